@@ -1,0 +1,47 @@
+# A fresh clone needs python3 >= 3.11 and make; everything else is put into .venv from requirements.lock.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed-from-lock
+
+.PHONY: help demo reproduce test lint format lock clean
+
+help:
+	@echo "make demo       a worn servo loses stability; its digital twin wins it back"
+	@echo "make reproduce  every figure and claim of the paper beside what is measured"
+	@echo "make test       format, lint, types, layers, tests"
+	@echo "make format     format the code and fix what can be fixed"
+	@echo "make lock       pin the dependencies anew (needs uv)"
+
+demo: $(STAMP)
+	$(BIN)/servotwin demo
+
+reproduce: $(STAMP)
+	$(BIN)/servotwin reproduce
+
+test: lint
+	$(BIN)/python -m pytest -q -n 2
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lock:
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
+		--no-emit-index-url --no-header --no-annotate -o requirements.lock
+
+clean:
+	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("servotwin needs Python 3.11 or newer; $(PYTHON) is " + sys.version.split()[0] + ". Try: make PYTHON=python3.12 ...")'
+	@echo "preparing .venv (once, about a minute)"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@

@@ -1,0 +1,1 @@
+"""A digital twin that keeps a motion controller tuned while its machine wears."""
