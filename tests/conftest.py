@@ -1,0 +1,41 @@
+"""What holds for every test: nothing leaks, and a failing random test prints its input."""
+
+import logging
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile(
+    "default", deadline=None, print_blob=True, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("ci", settings.get_profile("default"), derandomize=True)
+settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+class Kept(logging.Handler):
+    """Keeps what is logged: asyncio reports a task destroyed while pending, or an error nobody fetched, only there."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(record.getMessage())
+
+
+@pytest.fixture(autouse=True)
+def nothing_leaks() -> Iterator[None]:
+    """Fail the test that leaves a thread running or an asyncio task pending."""
+    before = set(threading.enumerate())
+    kept, logger = Kept(), logging.getLogger("asyncio")
+    logger.addHandler(kept)
+    yield
+    logger.removeHandler(kept)
+    left = [thread for thread in threading.enumerate() if thread not in before]
+    for thread in left:
+        thread.join(timeout=1.0)
+    assert not [thread.name for thread in left if thread.is_alive()], "threads were left running"
+    assert not kept.messages
