@@ -107,13 +107,13 @@ class Controller:
         enter, leave = self.thresholds(tolerance)
         return LawParameters(
             Kp=float(self.Kp),
-            integral_step=self.Ki * step,
+            integral_step=self.Ki / self.sample_rate,
             derivative_gain=self.Kd / self.Tf,
             filter_step=-expm1(-step / self.Tf),
             enter=enter,
             leave=leave,
             voltage_limit=inf if self.voltage_limit is None else float(self.voltage_limit),
-            rate_step=inf if self.rate_limit is None else self.rate_limit * step,
+            rate_step=inf if self.rate_limit is None else self.rate_limit / self.sample_rate,
             loop_step=1.0 if self.loop_filter_hz is None else -expm1(-2.0 * pi * self.loop_filter_hz * step),
             tracking_step=step / max(step, self.tracking),
         )

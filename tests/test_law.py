@@ -1,0 +1,177 @@
+"""The tick: exactness, decision E16, limits, bumplessness, and the same bits interpreted and compiled."""
+
+import random
+from array import array
+from dataclasses import replace
+from itertools import pairwise
+from math import exp, inf
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import signal
+
+from servotwin.control import Controller, LawParameters, LawState, start, tick
+
+PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
+LIMITED = PAPER.replace(voltage_limit=4.0, rate_limit=1e3, loop_filter_hz=20.0, enter=0.6, leave=1.4)
+
+
+def run(law: LawParameters, errors: list[float], state: LawState | None = None) -> list[LawState]:
+    """States after each tick for a given error sequence, the measurement at zero."""
+    states = []
+    state = start(0.0) if state is None else state
+    for error in errors:
+        state = tick(law, state, error, 0.0)
+        states.append(state)
+    return states
+
+
+def test_constant_error_gives_the_closed_form_step_response() -> None:
+    error, rate = 3e-4, 5000.0
+    voltages = [state.voltage for state in run(PAPER.law(), [error] * 5000)]
+    times = [k / rate for k in range(5000)]
+    exact = [error * (PAPER.Kp + PAPER.Ki * t + PAPER.Kd / PAPER.Tf * exp(-t / PAPER.Tf)) for t in times]
+    assert voltages == pytest.approx(exact, rel=1e-11)
+
+
+@pytest.mark.parametrize("rate", [50.0, 5000.0])
+def test_held_random_errors_agree_with_scipy(rate: float) -> None:
+    kp, ki, kd, tf = PAPER.Kp, PAPER.Ki, PAPER.Kd, PAPER.Tf
+    numerator = [kp * tf + kd, kp + ki * tf, ki]
+    a, b, c, d, _ = signal.cont2discrete(signal.tf2ss(numerator, [tf, 1.0, 0.0]), 1.0 / rate, method="zoh")
+    errors = np.random.default_rng(3).normal(size=400) * 1e-3
+    _, oracle, _ = signal.dlsim((a, b, c, d, 1.0 / rate), errors)
+    law = PAPER.replace(sample_rate=rate).law()
+    assert [s.voltage for s in run(law, errors.tolist())] == pytest.approx(oracle[:, 0].tolist(), rel=1e-9, abs=1e-9)
+
+
+def test_loop_filter_is_the_exact_low_pass() -> None:
+    law = PAPER.replace(loop_filter_hz=20.0).law()
+    state = start(0.0)
+    for k in range(1, 1000):
+        state = tick(law, state, 0.0, 1.0)
+        assert state.filtered == pytest.approx(1.0 - exp(-2.0 * np.pi * 20.0 * k / 5000.0), rel=1e-11)
+
+
+def test_without_loop_filter_the_measurement_passes_unchanged() -> None:
+    state = tick(PAPER.law(), start(1e8), 0.0, 1.2345e-9)
+    assert state.filtered == 1.2345e-9
+
+
+def test_inside_the_dead_zone_e16_holds() -> None:
+    law = PAPER.law(1e-3)
+    before = run(law, [2e-3] * 100)[-1]
+    inside = run(law, [0.9e-3] * 500, before)
+    assert {state.voltage for state in inside} == {0.0}
+    assert {state.active for state in inside} == {0.0}
+    assert {state.integral for state in inside} == {before.integral}
+    assert inside[-1].derivative == pytest.approx(before.derivative * exp(-0.1 / PAPER.Tf), rel=1e-11)
+    again = run(law, [-2e-3], inside[-1])[0]
+    kick = PAPER.Kd / PAPER.Tf * (-2e-3 - inside[-1].derivative)
+    assert again.voltage == pytest.approx(PAPER.Kp * -2e-3 + before.integral + kick, rel=1e-12)
+
+
+def test_the_boundary_belongs_to_the_dead_zone() -> None:
+    law = PAPER.law(1e-3)
+    assert run(law, [1e-3])[0].active == 0.0
+    assert run(law, [np.nextafter(1e-3, 1.0)])[0].active == 1.0
+
+
+def test_hysteresis_opens_below_enter_and_closes_above_leave() -> None:
+    law = PAPER.replace(enter=0.5, leave=1.5).law(1e-3)
+    errors = [1.0e-3, 0.6e-3, 0.5e-3, 1.4e-3, -1.5e-3, -1.6e-3, -0.6e-3]
+    assert [s.active for s in run(law, errors)] == [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("tolerance", [None, 0.0])
+def test_without_dead_zone_an_idle_law_wakes_up(tolerance: float | None) -> None:
+    idle = LawState(5.0, 0.0, 0.0, 0.0, 0.0)
+    state = tick(PAPER.law(tolerance), idle, 0.0, 0.0)
+    assert (state.active, state.voltage) == (1.0, 5.0)
+
+
+def test_limits_hold_and_the_integral_does_not_wind_up() -> None:
+    law = PAPER.replace(voltage_limit=2.0).law()
+    saturated = run(law, [2e-3] * 20_000)
+    assert max(abs(s.voltage) for s in saturated) == 2.0
+    assert abs(saturated[-1].integral) < 5.0
+    unlimited = run(PAPER.law(), [2e-3] * 20_000)
+    assert unlimited[-1].integral > 100.0
+    back = [s.voltage for s in run(law, [-2e-3] * 2000, saturated[-1])]
+    assert next(k for k, voltage in enumerate(back) if voltage < 0.0) < 500
+
+
+def test_rate_limit_bounds_every_change() -> None:
+    law = PAPER.replace(rate_limit=100.0).law(1e-3)
+    rng = random.Random(1)
+    states = run(law, [rng.uniform(-3e-3, 3e-3) for _ in range(2000)])
+    changes = [abs(b.voltage - a.voltage) for a, b in pairwise(states)]
+    assert max(changes) <= 0.02 * (1 + 1e-12)
+
+
+def test_without_limits_nothing_is_corrected() -> None:
+    errors = [1e-3, -2e-3, 0.5e-3] * 50
+    fast = run(PAPER.replace(tracking_time=1e-3).law(), errors)
+    assert fast == run(PAPER.replace(tracking_time=1.0).law(), errors)
+
+
+@given(ki=st.floats(-1e5, 1e5), error=st.floats(-1e-2, 1e-2))
+def test_a_new_integral_gain_is_bumpless(ki: float, error: float) -> None:
+    state = run(PAPER.law(), [1e-3, 2e-3, -1e-3] * 30)[-1]
+    kept = tick(PAPER.law(), state, error, 0.0).voltage
+    assert tick(PAPER.replace(Ki=ki).law(), state, error, 0.0).voltage == kept
+
+
+@given(power=st.integers(-40, 40), seed=st.integers(0, 10))
+def test_homogeneous_bit_for_bit(power: int, seed: int) -> None:
+    rng, scale = random.Random(seed), 2.0**power
+    errors = [rng.uniform(-3e-3, 3e-3) for _ in range(50)]
+    plain = run(PAPER.law(1e-3), errors)
+    scaled = run(PAPER.law(1e-3 * scale), [error * scale for error in errors])
+    assert [s.voltage * scale for s in plain] == [s.voltage for s in scaled]
+
+
+_compiled_tick: Any = numba.njit(tick)
+
+
+def _compiled_run(parameters: Any, state: Any, references: Any, measurements: Any, out: Any) -> None:
+    for k in range(len(references)):
+        state = _compiled_tick(parameters, state, references[k], measurements[k])
+        out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
+        out[k, 3], out[k, 4] = state.voltage, state.active
+
+
+def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """A wandering reference and a noisy measurement that cross every threshold and limit."""
+    rng = np.random.default_rng(11)
+    reference = np.repeat(rng.uniform(-4e-3, 4e-3, samples // 500), 500)
+    lag = signal.lfilter([0.01], [1.0, -0.99], reference)
+    return reference, lag + rng.normal(0.0, 3e-4, samples)
+
+
+@pytest.mark.parametrize("controller", [PAPER, LIMITED], ids=["paper", "limits, hysteresis, filter"])
+def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
+    law, samples = controller.law(1e-3), 1_000_000
+    reference, measurement = _signals(samples)
+    compiled = np.empty((samples, 5))
+    numba.njit(_compiled_run)(law, start(0.0), reference, measurement, compiled)
+    state, interpreted = start(0.0), array("d")
+    for r, y in zip(reference.tolist(), measurement.tolist(), strict=True):
+        state = tick(law, state, r, y)
+        interpreted.extend(state)
+    assert interpreted.tobytes() == compiled.tobytes()
+    assert np.count_nonzero(np.diff(compiled[:, 4])) > 100
+    if controller.voltage_limit is not None:
+        saturated = np.abs(compiled[:, 3]) == law.voltage_limit
+        rate_limited = np.isclose(np.abs(np.diff(compiled[:, 3])), law.rate_step)
+        assert 1000 < np.count_nonzero(saturated) < samples - 1000
+        assert np.count_nonzero(rate_limited) > 1000
+
+
+def test_parameters_are_plain_floats_for_the_compiler() -> None:
+    assert all(type(value) is float for value in (*LIMITED.law(1e-3), *start(0.0)))
+    assert replace(PAPER, voltage_limit=None).law().voltage_limit == inf
