@@ -1,0 +1,77 @@
+"""Files written whole or not at all, and the checks that can be made before anything is computed."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from servotwin.errors import InvalidInput
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file atomically; returns its path."""
+    with written(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def check_file(path: Path, suffixes: tuple[str, ...]) -> Path:
+    """Refuse an output path that cannot be written: wrong suffix, no such directory, a directory in its place.
+
+    Raises
+    ------
+    InvalidInput
+        Naming the path and what is allowed.
+    """
+    if path.suffix not in suffixes:
+        raise InvalidInput(f"output {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(suffixes)}")
+    if path.is_dir():
+        raise InvalidInput(f"output {path}: is a directory; give the name of a file")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"output {path}: there is no directory {path.parent}; make it first or choose another")
+    _check_writable(path.parent)
+    return path
+
+
+def make_directory(path: Path) -> Path:
+    """The directory `path`, made if it is missing.
+
+    Raises
+    ------
+    InvalidInput
+        When it cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInput(f"output directory {path}: cannot be made ({error.strerror})") from None
+    _check_writable(path)
+    return path
+
+
+def _check_writable(directory: Path) -> None:
+    if not os.access(directory, os.W_OK):
+        raise InvalidInput(f"output directory {directory}: may not be written to; choose another")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
