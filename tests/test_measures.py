@@ -73,7 +73,7 @@ def test_steps_of_a_square_wave():
     time = grid(40.0)
     reference = np.where(time < 20.0, 1e-3, -1e-3)
     first = 0.98e-3 * (1.0 - np.exp(-time))
-    second = -1e-3 + 0.2e-3 * np.sin(2 * np.pi * 1.5 * time)
+    second = -1e-3 + 0.2e-3 * np.sin(2 * np.pi * 1.6 * time)
     gap = time / 40.0
     one, two = measures.steps(time, np.where(time < 20.0, first, second), reference, gap, 1e-3)
     assert (one.begin, one.end, two.begin, two.end) == pytest.approx((0.0, 20.0, 20.0, 40.0))
