@@ -1,0 +1,218 @@
+"""The whole servo as one frozen description: motor, screw, chain of masses, sensors, default controller."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from numbers import Real
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant import servofile
+from servotwin.plant.motor import motor_matrices
+from servotwin.plant.signals import Array
+from servotwin.plant.structure import Chain, chain
+from servotwin.tomltable import Table, did_you_mean, parse_toml, read_toml
+
+PerMass: TypeAlias = float | tuple[float, ...]
+PRESETS = ("paper", "table1", "paper-gain2")
+_POSITIVE = {"J": "kg m^2", "p": "m/rad", "L": "H", "R": "ohm", "k_T": "N m/A", "k_B": "V s/rad"}
+_PER_MASS = {"m": "kg", "k": "N/m", "c": "N s/m"}
+_CONTROLLER_FIELDS = tuple(field.name for field in dataclasses.fields(Controller))
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A position servo: DC motor, lead screw, chain of n masses, sensors and its default controller.
+
+    Parameters
+    ----------
+    m, k, c : float or tuple of n floats
+        kg, N/m, N s/m: mass, stiffness, damping, one for all or one each from the screw outwards (Eq 9). With a rigid
+        screw the first of each is inert (Eq 10).
+    J, L, R, k_T, k_B : float
+        kg m^2, H, ohm, N m/A, V s/rad: the motor (Eqs 1-8).
+    p : float
+        m/rad, pitch of the lead screw.
+    controller : Controller
+        The controller that runs when none is given; it also carries the voltage and rate limits.
+    n : int
+        Number of masses, at least 2.
+    k_d : float
+        N/m between screw and first mass. Infinite (the paper's) means rigid and no reaction on the motor; finite
+        means an elastic screw whose load acts back on the motor.
+    encoder_resolution, position_resolution : float
+        rad and m of one count of the motor's encoder and of the position sensor; 0 is an ideal sensor.
+
+    Raises
+    ------
+    InvalidInput
+        A value is not a finite number in its range, or m, k or c does not have n values.
+    """
+
+    m: PerMass
+    k: PerMass
+    c: PerMass
+    J: float
+    p: float
+    L: float
+    R: float
+    k_T: float
+    k_B: float
+    controller: Controller
+    n: int = 3
+    k_d: float = math.inf
+    encoder_resolution: float = 0.0
+    position_resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 2:
+            raise InvalidInput(f"servo n = {self.n!r}: the number of masses must be an integer of 2 or more")
+        if not isinstance(self.controller, Controller):
+            raise InvalidInput(f"servo controller = {self.controller!r}: must be a Controller")
+        for name, unit in _PER_MASS.items():
+            object.__setattr__(self, name, _per_mass(name, getattr(self, name), self.n, unit))
+        for name, unit in _POSITIVE.items():
+            object.__setattr__(self, name, _checked(name, getattr(self, name), unit, positive=True))
+        object.__setattr__(self, "k_d", _checked("k_d", self.k_d, "N/m", positive=True, infinite=True))
+        for name, unit in {"encoder_resolution": "rad", "position_resolution": "m"}.items():
+            object.__setattr__(self, name, _checked(name, getattr(self, name), unit, positive=False))
+
+    @classmethod
+    def preset(cls, name: str = "paper") -> Servo:
+        """One of the paper's servos: "paper", "table1" or "paper-gain2" (facts E1 say how they differ)."""
+        if name not in PRESETS:
+            hint = did_you_mean(name, PRESETS)
+            raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
+        text = resources.files("servotwin.plant").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
+        return cls._from_table(parse_toml(text, f"{name}.toml"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Servo:
+        """A servo from a TOML file with unit-carrying keys, as `dumps` writes it.
+
+        Raises
+        ------
+        InvalidInput
+            The file is missing or not TOML, a key is unknown or missing, a value is out of its range.
+        """
+        return cls._from_table(read_toml(path))
+
+    @classmethod
+    def resolve(cls, name_or_path: str, folder: str | os.PathLike[str] = ".") -> Servo:
+        """A preset's name, or the path of a servo's TOML relative to `folder`."""
+        return cls.preset(name_or_path) if name_or_path in PRESETS else cls.load(Path(folder) / name_or_path)
+
+    @classmethod
+    def _from_table(cls, table: Table) -> Servo:
+        values, gains = servofile.read(table)
+        try:
+            return cls(controller=Controller(**gains), **values)
+        except InvalidInput as error:
+            raise InvalidInput(f"{table.source}: {error}") from None
+
+    def dumps(self) -> str:
+        """The servo as TOML that `load` reads back to an equal servo."""
+        return servofile.write(self._plant_values(), dataclasses.asdict(self.controller))
+
+    def replace(self, **changes: Any) -> Servo:
+        """A copy with some values changed; the controller's own names (Kp, Ki, Kd, Tf, voltage_limit, ...) go to it."""
+        _refuse_unknown(changes)
+        for_controller = {key: changes.pop(key) for key in _CONTROLLER_FIELDS if key in changes}
+        changed = dataclasses.replace(self, **changes)
+        if not for_controller:
+            return changed
+        return dataclasses.replace(changed, controller=changed.controller.replace(**for_controller))
+
+    def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
+        """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
+
+        Raises
+        ------
+        InvalidInput
+            The gap or k_dz is negative or not finite.
+        """
+        for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
+        return k_dz * self.p * gap
+
+    @property
+    def masses(self) -> Array:
+        """(n,) kg."""
+        return _spread(self.m, self.n)
+
+    @property
+    def stiffnesses(self) -> Array:
+        """(n,) N/m."""
+        return _spread(self.k, self.n)
+
+    @property
+    def dampings(self) -> Array:
+        """(n,) N s/m."""
+        return _spread(self.c, self.n)
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the first mass follows the screw (k_d infinite)."""
+        return math.isinf(self.k_d)
+
+    @property
+    def version(self) -> str:
+        """Twelve hexadecimal digits that name this plant's numbers (the controller's do not count)."""
+        return hashlib.sha256(servofile.write(self._plant_values(), {}).encode()).hexdigest()[:12]
+
+    def chain(self) -> Chain:
+        """Matrices of the structure (Eqs 9-13)."""
+        return chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
+
+    def motor(self) -> tuple[Array, Array, Array]:
+        """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
+        return motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
+
+    def _plant_values(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "controller"}
+
+
+def _spread(value: PerMass, n: int) -> Array:
+    return np.broadcast_to(np.asarray(value, dtype=float), (n,)).copy()
+
+
+def _per_mass(name: str, value: object, n: int, unit: str) -> PerMass:
+    positive = name != "c"
+    if isinstance(value, Real):
+        return _checked(name, value, unit, positive=positive)
+    try:
+        values: tuple[object, ...] = tuple(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise InvalidInput(f"servo {name} = {value!r}: must be a number in {unit} or a tuple of {n}") from None
+    if len(values) != n:
+        count = len(values)
+        raise InvalidInput(f"servo {name} = {value!r}: has {count} values in {unit} for {n} masses; give one or {n}")
+    return tuple(_checked(f"{name}[{i}]", v, unit, positive=positive) for i, v in enumerate(values))
+
+
+def _checked(name: str, value: object, unit: str, *, positive: bool, infinite: bool = False) -> float:
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    finite = math.isfinite(number) or (infinite and number == math.inf)
+    if not finite or number < 0.0 or (positive and number == 0.0):
+        allowed = ("greater than 0" if positive else "0 or more") + (", inf allowed" if infinite else " and finite")
+        raise InvalidInput(f"servo {name} = {value!r} {unit}: must be {allowed}")
+    return number
+
+
+def _refuse_unknown(changes: Mapping[str, object]) -> None:
+    known = (*(field.name for field in dataclasses.fields(Servo)), *_CONTROLLER_FIELDS)
+    for name in changes:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise InvalidInput(f"servo has no value named {name!r}{hint}; allowed are {', '.join(known)}")

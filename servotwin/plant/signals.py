@@ -1,0 +1,298 @@
+"""Signals of time as piecewise cubics: references, gaps, tolerances.
+
+A cubic is what the hybrid kernel integrates exactly (four exosystem states), and a smoothstep, a step and a
+square wave are all piecewise cubic, so every signal comes down to one `PiecewiseCubic`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from servotwin.errors import InvalidInput
+
+Array: TypeAlias = NDArray[np.float64]
+_ROUNDING = 64 * float(np.finfo(float).eps)
+
+
+@runtime_checkable
+class Signal(Protocol):
+    """Anything that can say what it is on [0, duration]."""
+
+    def pieces(self, duration: float, /) -> PiecewiseCubic: ...
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewiseCubic:
+    """A function of time made of cubics, right-continuous at its jumps.
+
+    Parameters
+    ----------
+    times : (M,) array
+        s, increasing, the first at 0 or earlier; piece i holds on [times[i], times[i + 1]), the last for ever.
+    coeffs : (M, 4) array
+        Ascending powers of (t - times[i]).
+
+    Raises
+    ------
+    InvalidInput
+        Shapes do not match, a number is not finite, or the times do not increase from 0 or earlier.
+    """
+
+    times: Array
+    coeffs: Array
+
+    def __init__(self, times: ArrayLike, coeffs: ArrayLike) -> None:
+        object.__setattr__(self, "times", _frozen(times, "times"))
+        object.__setattr__(self, "coeffs", _frozen(coeffs, "coeffs"))
+        if self.times.ndim != 1 or self.times.size == 0 or self.coeffs.shape != (self.times.size, 4):
+            raise InvalidInput(
+                "a piecewise cubic needs times (M,) and coeffs (M, 4) with M >= 1, "
+                f"not {self.times.shape} and {self.coeffs.shape}"
+            )
+        if self.times[0] > 0.0 or not np.all(np.diff(self.times) > 0.0):
+            raise InvalidInput("the times of a piecewise cubic must increase, and the first must be 0 s or earlier")
+
+    @classmethod
+    def constant(cls, value: float) -> PiecewiseCubic:
+        """The same value at all times."""
+        return cls([0.0], [[value, 0.0, 0.0, 0.0]])
+
+    @classmethod
+    def held(cls, times: ArrayLike, values: ArrayLike) -> PiecewiseCubic:
+        """Each value from its time until the next one."""
+        values = np.asarray(values, dtype=float)
+        coeffs = np.zeros((values.size, 4))
+        coeffs[:, 0] = values
+        return cls(times, coeffs)
+
+    def pieces(self, _duration: float, /) -> PiecewiseCubic:
+        """Itself: a piecewise cubic holds for ever."""
+        return self
+
+    def value(self, t: ArrayLike) -> Array:
+        """Value at time t (scalar or array), the right limit at a jump; before times[0] the first value holds."""
+        t = np.asarray(t, dtype=float)
+        piece = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
+        elapsed = np.maximum(t - self.times[piece], 0.0)
+        c = self.coeffs[piece]
+        return np.asarray(((c[..., 3] * elapsed + c[..., 2]) * elapsed + c[..., 1]) * elapsed + c[..., 0])
+
+    @property
+    def jumps(self) -> Array:
+        """(K,) times at which the value is discontinuous (rounding of the cubic's end value does not count)."""
+        span = np.diff(self.times)
+        powers = span[:, None] ** np.arange(4)
+        left = np.sum(self.coeffs[:-1] * powers, axis=1)
+        right = self.coeffs[1:, 0]
+        scale = np.sum(np.abs(self.coeffs[:-1]) * powers, axis=1) + np.abs(right)
+        jumped: Array = self.times[1:][np.abs(right - left) > _ROUNDING * scale]
+        return jumped
+
+    def changes(self, duration: float) -> Array:
+        """Times of [0, duration) at which the value jumps; 0 counts when the value there is not zero."""
+        inside = self.jumps[(self.jumps > 0.0) & (self.jumps < duration)]
+        starts = [0.0] if self.value(0.0) != 0.0 and duration > 0.0 else []
+        return np.concatenate([starts, inside])
+
+    def minimum(self, duration: float) -> tuple[float, float]:
+        """(time, value) of the lowest point on [0, duration], from the roots of each cubic's derivative."""
+        best = (0.0, float(self.value(0.0)))
+        ends = np.append(self.times[1:], math.inf)
+        for start, end, c in zip(self.times, ends, self.coeffs, strict=True):
+            first, last = max(start, 0.0) - start, min(end, duration) - start
+            if first > last:
+                continue
+            for elapsed in _candidates(c, first, last):
+                value = float(((c[3] * elapsed + c[2]) * elapsed + c[1]) * elapsed + c[0])
+                if value < best[1]:
+                    best = (float(start + elapsed), value)
+        return best
+
+    def scaled(self, factor: float) -> PiecewiseCubic:
+        """The same shape, every value times `factor`."""
+        return PiecewiseCubic(self.times, self.coeffs * factor)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PiecewiseCubic):
+            return NotImplemented
+        return np.array_equal(self.times, other.times) and np.array_equal(self.coeffs, other.coeffs)
+
+    def __hash__(self) -> int:
+        return hash((self.times.tobytes(), self.coeffs.tobytes()))
+
+
+@dataclass(frozen=True)
+class SCurve:
+    """Smoothstep 3 u^2 - 2 u^3 from one value to another, constant before and after.
+
+    Parameters
+    ----------
+    begin_value, end_value : float
+        Values before `begin` and after `begin + duration`.
+    duration : float
+        s, how long the change takes.
+    begin : float
+        s, when it starts.
+    """
+
+    begin_value: float
+    end_value: float
+    duration: float
+    begin: float = 0.0
+
+    def __post_init__(self) -> None:
+        _finite("SCurve", begin_value=self.begin_value, end_value=self.end_value, begin=self.begin)
+        _positive("SCurve", "s", duration=self.duration)
+
+    def pieces(self, _duration: float, /) -> PiecewiseCubic:
+        """The ramp as one cubic between two constants."""
+        rise = self.end_value - self.begin_value
+        ramp = [self.begin_value, 0.0, 3.0 * rise / self.duration**2, -2.0 * rise / self.duration**3]
+        times = [self.begin, self.begin + self.duration]
+        coeffs = [ramp, [self.end_value, 0.0, 0.0, 0.0]]
+        if self.begin > 0.0:
+            times, coeffs = [0.0, *times], [[self.begin_value, 0.0, 0.0, 0.0], *coeffs]
+        return PiecewiseCubic(times, coeffs)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Zero, then `size` from time `at` (s) on."""
+
+    size: float
+    at: float = 0.0
+
+    def __post_init__(self) -> None:
+        _finite("Step", size=self.size, at=self.at)
+
+    def pieces(self, _duration: float, /) -> PiecewiseCubic:
+        """One constant, or two when the step comes later."""
+        if self.at <= 0.0:
+            return PiecewiseCubic.constant(self.size)
+        return PiecewiseCubic.held([0.0, self.at], [0.0, self.size])
+
+
+@dataclass(frozen=True)
+class SquareWave:
+    """offset + amplitude in the first half of each period (s), offset - amplitude in the second."""
+
+    amplitude: float
+    period: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        _finite("SquareWave", amplitude=self.amplitude, offset=self.offset)
+        _positive("SquareWave", "s", period=self.period)
+
+    def pieces(self, duration: float, /) -> PiecewiseCubic:
+        """One constant per half period that starts on [0, duration]."""
+        halves = np.arange(math.floor(2.0 * max(duration, 0.0) / self.period) + 1)
+        return PiecewiseCubic.held(halves * (0.5 * self.period), self.offset + self.amplitude * (-1.0) ** halves)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Recorded values, each held until the next one; the first also holds before its time.
+
+    Parameters
+    ----------
+    times : sequence of float
+        s, increasing.
+    values : sequence of float
+        One for each time.
+    """
+
+    times: Sequence[float]
+    values: Sequence[float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", tuple(float(t) for t in self.times))
+        object.__setattr__(self, "values", tuple(float(v) for v in self.values))
+        if not self.times or len(self.times) != len(self.values):
+            raise InvalidInput(f"Samples needs one value for each time, not {len(self.values)} for {len(self.times)}")
+        if any(after <= before for before, after in zip(self.times, self.times[1:], strict=False)):
+            raise InvalidInput("the times of Samples must increase")
+
+    def pieces(self, _duration: float, /) -> PiecewiseCubic:
+        """One constant per sample."""
+        return PiecewiseCubic.held([min(self.times[0], 0.0), *self.times[1:]], self.values)
+
+
+SignalLike: TypeAlias = Signal | float
+
+
+def as_pieces(signal: SignalLike, duration: float) -> PiecewiseCubic:
+    """The piecewise cubic of a signal or of a plain number on [0, duration].
+
+    Raises
+    ------
+    InvalidInput
+        It is neither a number nor a signal, or it is not finite.
+    """
+    if isinstance(signal, Signal):
+        return signal.pieces(duration)
+    try:
+        return PiecewiseCubic.constant(float(signal))
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InvalidInput):
+            raise
+        raise InvalidInput(
+            f"{signal!r} is no signal; give a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic"
+        ) from None
+
+
+def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit: str = "rad") -> PiecewiseCubic:
+    """As `as_pieces`, refusing a signal that goes below zero anywhere on [0, duration].
+
+    Raises
+    ------
+    InvalidInput
+        With the time and the value of the lowest point.
+    """
+    pieces = as_pieces(signal, duration)
+    time, value = pieces.minimum(duration)
+    if value < -_ROUNDING * float(np.max(np.abs(pieces.value(np.append(pieces.times, duration))))):
+        raise InvalidInput(f"{name} = {value:.6g} {unit} at t = {time:.6g} s is negative; it must be 0 {unit} or more")
+    return pieces
+
+
+def reference_changes(signal: SignalLike, duration: float) -> Array:
+    """Times of [0, duration) at which a signal jumps; 0 counts when it does not start at zero."""
+    return as_pieces(signal, duration).changes(duration)
+
+
+def _candidates(c: Array, first: float, last: float) -> list[float]:
+    """Both ends and the derivative's real roots between them (elapsed times), without cancellation."""
+    constant, half_slope, square = float(c[1]), float(c[2]), 3.0 * float(c[3])
+    discriminant = half_slope**2 - square * constant
+    if discriminant < 0.0:
+        return [first, last]
+    larger = -(half_slope + math.copysign(math.sqrt(discriminant), half_slope))
+    roots = [a / b for a, b in ((larger, square), (constant, larger)) if abs(b) * last > abs(a)]
+    return [first, last, *(root for root in roots if first < root < last)]
+
+
+def _frozen(values: ArrayLike, name: str) -> Array:
+    array = np.array(values, dtype=float)
+    if not np.all(np.isfinite(array)):
+        raise InvalidInput(f"{name} of a piecewise cubic must be finite")
+    array.flags.writeable = False
+    return array
+
+
+def _finite(owner: str, **numbers: float) -> None:
+    for name, value in numbers.items():
+        if not math.isfinite(value):
+            raise InvalidInput(f"{owner}: {name} = {value} must be finite")
+
+
+def _positive(owner: str, unit: str, **numbers: float) -> None:
+    for name, value in numbers.items():
+        if not (math.isfinite(value) and value > 0.0):
+            raise InvalidInput(f"{owner}: {name} = {value} {unit} must be positive and finite")

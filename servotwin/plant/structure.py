@@ -1,0 +1,133 @@
+"""The chain of masses on springs and dampers that the lead screw drives (Eqs 9-13, any n >= 2, unequal masses too).
+
+Mass 1 hangs on the ground by spring 1 and damper 1, mass i on mass i - 1 by spring i and damper i (Eq 9). The
+screw's elongation d = p theta_d moves mass 1, either rigidly (k_d infinite, Eq 10) or through the spring k_d.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import polynomial as poly
+
+from servotwin.plant.signals import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """x' = A x + B_position d + B_velocity d', the n positions q = C x + D d, with d = p theta_d.
+
+    Attributes
+    ----------
+    A : (N, N) array
+        Rigid screw: N = 2 (n - 1), x = [q_2..q_n, v_2..v_n]. Finite k_d: N = 2 n, x = [q_1..q_n, v_1..v_n].
+    B_position, B_velocity : (N,) arrays
+        Input columns of d (m) and d' (m/s); with finite k_d the second is zero.
+    C : (n, N) array
+    D : (n,) array
+        All positions; with a rigid screw q_1 = d.
+    reaction : (N,) array
+    reaction_position : float
+        Force on the screw, N: F = reaction x + reaction_position d = k_d (d - q_1). Zero with a rigid screw, whose
+        load does not act back (the paper's first assumption).
+    """
+
+    A: Array
+    B_position: Array
+    B_velocity: Array
+    C: Array
+    D: Array
+    reaction: Array
+    reaction_position: float
+
+    @property
+    def C_last(self) -> Array:
+        """(N,) row of the last mass's position, the controlled one."""
+        return np.asarray(self.C[-1])
+
+    def equilibrium(self, d: float) -> Array:
+        """(N,) state at rest for a constant elongation d (m)."""
+        return np.asarray(np.linalg.solve(self.A, -self.B_position * d))
+
+
+def chain(m: Array, k: Array, c: Array, k_d: float = math.inf) -> Chain:
+    """The chain's matrices.
+
+    Parameters
+    ----------
+    m, k, c : (n,) arrays
+        kg, N/m, N s/m, from the screw's end outwards. With a rigid screw the first of each is inert.
+    k_d : float
+        N/m, stiffness between screw and mass 1; infinite means that mass 1 follows the screw.
+    """
+    return _prescribed(m, k, c) if math.isinf(k_d) else _elastic(m, k, c, k_d)
+
+
+def _prescribed(m: Array, k: Array, c: Array) -> Chain:
+    """Eq 10: q_1 = d is moved to the right-hand side."""
+    free = m.size - 1
+    A = _first_order(m[1:], tridiagonal(k)[1:, 1:], tridiagonal(c)[1:, 1:])
+    B_position, B_velocity, zero = np.zeros((3, 2 * free))
+    B_position[free] = k[1] / m[1]
+    B_velocity[free] = c[1] / m[1]
+    C = np.vstack([np.zeros(2 * free), np.eye(free, 2 * free)])
+    return Chain(A, B_position, B_velocity, C, np.eye(free + 1)[0], zero, 0.0)
+
+
+def _elastic(m: Array, k: Array, c: Array, k_d: float) -> Chain:
+    """Eq 9 with the force k_d (d - q_1) on mass 1."""
+    n = m.size
+    stiffness = tridiagonal(k)
+    stiffness[0, 0] += k_d
+    B_position, zero, reaction = np.zeros((3, 2 * n))
+    B_position[n] = k_d / m[0]
+    reaction[0] = -k_d
+    A = _first_order(m, stiffness, tridiagonal(c))
+    return Chain(A, B_position, zero, np.eye(n, 2 * n), np.zeros(n), reaction, k_d)
+
+
+def tridiagonal(k: Array) -> Array:
+    """(n, n) stiffness (or damping) matrix of Eq 9 for the elements k (n,)."""
+    return np.diag(k + np.append(k[1:], 0.0)) - np.diag(k[1:], 1) - np.diag(k[1:], -1)
+
+
+def _first_order(m: Array, stiffness: Array, damping: Array) -> Array:
+    """(2 n, 2 n) matrix of m q'' + damping q' + stiffness q = 0 for x = [q, q']."""
+    upper = np.eye(m.size, 2 * m.size, m.size)
+    return np.vstack([upper, np.hstack([-stiffness, -damping]) / m[:, None]])
+
+
+def transfer(m: Array, k: Array, c: Array, k_d: float = math.inf) -> tuple[Array, Array, Array]:
+    """Polynomials in s, ascending: (numerator of q_n / d, denominator, the same determinant without mass 1).
+
+    The dynamic stiffness is tridiagonal, so its determinant is a continuant and the cofactor of q_n is the product
+    of the couplings c_i s + k_i (Eq 13 for n = 3); nothing is inverted.
+    """
+    couplings = product([np.array([k[i], c[i]]) for i in range(1, m.size)])
+    inner = _determinant(m[1:], k[1:], c[1:])
+    if math.isinf(k_d):
+        return couplings, inner, inner
+    extra = k.copy()
+    extra[0] += k_d
+    return k_d * couplings, _determinant(m, extra, c), inner
+
+
+def _determinant(m: Array, k: Array, c: Array) -> Array:
+    """det(M s^2 + C s + K) of a chain, by the three-term recursion from its free end."""
+    beyond, here = np.array([1.0]), np.array([k[-1], c[-1], m[-1]])
+    for i in range(m.size - 2, -1, -1):
+        diagonal = np.array([k[i] + k[i + 1], c[i] + c[i + 1], m[i]])
+        coupling = np.array([k[i + 1], c[i + 1]])
+        square = poly.polymul(poly.polymul(coupling, coupling), beyond)
+        beyond, here = here, poly.polysub(poly.polymul(diagonal, here), square)
+    return np.asarray(here)
+
+
+def product(factors: list[Array]) -> Array:
+    """Product of polynomials (ascending)."""
+    result = np.array([1.0])
+    for factor in factors:
+        result = poly.polymul(result, factor)
+    return np.asarray(result)

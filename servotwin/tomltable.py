@@ -1,0 +1,242 @@
+"""A strict reader of TOML tables: every value is asked for by name, type and range, and nothing unknown is left over.
+
+Each refusal is one `InvalidInput` sentence that names the file, the key, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from servotwin.errors import InvalidInput
+
+_Default = TypeVar("_Default")
+
+
+class _Required:
+    """The default of a key that must be present."""
+
+
+REQUIRED = _Required()
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers that a key accepts; both ends belong to it unless `positive`."""
+
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    positive: bool = False
+    infinite: bool = False
+
+    def accepts(self, value: float) -> bool:
+        finite = math.isfinite(value) or (self.infinite and not math.isnan(value))
+        return finite and self.minimum <= value <= self.maximum and not (self.positive and value <= 0.0)
+
+    def __str__(self) -> str:
+        words = ["a positive number" if self.positive else "a number"]
+        if self.minimum > -math.inf:
+            words.append(f"at least {self.minimum:g}")
+        if self.maximum < math.inf:
+            words.append(f"at most {self.maximum:g}")
+        words.append("inf allowed" if self.infinite else "finite")
+        return ", ".join(words)
+
+
+@dataclass
+class Table:
+    """One TOML table, read key by key.
+
+    Parameters
+    ----------
+    source : str
+        The file, as it is named in messages.
+    values : mapping
+        The parsed table.
+    name : str
+        Dotted path of the table inside its file; empty at the top.
+    """
+
+    source: str
+    values: Mapping[str, object]
+    name: str = ""
+    _asked: set[str] = field(default_factory=set)
+
+    def number(
+        self,
+        key: str,
+        default: _Default | _Required = REQUIRED,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        positive: bool = False,
+        infinite: bool = False,
+    ) -> float | _Default:
+        """One number (an integer counts); NaN never, inf only where `infinite`."""
+        if self._missing(key, default):
+            return cast(_Default, default)
+        return self._number(key, self.values[key], Range(minimum, maximum, positive, infinite))
+
+    def numbers(
+        self,
+        key: str,
+        default: _Default | _Required = REQUIRED,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+        positive: bool = False,
+    ) -> float | tuple[float, ...] | _Default:
+        """One number, or a list of at least one."""
+        if self._missing(key, default):
+            return cast(_Default, default)
+        allowed = Range(minimum, maximum, positive)
+        value = self.values[key]
+        if not isinstance(value, list):
+            return self._number(key, value, allowed, " or a list of such")
+        if not value:
+            raise self.invalid(key, f"{allowed} or a list of such")
+        return tuple(self._number(f"{key}[{i}]", item, allowed) for i, item in enumerate(value))
+
+    def integer(
+        self,
+        key: str,
+        default: _Default | _Required = REQUIRED,
+        *,
+        minimum: float = -math.inf,
+        maximum: float = math.inf,
+    ) -> int | _Default:
+        """One integer within the range."""
+        if self._missing(key, default):
+            return cast(_Default, default)
+        value = self.values[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+            allowed = str(Range(minimum, maximum)).replace("a number", "an integer").removesuffix(", finite")
+            raise self.invalid(key, allowed)
+        return value
+
+    def text(
+        self, key: str, default: _Default | _Required = REQUIRED, *, choices: Sequence[str] | None = None
+    ) -> str | _Default:
+        """One string, one of `choices` where they are given."""
+        if self._missing(key, default):
+            return cast(_Default, default)
+        value = self.values[key]
+        if not isinstance(value, str):
+            raise self.invalid(key, "a text in quotes")
+        if choices is not None and value not in choices:
+            raise self.invalid(key, f"one of {_listed(choices)}{did_you_mean(value, choices)}")
+        return value
+
+    def boolean(self, key: str, default: _Default | _Required = REQUIRED) -> bool | _Default:
+        """true or false."""
+        if self._missing(key, default):
+            return cast(_Default, default)
+        value = self.values[key]
+        if not isinstance(value, bool):
+            raise self.invalid(key, "true or false")
+        return value
+
+    def table(self, key: str, *, required: bool = False) -> Table:
+        """The table [key]; where it is absent and not required, an empty one."""
+        self._asked.add(key)
+        value = self.values.get(key, {})
+        if not isinstance(value, dict):
+            raise self.invalid(key, f"a table [{self.path(key)}]")
+        if required and key not in self.values:
+            raise InvalidInput(f"{self.source}: table [{self.path(key)}] is missing{self._misspelt(key)}")
+        return Table(self.source, value, self.path(key))
+
+    def tables(self, key: str) -> list[Table]:
+        """The array of tables [[key]]; empty where it is absent."""
+        self._asked.add(key)
+        value = self.values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
+        return [Table(self.source, item, f"{self.path(key)}[{i}]") for i, item in enumerate(value)]
+
+    def done(self) -> None:
+        """Refuse whatever was never asked for."""
+        for key in self.values:
+            if key not in self._asked:
+                allowed = _listed(sorted(self._asked)) or "no key at all"
+                hint = did_you_mean(key, self._asked)
+                where = f"table [{self.name}]" if self.name else "the top level"
+                raise InvalidInput(f"{self.source}: unknown key '{self.path(key)}'{hint}; {where} allows {allowed}")
+
+    def path(self, key: str) -> str:
+        """The key's dotted path inside its file."""
+        return f"{self.name}.{key}" if self.name else key
+
+    def invalid(self, key: str, allowed: str) -> InvalidInput:
+        """The error for a value of `key` that is not allowed; to be raised by the caller."""
+        shown = _shown(self.values.get(key))
+        return InvalidInput(f"{self.source}: {self.path(key)} = {shown} is not allowed; give {allowed}")
+
+    def _number(self, key: str, value: object, allowed: Range, alternative: str = "") -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not allowed.accepts(float(value)):
+            raise InvalidInput(
+                f"{self.source}: {self.path(key)} = {_shown(value)} is not allowed; give {allowed}{alternative}"
+            )
+        return float(value)
+
+    def _missing(self, key: str, default: object) -> bool:
+        self._asked.add(key)
+        if key in self.values:
+            return False
+        if default is REQUIRED:
+            raise InvalidInput(f"{self.source}: key '{self.path(key)}' is missing{self._misspelt(key)}")
+        return True
+
+    def _misspelt(self, key: str) -> str:
+        close = difflib.get_close_matches(key, [k for k in self.values if k not in self._asked], n=1)
+        return f"; '{self.path(close[0])}' is not it" if close else ""
+
+
+def read_toml(path: str | os.PathLike[str]) -> Table:
+    """Read a TOML file as a strict `Table`.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, unreadable, not UTF-8, not TOML, or empty.
+    """
+    source = os.fspath(path)
+    try:
+        text = Path(path).read_bytes().decode("utf-8")
+    except OSError as error:
+        raise InvalidInput(f"{source}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
+        raise InvalidInput(f"{source}: is not a TOML file (byte {error.start} is not UTF-8)") from None
+    return parse_toml(text, source)
+
+
+def parse_toml(text: str, source: str) -> Table:
+    """Read TOML text as a strict `Table`; `source` is its name in messages."""
+    try:
+        values: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidInput(f"{source}: is not a TOML file ({error})") from None
+    if not values:
+        raise InvalidInput(f"{source}: is empty; it must hold at least one key")
+    return Table(source, values)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A hint such as " (did you mean 'mass_kg'?)", or nothing where no known word is close."""
+    close = difflib.get_close_matches(word, sorted(known), n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def _listed(words: Iterable[str]) -> str:
+    return ", ".join(words)
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
