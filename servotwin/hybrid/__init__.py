@@ -1,0 +1,1 @@
+"""An exact kernel for piecewise-affine hybrid automata."""

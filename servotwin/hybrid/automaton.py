@@ -1,0 +1,101 @@
+"""A piecewise-affine automaton: per mode a linear flow, linear guards and linear resets.
+
+Everything is homogeneous in the state: constants, ramps and polynomial inputs are states of an exosystem (a constant ``1`` with zero
+derivative makes a flow affine). So no threshold in the whole kernel is absolute, and scaling a start by a power of two scales the
+whole trajectory bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from servotwin.errors import InvalidInput
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Leave the mode when ``row @ x`` becomes positive.
+
+    Parameters
+    ----------
+    row : (n,) array
+        The mode admits flow where ``row @ x <= 0``.
+    target : int
+        Index of the mode entered.
+    reset : (n, n) array, optional
+        ``x`` becomes ``reset @ x`` at the event; None leaves it.
+    label, side : str, int
+        Names for the event table.
+    """
+
+    row: ArrayLike
+    target: int
+    reset: ArrayLike | None = None
+    label: str = ""
+    side: int = 0
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Flow ``x' = flow @ x`` while no guard is positive."""
+
+    flow: ArrayLike
+    guards: tuple[Guard, ...] = ()
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Automaton:
+    """Modes over one common state; compared and hashed by identity.
+
+    Parameters
+    ----------
+    modes : tuple of Mode
+        Flows are ``(n, n)``, guard rows ``(n,)``.
+    names : tuple of str
+        One name per state.
+
+    Raises
+    ------
+    InvalidInput
+        When shapes disagree, a number is not finite or a target does not exist.
+    """
+
+    modes: tuple[Mode, ...]
+    names: tuple[str, ...]
+    flows: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        for mode in self.modes:
+            _check(f"flow of mode {mode.name!r}", mode.flow, (n, n))
+            for guard in mode.guards:
+                _check(f"guard {guard.label!r} of mode {mode.name!r}", guard.row, (n,))
+                if guard.reset is not None:
+                    _check(f"reset of guard {guard.label!r}", guard.reset, (n, n))
+                if not 0 <= guard.target < len(self.modes):
+                    raise InvalidInput(f"guard {guard.label!r} leads to mode {guard.target}; modes are 0 to {len(self.modes) - 1}")
+        object.__setattr__(self, "flows", np.array([mode.flow for mode in self.modes], dtype=float))
+
+    @cached_property
+    def fastest(self) -> float:
+        """Largest eigenvalue magnitude of any mode, 1/s."""
+        return float(max(np.abs(np.linalg.eigvals(flow)).max() for flow in self.flows))
+
+    def index(self, name: str) -> int:
+        """Index of the state called `name`."""
+        return self.names.index(name)
+
+
+def _check(what: str, value: ArrayLike, shape: tuple[int, ...]) -> None:
+    array = np.asarray(value, dtype=float)
+    if array.shape != shape:
+        raise InvalidInput(f"{what} has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise InvalidInput(f"{what} holds a number that is not finite")

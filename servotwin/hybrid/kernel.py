@@ -1,0 +1,358 @@
+"""The compiled kernel: exact flow, events located to rounding, none missed.
+
+A *place* is a search step and a fraction of it in [0, 1); time is ``(step + fraction) * h``. Between events the state is advanced by tables
+of ``exp(A t) - I``; a guard is looked at as in `tables`, coarse first, and wherever it might become positive again at the next finer
+scale, down to its Taylor polynomial inside one step, whose first root is the event.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.polynomial import first_positive
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PARTS, PIECES, TERMS, Tables
+
+DONE, FULL, ZENO = 0, 1, 2
+# More events than this inside one search step, or mode changes at one instant, is Zeno behaviour or sliding.
+EVENTS_PER_STEP = 1000
+CHANGES_AT_ONCE = 64
+# A guard value or derivative below this part of its own terms is rounding, hence zero.
+SIGNIFICANT = 1e-13
+_PART_TERMS = 9
+
+
+class Record(NamedTuple):
+    """Growing output: segments (start of a stretch of one flow) and events; ``size[0]`` segments and ``size[1]`` events are filled."""
+
+    size: NDArray[np.int64]
+    step: NDArray[np.int64]
+    fraction: Array
+    mode: NDArray[np.int64]
+    state: Array
+    event_step: NDArray[np.int64]
+    event_fraction: Array
+    event_mode: NDArray[np.int64]
+    event_guard: NDArray[np.int64]
+    event_forced: NDArray[np.bool_]
+
+
+class Scratch(NamedTuple):
+    """Working memory of one run."""
+
+    rows: Array
+    series: Array
+    change: Array
+    term: Array
+
+
+@compiled
+def advance(table: Array, base: int, x: Array, change: Array) -> None:
+    """``x += P @ x`` with the transposed ``(n, n)`` matrix at `base`."""
+    n = np.uint64(x.size)
+    for i in range(n):
+        change[i] = 0.0
+    at = np.uint64(base)
+    for j in range(n):
+        factor = x[j]
+        for i in range(n):
+            change[i] += table[at + i] * factor
+        at += n
+    for i in range(n):
+        x[i] += change[i]
+
+
+@compiled
+def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
+    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
+    n = np.uint64(t.states)
+    part = min(int(fraction * PARTS), PARTS - 1)
+    rest = fraction * PARTS - part
+    change, term = scratch.change, scratch.term
+    if part > 0:
+        advance(t.jump_part, (mode * PARTS + part) * t.states * t.states, x, change)
+    for i in range(n):
+        term[i] = x[i]
+    for order in range(1, _PART_TERMS):
+        factor = rest / order
+        for i in range(n):
+            change[i] = 0.0
+        at = np.uint64(mode * t.states * t.states)
+        for j in range(n):
+            scaled = term[j] * factor
+            for i in range(n):
+                change[i] += t.flow_part[at + i] * scaled
+            at += n
+        for i in range(n):
+            term[i] = change[i]
+            x[i] += change[i]
+
+
+@compiled
+def scan(table: Array, base: int, rows: int, x: Array, out: Array) -> float:
+    """Fill ``out[:rows]`` with the Bernstein rows at `base` times `x`; return the largest."""
+    count = np.uint64(rows)
+    at = np.uint64(base)
+    for r in range(count):
+        out[r] = table[at + r] * x[0]
+    for j in range(np.uint64(1), np.uint64(x.size)):
+        at += count
+        factor = x[j]
+        for r in range(count):
+            out[r] += table[at + r] * factor
+    worst = -np.inf
+    for r in range(count):
+        worst = max(worst, out[r])
+    return worst
+
+
+@compiled
+def clean_intervals(out: Array, guards: int, nodes: int, wanted: int) -> int:
+    """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
+    rows = 3 * nodes + 1
+    clean = wanted
+    for g in range(guards):
+        for k in range(clean):
+            at = g * rows + 3 * k
+            if max(out[at], out[at + 1], out[at + 2], out[at + 3]) > 0.0:
+                clean = k
+                break
+    return clean
+
+
+@compiled
+def guard_term(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
+    """Taylor coefficient `order` of a guard, or zero when it is lost in the rounding of its own terms."""
+    base = (mode * t.guards + guard) * t.states * TERMS + order
+    value, size = 0.0, 0.0
+    for i in range(t.states):
+        term = t.taylor[base + i * TERMS] * x[i]
+        value += term
+        size += abs(term)
+    return value if abs(value) > SIGNIFICANT * size else 0.0
+
+
+@compiled
+def is_leaving(t: Tables, mode: int, guard: int, x: Array) -> bool:
+    """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
+    for order in range(TERMS):
+        value = guard_term(t, mode, guard, order, x)
+        if value != 0.0:
+            return value > 0.0
+    return False
+
+
+@compiled
+def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
+    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does not."""
+    n = np.uint64(t.states)
+    c, b = scratch.series, scratch.rows
+    first = 0
+    while first < TERMS and guard_term(t, mode, guard, first, x) == 0.0:
+        first += 1
+    if first == TERMS:
+        return np.inf
+    base = np.uint64((mode * t.guards + guard) * t.states * TERMS)
+    terms = np.uint64(TERMS)
+    for k in range(terms):
+        c[k] = 0.0
+    for i in range(n):
+        factor = x[i]
+        for k in range(terms):
+            c[k] += t.taylor[base + k] * factor
+        base += terms
+    if c[first] > 0.0:
+        return 0.0
+    # Leading zeros are divided out: the guard starts at zero and moves away.
+    power = 1.0
+    for k in range(TERMS - first):
+        c[k] = c[k + first] * power
+        power *= length
+    for k in range(TERMS - first, TERMS):
+        c[k] = 0.0
+    return _search_unit(t, c, b) * length
+
+
+@compiled
+def _search_unit(t: Tables, c: Array, b: Array) -> float:
+    rows = np.uint64(3 * PIECES + 1)
+    for r in range(rows):
+        b[r] = 0.0
+    for k in range(np.uint64(TERMS)):
+        for r in range(rows):
+            b[r] += t.bernstein[k, r] * c[k]
+    for piece in range(PIECES):
+        at = 3 * piece
+        if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
+            root = first_positive(c, piece / PIECES, (piece + 1) / PIECES)
+            if root < np.inf:
+                return root
+    return np.inf
+
+
+@compiled
+def note_segment(record: Record, step: int, fraction: float, mode: int, x: Array) -> None:
+    """Start a segment at a place."""
+    at = record.size[0]
+    record.step[at], record.fraction[at], record.mode[at] = step, fraction, mode
+    for i in range(np.uint64(x.size)):
+        record.state[at, i] = x[i]
+    record.size[0] = at + 1
+
+
+@compiled
+def fire(t: Tables, mode: int, guard: int, x: Array, step: int, fraction: float, forced: bool, record: Record) -> int:
+    """Record the event, apply the guard's reset and return the mode entered."""
+    at = record.size[1]
+    record.event_step[at], record.event_fraction[at] = step, fraction
+    record.event_mode[at], record.event_guard[at], record.event_forced[at] = mode, guard, forced
+    record.size[1] = at + 1
+    if t.has_reset[mode, guard]:
+        old = x.copy()
+        for i in range(t.states):
+            total = 0.0
+            for j in range(t.states):
+                total += t.reset[mode, guard, i, j] * old[j]
+            x[i] = total
+    return t.target[mode, guard]
+
+
+@compiled
+def settle(t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: Record) -> int:
+    """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none."""
+    for _ in range(CHANGES_AT_ONCE):
+        leaving = -1
+        for g in range(t.count[mode]):
+            if is_leaving(t, mode, g, x):
+                leaving = g
+                break
+        if leaving < 0:
+            return mode
+        mode = fire(t, mode, leaving, x, step, fraction, forced, record)
+    return -1
+
+
+@compiled
+def cross(
+    t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: Record, scratch: Scratch
+) -> tuple[int, int]:
+    """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number of events."""
+    place, before = start, record.size[1]
+    while record.size[1] - before < EVENTS_PER_STEP:
+        first, which = np.inf, -1
+        for g in range(t.count[mode]):
+            time = next_crossing(t, mode, g, x, end - place, scratch)
+            if time < first:
+                first, which = time, g
+        if which < 0:
+            advance_fraction(t, mode, x, end - place, scratch)
+            return mode, record.size[1] - before
+        advance_fraction(t, mode, x, first, scratch)
+        place = min(place + first, end)
+        mode = fire(t, mode, which, x, step, place, False, record)
+        mode = settle(t, mode, x, step, place, False, record)
+        if mode < 0:
+            break
+        note_segment(record, step, place, mode, x)
+    return -1, record.size[1] - before
+
+
+@compiled
+def flow_until(
+    t: Tables,
+    x: Array,
+    mode: int,
+    step: int,
+    fraction: float,
+    end_step: int,
+    end_fraction: float,
+    record: Record,
+    scratch: Scratch,
+) -> tuple[int, int, float, int]:
+    """Advance `x` in place from one place to another; return status, place reached (of the failure when Zeno) and mode."""
+    n2 = t.states * t.states
+    coarse_rows, fine_rows = t.guards * (3 * NODES_COARSE + 1), t.guards * (3 * NODES_FINE + 1)
+    calm = 0
+    room = len(record.step) - EVENTS_PER_STEP - 4
+    room_events = len(record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE - 4
+    note_segment(record, step, fraction, mode, x)
+    while step < end_step or fraction < end_fraction:
+        if record.size[0] > room or record.size[1] > room_events:
+            return FULL, step, fraction, mode
+        left = end_step - step
+        if fraction == 0.0 and left >= NODES_FINE and calm >= NODES_FINE:
+            wanted = min(NODES_COARSE, left // NODES_FINE)
+            worst = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, x, scratch.rows)
+            clean = wanted if worst <= 0.0 else clean_intervals(scratch.rows, t.count[mode], NODES_COARSE, wanted)
+            if clean > 0:
+                advance(t.jump_coarse, (mode * NODES_COARSE + clean - 1) * n2, x, scratch.change)
+                step += clean * NODES_FINE
+                note_segment(record, step, 0.0, mode, x)
+            if clean == wanted:
+                continue
+            left = end_step - step
+        if fraction == 0.0 and left > 0:
+            wanted = min(NODES_FINE, left)
+            worst = scan(t.fine, mode * t.states * fine_rows, fine_rows, x, scratch.rows)
+            clean = wanted if worst <= 0.0 else clean_intervals(scratch.rows, t.count[mode], NODES_FINE, wanted)
+            if clean > 0:
+                advance(t.jump_fine, (mode * NODES_FINE + clean - 1) * n2, x, scratch.change)
+                step += clean
+                calm += clean
+                note_segment(record, step, 0.0, mode, x)
+            if clean == wanted:
+                continue
+        stop = 1.0 if step < end_step else end_fraction
+        mode, events = cross(t, mode, x, step, fraction, stop, record, scratch)
+        if mode < 0:
+            return ZENO, step, record.event_fraction[record.size[1] - 1], mode
+        calm = 0 if events > 0 else calm + 1
+        if stop == 1.0:
+            step, fraction = step + 1, 0.0
+        else:
+            fraction = stop
+        note_segment(record, step, fraction, mode, x)
+    return DONE, step, fraction, mode
+
+
+@compiled
+def follow_schedule(
+    t: Tables,
+    x: Array,
+    place: NDArray[np.float64],
+    at: NDArray[np.int64],
+    jump_step: NDArray[np.int64],
+    jump_fraction: Array,
+    jump_value: Array,
+    jump_mode: NDArray[np.int64],
+    record: Record,
+    scratch: Scratch,
+) -> int:
+    """Flow from jump to jump, apply each (NaN keeps a state), settle; the last row only marks the end.
+
+    ``place = [fraction]`` and ``at = [step, mode, next jump, fresh]`` are updated in place, so that a run resumes when `record` has grown.
+    """
+    while True:
+        if at[3] == 1:
+            mode = settle(t, at[1], x, at[0], place[0], True, record)
+            if mode < 0:
+                return ZENO
+            at[1], at[3] = mode, 0
+        j = at[2]
+        status, at[0], place[0], at[1] = flow_until(
+            t, x, at[1], at[0], place[0], jump_step[j], jump_fraction[j], record, scratch
+        )
+        if status != DONE:
+            return status
+        at[2] = j + 1
+        if at[2] == len(jump_step):
+            return DONE
+        for i in range(t.states):
+            if not np.isnan(jump_value[j, i]):
+                x[i] = jump_value[j, i]
+        at[1] = jump_mode[j, at[1]]
+        at[3] = 1

@@ -1,0 +1,76 @@
+"""The first time a polynomial becomes positive: compiled helpers on coefficient arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import compiled
+
+_DEPTH = 40
+_NEWTON_STEPS = 60
+
+
+@compiled
+def value_and_slope(c: Array, t: float) -> tuple[float, float]:
+    """Horner's scheme for the polynomial ``sum c[k] t**k`` and its derivative."""
+    value, slope = c[-1], 0.0
+    for k in range(len(c) - 2, -1, -1):
+        slope = slope * t + value
+        value = value * t + c[k]
+    return value, slope
+
+
+@compiled
+def bracketed_root(c: Array, low: float, high: float) -> float:
+    """Root in [low, high] where ``p(low) <= 0 < p(high)``: Newton from the secant, bisection whenever it leaves the bracket."""
+    at_low, _ = value_and_slope(c, low)
+    at_high, _ = value_and_slope(c, high)
+    t = low - at_low * (high - low) / (at_high - at_low)
+    for _ in range(_NEWTON_STEPS):
+        value, slope = value_and_slope(c, t)
+        if value > 0.0:
+            high = t
+        else:
+            low = t
+        step = value / slope if slope > 0.0 else np.inf
+        new = t - step
+        if not low <= new <= high:
+            new = 0.5 * (low + high)
+        if abs(new - t) <= 2e-16 * abs(new) or value == 0.0:
+            return new
+        t = new
+    return t
+
+
+@compiled
+def first_positive(c: Array, low: float, high: float) -> float:
+    """First t in (low, high] from which ``p > 0``, given ``p(low) <= 0``; inf when there is none.
+
+    Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero or rises through it monotonically.
+    """
+    starts, ends = np.empty(_DEPTH + 2), np.empty(_DEPTH + 2)
+    starts[0], ends[0] = low, high
+    smallest = (high - low) * 0.5**_DEPTH
+    top = 1
+    while top > 0:
+        top -= 1
+        a, b = starts[top], ends[top]
+        third = (b - a) / 3.0
+        at_a, slope_a = value_and_slope(c, a)
+        at_b, slope_b = value_and_slope(c, b)
+        inner_a, inner_b = at_a + third * slope_a, at_b - third * slope_b
+        if at_a > 0.0:
+            return a
+        if max(inner_a, inner_b, at_b) <= 0.0:
+            continue
+        rises = at_b > 0.0 and slope_a >= 0.0 and slope_b > 0.0 and inner_b >= inner_a
+        if rises or b - a <= smallest:
+            if at_b > 0.0:
+                return bracketed_root(c, a, b)
+            continue
+        middle = 0.5 * (a + b)
+        starts[top], ends[top] = middle, b
+        starts[top + 1], ends[top + 1] = a, middle
+        top += 2
+    return np.inf

@@ -1,0 +1,117 @@
+"""The numbers that the kernel needs for one automaton and one search step, in flat arrays.
+
+Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every step, and a single step
+as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; the table's rows give that cubic's Bernstein
+coefficients, so "no coefficient above zero" means "the cubic does not leave the mode", and one product settles a whole block.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.exponential import Long, expm1, powers, taylor_rows
+
+NODES_COARSE = 16
+NODES_FINE = 8
+PARTS = 32
+PIECES = 4
+# |eigenvalue| * step <= 2 by the choice of the step: 2**26 / 26! = 2e-19.
+TERMS = 26
+SPECTRAL_STEP = 2.0
+
+
+class Tables(NamedTuple):
+    """Flat tables; `M` modes, `n` states, `G` guards per mode (padded with rows of -0)."""
+
+    states: int
+    guards: int
+    count: NDArray[np.int64]  # (M,) guards of each mode
+    target: NDArray[np.int64]  # (M, G)
+    has_reset: NDArray[np.bool_]  # (M, G)
+    reset: Array  # (M, G, n, n)
+    coarse: Array  # M * n * (G * 49): Bernstein rows over 16 intervals of 8 steps
+    fine: Array  # M * n * (G * 25): the same over 8 intervals of one step
+    taylor: Array  # M * G * n * TERMS
+    rows: Array  # (M, G, n)
+    jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
+    jump_fine: Array  # M * 8 * n * n, transposed
+    jump_part: Array  # M * 32 * n * n, transposed: exp(A j step / 32) - I
+    flow_part: Array  # M * n * n, transposed: A step / 32
+    bernstein: Array  # (TERMS, 13): Taylor coefficients on [0, 1] to Bernstein rows over 4 intervals
+
+
+def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
+    """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and k."""
+    divisor = max(1, int(np.ceil(automaton.fastest * sample_step / SPECTRAL_STEP - 0.05)))
+    return sample_step / divisor, divisor
+
+
+def build_tables(automaton: Automaton, step: float) -> Tables:
+    """All tables of `automaton` for one search step in seconds."""
+    n, modes = len(automaton.names), automaton.modes
+    guards = max(1, *(len(mode.guards) for mode in modes))
+    count = np.array([len(mode.guards) for mode in modes])
+    target = np.zeros((len(modes), guards), dtype=np.int64)
+    has_reset = np.zeros((len(modes), guards), dtype=bool)
+    reset = np.zeros((len(modes), guards, n, n))
+    rows = np.zeros((len(modes), guards, n))
+    for m, mode in enumerate(modes):
+        for g, guard in enumerate(mode.guards):
+            target[m, g], rows[m, g] = guard.target, guard.row
+            if guard.reset is not None:
+                has_reset[m, g], reset[m, g] = True, guard.reset
+    parts = [_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))]
+    stacked = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in zip(*parts, strict=True)]
+    return Tables(n, guards, count, target, has_reset, reset, *stacked[:3], rows, *stacked[3:], _bernstein_of_taylor())
+
+
+def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
+    unit = expm1(flow, step)
+    fine = powers(unit, NODES_FINE)
+    coarse = powers(fine[-1], NODES_COARSE)
+    part = np.concatenate([np.zeros((1, *flow.shape), np.longdouble), powers(expm1(flow, step / PARTS), PARTS - 1)])
+    taylor = np.array([taylor_rows(row, flow, step, TERMS).T for row in rows])
+    slopes = rows @ flow
+    return (
+        _bernstein_rows(rows, slopes * (NODES_FINE * step), coarse),
+        _bernstein_rows(rows, slopes * step, fine),
+        taylor,
+        coarse.transpose(0, 2, 1),
+        fine.transpose(0, 2, 1),
+        part.transpose(0, 2, 1),
+        (flow.T * (step / PARTS)).astype(np.longdouble),
+    )
+
+
+def _bernstein_rows(rows: Array, slopes: Array, deviations: Long) -> Long:
+    """Bernstein rows of every guard over the intervals between nodes 0, 1, ... (`deviations`), ``(n, G * (3 * intervals + 1))``."""
+    nodes = len(deviations) + 1
+    values = np.empty((len(rows), 3 * nodes - 2, rows.shape[1]), dtype=np.longdouble)
+    for node in range(nodes):
+        change = deviations[node - 1] if node else np.zeros_like(deviations[0])
+        value, third = rows + rows @ change, (slopes + slopes @ change) / 3
+        values[:, 3 * node] = value
+        if node < nodes - 1:
+            values[:, 3 * node + 1] = value + third
+        if node:
+            values[:, 3 * node - 1] = value - third
+    return np.ascontiguousarray(values.reshape(-1, rows.shape[1]).T)
+
+
+def _bernstein_of_taylor() -> Array:
+    order = np.arange(TERMS)
+    result = np.empty((TERMS, 3 * PIECES + 1))
+    for node in range(PIECES + 1):
+        place = node / PIECES
+        value = place**order
+        third = np.concatenate([[0.0], order[1:] * place ** (order[1:] - 1)]) / (3 * PIECES)
+        result[:, 3 * node] = value
+        if node < PIECES:
+            result[:, 3 * node + 1] = value + third
+        if node:
+            result[:, 3 * node - 1] = value - third
+    return result
