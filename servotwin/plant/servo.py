@@ -89,7 +89,7 @@ class Servo:
 
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
-        """One of the paper's servos: "paper", "table1" or "paper-gain2" (facts E1 say how they differ)."""
+        """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 say how they differ)."""
         if name not in PRESETS:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")

@@ -1,0 +1,129 @@
+"""Noise of the position sensor: Gaussian, white or high-passed, with a stated standard deviation (section 4.3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import linalg, signal
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.signals import Array
+
+PASSBAND_RIPPLE_DB = 1.0
+STOPBAND_ATTENUATION_DB = 40.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Stationary Gaussian noise.
+
+    Parameters
+    ----------
+    std : float
+        m, standard deviation of what comes out (the paper's 0.22 mm; its "20 dB" is another number, erratum E13).
+    band : (float, float)
+        Hz, edges of the high-pass: at least 40 dB down below the first, at most 1 dB above the second (erratum E18).
+        The paper's 10 and 50 Hz give a Butterworth filter of fourth order near 42 Hz. Not used by white noise.
+    kind : "highpass" or "white"
+
+    Raises
+    ------
+    InvalidInput
+        std is negative or not finite, the band is not 0 < stop < pass, or the kind is unknown.
+    """
+
+    std: float
+    band: tuple[float, float] = (10.0, 50.0)
+    kind: Literal["highpass", "white"] = "highpass"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.std) and self.std >= 0.0):
+            raise InvalidInput(f"noise std = {self.std} m: must be finite and 0 or more")
+        if self.kind not in ("highpass", "white"):
+            raise InvalidInput(f"noise kind = {self.kind!r}: must be 'highpass' or 'white'")
+        stop, passed = self.band
+        if not 0.0 < stop < passed < math.inf:
+            raise InvalidInput(f"noise band = {self.band} Hz: must be 0 < stop < pass, finite")
+
+    def filter(self, rate: float) -> Array:
+        """(sections, 6) second-order sections of unit noise gain at a sample rate (Hz)."""
+        if self.kind == "white":
+            return np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+        stop, passed = self.band
+        if not passed < 0.5 * rate:
+            raise InvalidInput(
+                f"noise band = {self.band} Hz: the pass edge must be below half the sample rate of {rate} Hz"
+            )
+        order, edge = signal.buttord(passed, stop, PASSBAND_RIPPLE_DB, STOPBAND_ATTENUATION_DB, fs=rate)
+        sections: Array = signal.butter(order, edge, "highpass", output="sos", fs=rate)
+        sections[0, :3] /= noise_gain(sections)
+        return sections
+
+    def source(self, rate: float, rng: np.random.Generator) -> NoiseSource:
+        """A source that goes on from block to block, stationary from its first sample."""
+        sections = self.filter(rate)
+        A, B, _, _ = state_space(sections)
+        start = _square_root(linalg.solve_discrete_lyapunov(A, np.outer(B, B))) @ rng.standard_normal(B.size)
+        return NoiseSource(self.std, sections, start.reshape(-1, 2), rng)
+
+    def samples(self, n: int, rate: float, rng: np.random.Generator) -> Array:
+        """(n,) m, the first n samples of `source`.
+
+        Parameters
+        ----------
+        n : int
+        rate : float
+            Hz, sample rate.
+        rng : numpy.random.Generator
+            The only randomness used.
+        """
+        return self.source(rate, rng).block(n)
+
+
+@dataclass
+class NoiseSource:
+    """Filter, state and generator of a noise that is drawn in blocks; how it is cut into blocks changes nothing."""
+
+    std: float
+    sections: Array
+    state: Array
+    rng: np.random.Generator
+
+    def block(self, n: int) -> Array:
+        """(n,) m, the next n samples."""
+        out, self.state = signal.sosfilt(self.sections, self.rng.standard_normal(n), zi=self.state)
+        return np.asarray(self.std * out)
+
+
+def noise_gain(sections: Array) -> float:
+    """Standard deviation of the filter's output for unit white noise: sqrt of the sum of its squared impulse response.
+
+    In closed form: C P C' + D^2 with P the solution of the discrete Lyapunov equation P = A P A' + B B'.
+    """
+    A, B, C, D = state_space(sections)
+    P = linalg.solve_discrete_lyapunov(A, np.outer(B, B))
+    return float(np.sqrt(C @ P @ C + D * D))
+
+
+def state_space(sections: Array) -> tuple[Array, Array, Array, float]:
+    """(A, B, C, D) of a cascade of second-order sections, whose state is that of `scipy.signal.sosfilt`."""
+    size = 2 * len(sections)
+    A, B, C, D = np.zeros((size, size)), np.zeros(size), np.zeros(size), 1.0
+    for i, (b0, b1, b2, _, a1, a2) in enumerate(sections):
+        own = slice(2 * i, 2 * i + 2)
+        drive = np.array([b1 - a1 * b0, b2 - a2 * b0])
+        A[own] = np.outer(drive, C)
+        A[own, own] = [[-a1, 1.0], [-a2, 0.0]]
+        B[own] = drive * D
+        C, D = b0 * C, b0 * D
+        C[2 * i] = 1.0
+    return A, B, C, D
+
+
+def _square_root(covariance: Array) -> Array:
+    """A root of a symmetric positive semidefinite matrix (white noise has none to take a Cholesky factor of)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
