@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from importlib import resources
 from numbers import Real
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import servofile
+from servotwin.plant import linear, servofile
+from servotwin.plant.linear import LinearSystem
+from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import motor_matrices
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
@@ -28,6 +30,16 @@ PRESETS = ("paper", "table1", "paper-gain2")
 _POSITIVE = {"J": "kg m^2", "p": "m/rad", "L": "H", "R": "ohm", "k_T": "N m/A", "k_B": "V s/rad"}
 _PER_MASS = {"m": "kg", "k": "N/m", "c": "N s/m"}
 _CONTROLLER_FIELDS = tuple(field.name for field in dataclasses.fields(Controller))
+
+
+class Control(NamedTuple):
+    """A servo's systems as python-control StateSpace objects."""
+
+    G1: Any
+    G2: Any
+    C: Any
+    loop: Any
+    closed_loop: Any
 
 
 @dataclass(frozen=True)
@@ -116,7 +128,9 @@ class Servo:
     def _from_table(cls, table: Table) -> Servo:
         values, gains = servofile.read(table)
         try:
-            return cls(controller=Controller(**gains), **values)
+            servo = cls(controller=Controller(**gains), **values)
+            servo.check_loop()
+            return servo
         except InvalidInput as error:
             raise InvalidInput(f"{table.source}: {error}") from None
 
@@ -178,6 +192,57 @@ class Servo:
     def motor(self) -> tuple[Array, Array, Array]:
         """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
         return motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
+
+    def G1(self) -> LinearSystem:
+        """Voltage to the unloaded motor's angle (Eq 8)."""
+        return linear.motor(self)
+
+    def G2(self) -> LinearSystem:
+        """Angle of the screw to the position of the last mass (Eq 13)."""
+        return linear.structure(self)
+
+    def plant(self) -> LinearSystem:
+        """Voltage to the position of the last mass without a gap; G1 G2 with a rigid screw."""
+        return linear.plant(self)
+
+    def loop(self, controller: Controller | None = None) -> LinearSystem:
+        """L = C_PIDF G1 G2 and, where the controller has one, the loop filter; in continuous time, without a gap."""
+        law = controller or self.controller
+        forward = linear.series(linear.pidf(law), linear.plant(self))
+        return linear.series(forward, linear.loop_filter(law))
+
+    def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
+        """Reference to the position of the last mass (Eq 15), in continuous time, without a gap."""
+        law = controller or self.controller
+        forward = linear.series(linear.pidf(law), linear.plant(self))
+        return linear.feedback(forward, linear.loop_filter(law))
+
+    def margins(self, controller: Controller | None = None) -> Margins:
+        """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
+        return margins(self.loop(controller), self.closed_loop(controller))
+
+    def check_loop(self, controller: Controller | None = None) -> None:
+        """Refuse a controller that does not even stabilise the servo without a gap.
+
+        Raises
+        ------
+        InvalidInput
+            With the fastest growing pole.
+        """
+        poles = self.closed_loop(controller).poles()
+        worst = poles[np.argmax(poles.real)]
+        if not worst.real < 0.0:
+            law = controller or self.controller
+            gains = f"Kp = {law.Kp:g}, Ki = {law.Ki:g}, Kd = {law.Kd:g}, Tf = {law.Tf:g} s"
+            raise InvalidInput(
+                f"the controller with {gains} is unstable on this servo even without a gap: a closed-loop pole lies at "
+                f"{worst.real:.3g} {worst.imag:+.3g}j 1/s; all must have a negative real part"
+            )
+
+    def to_control(self) -> Control:
+        """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
+        systems = (self.G1(), self.G2(), linear.pidf(self.controller), self.loop(), self.closed_loop())
+        return Control(*(system.to_control() for system in systems))
 
     def _plant_values(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "controller"}

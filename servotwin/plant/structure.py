@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import polynomial as poly
 
+from servotwin.plant.polynomials import minus, product, times
 from servotwin.plant.signals import Array
 
 
@@ -105,7 +105,7 @@ def transfer(m: Array, k: Array, c: Array, k_d: float = math.inf) -> tuple[Array
     The dynamic stiffness is tridiagonal, so its determinant is a continuant and the cofactor of q_n is the product
     of the couplings c_i s + k_i (Eq 13 for n = 3); nothing is inverted.
     """
-    couplings = product([np.array([k[i], c[i]]) for i in range(1, m.size)])
+    couplings = product(np.array([k[i], c[i]]) for i in range(1, m.size))
     inner = _determinant(m[1:], k[1:], c[1:])
     if math.isinf(k_d):
         return couplings, inner, inner
@@ -120,14 +120,6 @@ def _determinant(m: Array, k: Array, c: Array) -> Array:
     for i in range(m.size - 2, -1, -1):
         diagonal = np.array([k[i] + k[i + 1], c[i] + c[i + 1], m[i]])
         coupling = np.array([k[i + 1], c[i + 1]])
-        square = poly.polymul(poly.polymul(coupling, coupling), beyond)
-        beyond, here = here, poly.polysub(poly.polymul(diagonal, here), square)
-    return np.asarray(here)
-
-
-def product(factors: list[Array]) -> Array:
-    """Product of polynomials (ascending)."""
-    result = np.array([1.0])
-    for factor in factors:
-        result = poly.polymul(result, factor)
-    return np.asarray(result)
+        square = product([coupling, coupling, beyond])
+        beyond, here = here, minus(times(diagonal, here), square)
+    return here
