@@ -1,0 +1,251 @@
+"""What crosses the link: round trips, quantisation, and that nothing but InvalidMessage comes out of bad bytes."""
+
+import json
+import math
+from array import array
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin import messages
+from servotwin.messages import (
+    Acknowledge,
+    Channel,
+    Hello,
+    InvalidMessage,
+    Message,
+    Reason,
+    Receipt,
+    Update,
+    Window,
+    checksum,
+    decode,
+    decode_json,
+    encode,
+    encode_json,
+    pack_channel,
+    unpack_channel,
+)
+
+SAMPLES = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e200, max_value=1e200)
+
+
+def window(**changes: Any) -> Window:
+    channels = (pack_channel("position", "m", [0.0, 1e-3, 2e-3]), pack_channel("theta_m", "rad", [1.0, 1.0, 1.0]))
+    values: dict[str, Any] = {
+        "servo": "axis-1", "boot": "b0", "sequence": 4, "start": 20.0, "rate": 5000.0, "channels": channels,
+        "reference_changes": ((20.0, 1e-3),), "parameter_version": 2, "model_version": "paper", "reason": "reference",
+        "crc": checksum(channels),
+    }  # fmt: skip
+    return Window(**{**values, **changes})
+
+
+UPDATE = Update("axis-1", 3, 2, ("b0", 4), 20.0, 0.1, 0.01, (0.08, None), "OK", 1e-4, 60.0)
+RECEIPT = Receipt("axis-1", 3, True, 110_000, Reason.APPLIED, 3, "b0")
+HELLO = Hello("axis-1", "b0", 0.0, 5000.0, 0, 0.0, "paper")
+ACKNOWLEDGE = Acknowledge("axis-1", "b0", 4)
+
+
+@pytest.mark.parametrize("message", [window(), UPDATE, RECEIPT, HELLO, ACKNOWLEDGE])
+def test_messages_survive_the_bytes(message: Message) -> None:
+    assert decode(encode(message)) == message
+
+
+@pytest.mark.parametrize("message", [UPDATE, RECEIPT, HELLO, ACKNOWLEDGE])
+def test_parameter_messages_are_json_too(message: Any) -> None:
+    text = encode_json(message)
+    assert decode_json(text) == message
+    assert json.loads(text)["type"].endswith("/1")
+
+
+def test_a_window_knows_who_it_is() -> None:
+    w = window()
+    assert w.identity == ("axis-1", "b0", 4)
+    assert w.samples == 3
+    assert w.channel("theta_m") is w.channels[1]
+    assert w.channel("voltage") is None
+
+
+@given(st.lists(SAMPLES, min_size=1, max_size=60))
+def test_quantisation_error_is_at_most_half_a_step(samples: list[float]) -> None:
+    channel = pack_channel("x", "m", samples)
+    rounding = 4 * max(math.ulp(x) for x in samples)
+    back = unpack_channel(channel)
+    assert all(abs(a - b) <= 0.5 * channel.scale * (1 + 1e-9) + rounding for a, b in zip(samples, back, strict=True))
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=60))
+def test_the_whole_int16_range_is_used(samples: list[float]) -> None:
+    channel = pack_channel("x", "m", samples)
+    codes = array("h", channel.data)
+    if max(samples) - min(samples) < 1e-250:
+        return
+    assert (min(codes), max(codes)) == (-32768, 32767)
+
+
+def test_codes_are_little_endian() -> None:
+    assert pack_channel("x", "m", [0.0, 65535.0, 32769.0]).data == b"\x00\x80\xff\x7f\x01\x00"
+
+
+@pytest.mark.parametrize("value", [0.0, -3.7e-5, 1e300])
+def test_constants_and_single_samples_are_exact(value: float) -> None:
+    for count in (1, 7):
+        channel = pack_channel("x", "m", [value] * count)
+        assert channel.scale == 0.0
+        assert list(unpack_channel(channel)) == [value] * count
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        ([], "no samples"),
+        ([0.0, math.nan], "sample 1 is nan m"),
+        ([math.inf, 0.0], "sample 0 is inf m"),
+        ([-1e308, 1e308], "too large"),
+    ],
+)
+def test_what_cannot_be_packed_is_named(samples: list[float], words: str) -> None:
+    with pytest.raises(InvalidMessage, match=words):
+        pack_channel("position", "m", samples)
+
+
+@given(st.binary(max_size=300))
+def test_garbage_is_refused_and_nothing_else(data: bytes) -> None:
+    for function in (decode, decode_json):
+        with pytest.raises(InvalidMessage):
+            function(data)
+
+
+@dataclass
+class Damage:
+    position: float
+    value: int
+    cut: int
+
+
+DAMAGE = st.builds(Damage, st.floats(0, 1, exclude_max=True), st.integers(0, 255), st.integers(0, 3))
+
+
+@given(st.sampled_from([window(), UPDATE, RECEIPT, HELLO, ACKNOWLEDGE]), st.lists(DAMAGE, min_size=1, max_size=6))
+def test_damaged_messages_decode_or_are_refused(message: Message, damages: list[Damage]) -> None:
+    for encoder, decoder in ((encode, decode), (msgspec.json.encode, decode_json)):
+        data = bytearray(encoder(message))
+        for damage in damages:
+            data[int(damage.position * len(data))] = damage.value
+        try:
+            decoder(bytes(data[: len(data) - damages[0].cut]))
+        except InvalidMessage:
+            continue
+
+
+@given(st.recursive(st.none() | st.integers(-9, 9) | st.text(max_size=4), lambda x: st.lists(x, max_size=3)))
+def test_foreign_objects_are_refused(thing: object) -> None:
+    for tag in ("window/1", "update/1", "receipt/1", "hello/1", "ack/1", "window/2"):
+        with pytest.raises(InvalidMessage):
+            decode(msgspec.msgpack.encode({"type": tag, "servo": thing}))
+
+
+@pytest.mark.parametrize(
+    "data", [b"\x91" * 100_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
+)
+def test_bombs_are_refused(data: bytes) -> None:
+    with pytest.raises(InvalidMessage):
+        decode(data)
+
+
+def test_deep_nesting_in_an_ignored_field_is_refused() -> None:
+    data = bytearray(encode(ACKNOWLEDGE))
+    data[0] += 1
+    data += b"\xa1x" + b"\x91" * 100_000 + b"\x01"
+    with pytest.raises(InvalidMessage):
+        decode(bytes(data))
+
+
+def test_size_is_limited_before_parsing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(messages, "_decoder", None)
+    with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
+        decode(b"x" * 11, limit=10)
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_the_checksum_covers_samples_and_scales(channel: int) -> None:
+    good = window().channels[channel]
+    flipped = bytes([good.data[0] ^ 1]) + good.data[1:]
+    for change in ({"data": flipped}, {"scale": 1.0}, {"offset": 9.0}, {"name": "voltage"}, {"unit": "V"}):
+        channels = list(window().channels)
+        channels[channel] = msgspec.structs.replace(good, **change)
+        with pytest.raises(InvalidMessage, match="checksum"):
+            decode(encode(window(channels=tuple(channels))))
+
+
+def test_every_single_bit_flip_in_the_samples_is_found() -> None:
+    data = encode(window())
+    start = data.index(window().channels[0].data)
+    for position in range(start, start + 6):
+        for bit in range(8):
+            broken = bytearray(data)
+            broken[position] ^= 1 << bit
+            with pytest.raises(InvalidMessage, match="checksum"):
+                decode(bytes(broken))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rate": 0.0},
+        {"rate": math.nan},
+        {"start": math.inf},
+        {"reference_changes": ((math.nan, 0.0),)},
+        {"channels": (pack_channel("a", "m", [0.0]), pack_channel("b", "m", [0.0, 1.0]))},
+        {"channels": (pack_channel("a", "m", [0.0]), pack_channel("a", "m", [0.0]))},
+    ],
+)
+def test_inconsistent_windows_cannot_be_made(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidMessage):
+        window(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"servo": ""}, {"servo": "../x"}, {"servo": "a\n"}, {"sequence": -1}, {"crc": 2**32}, {"boot": "x" * 65}],
+)
+def test_fields_out_of_range_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidMessage):
+        decode(encode(window(**changes)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"tolerance": -1e-9},
+        {"tolerance": math.nan},
+        {"gap": math.nan},
+        {"interval": (0.0, math.inf)},
+        {"not_after": math.inf},
+        {"data_time": math.nan},
+    ],
+)
+def test_updates_carry_finite_numbers_or_none(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidMessage):
+        msgspec.structs.replace(UPDATE, **changes)
+
+
+def test_an_unknown_schema_version_is_named() -> None:
+    with pytest.raises(InvalidMessage, match="window/2"):
+        decode(encode(window()).replace(b"window/1", b"window/2"))
+
+
+def test_odd_channels_are_refused() -> None:
+    for data in (b"", b"abc"):
+        with pytest.raises(InvalidMessage, match="int16"):
+            Channel("a", "m", 1.0, 0.0, data)
+
+
+def test_unknown_values_are_none() -> None:
+    assert messages.finite(math.nan) is None
+    assert messages.finite(math.inf) is None
+    assert messages.finite(0.25) == 0.25
