@@ -59,18 +59,12 @@ class LinearSystem:
 
     def step(self, time: ArrayLike) -> Array:
         """(n,) response at equally spaced times (s, from 0) to a unit step, exact by a matrix exponential (Fig 5a)."""
-        from scipy.linalg import expm
-
         time = np.asarray(time, dtype=float)
-        size = self.B.size
-        flow = np.zeros((size + 1, size + 1))
-        flow[:size, :size], flow[:size, size] = self.A, self.B
-        advance = expm(flow * (time[1] - time[0]))
-        states = np.zeros((time.size, size + 1))
-        states[0, size] = 1.0
+        advance, drive = held(self.A, self.B, float(time[1] - time[0]))
+        states = np.zeros((time.size, self.B.size))
         for i in range(1, time.size):
-            states[i] = advance @ states[i - 1]
-        return np.asarray(states @ np.append(self.C, self.D))
+            states[i] = advance @ states[i - 1] + drive
+        return np.asarray(states @ self.C + self.D)
 
     def to_control(self) -> Any:
         """The same system as a python-control StateSpace.
@@ -85,6 +79,17 @@ class LinearSystem:
         except ImportError:
             raise InvalidInput("python-control is not installed; give: pip install 'servotwin[interop]'") from None
         return control.ss(self.A, self.B[:, None], self.C[None, :], [[self.D]])
+
+
+def held(A: Array, B: Array, step: float) -> tuple[Array, Array]:
+    """(A_d, B_d) of x' = A x + B u over `step` seconds of constant u (zero-order hold), by a matrix exponential."""
+    from scipy.linalg import expm
+
+    size = B.size
+    flow = np.zeros((size + 1, size + 1))
+    flow[:size, :size], flow[:size, size] = A, B
+    advance = expm(flow * step)
+    return advance[:size, :size], advance[:size, size]
 
 
 def gain(value: float) -> LinearSystem:

@@ -21,6 +21,7 @@ from servotwin.plant import linear, servofile
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import motor_matrices
+from servotwin.plant.sampled import sampled_poles
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
 from servotwin.tomltable import Table, did_you_mean, parse_toml, read_toml
@@ -222,21 +223,21 @@ class Servo:
         return margins(self.loop(controller), self.closed_loop(controller))
 
     def check_loop(self, controller: Controller | None = None) -> None:
-        """Refuse a controller that does not even stabilise the servo without a gap.
+        """Refuse a controller that does not even stabilise the servo without a gap, at its sample rate if it has one.
 
         Raises
         ------
         InvalidInput
             With the fastest growing pole.
         """
-        poles = self.closed_loop(controller).poles()
-        worst = poles[np.argmax(poles.real)]
+        law = controller or self.controller
+        worst = _worst_pole(self, law)
         if not worst.real < 0.0:
-            law = controller or self.controller
-            gains = f"Kp = {law.Kp:g}, Ki = {law.Ki:g}, Kd = {law.Kd:g}, Tf = {law.Tf:g} s"
+            rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
+            gains = f"Kp = {law.Kp:g} V/m, Ki = {law.Ki:g} V/(m s), Kd = {law.Kd:g} V s/m, Tf = {law.Tf:g} s{rate}"
             raise InvalidInput(
-                f"the controller with {gains} is unstable on this servo even without a gap: a closed-loop pole lies at "
-                f"{worst.real:.3g} {worst.imag:+.3g}j 1/s; all must have a negative real part"
+                f"the controller with {gains} is unstable on this servo even without a gap: its closed loop has a pole "
+                f"at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
             )
 
     def to_control(self) -> Control:
@@ -246,6 +247,15 @@ class Servo:
 
     def _plant_values(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "controller"}
+
+
+def _worst_pole(servo: Servo, controller: Controller) -> complex:
+    """The pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
+    if controller.sample_rate is None:
+        poles = servo.closed_loop(controller).poles()
+        return complex(poles[np.argmax(poles.real)])
+    poles = sampled_poles(servo, controller)
+    return complex(np.log(poles[np.argmax(np.abs(poles))]) * controller.sample_rate)
 
 
 def _spread(value: PerMass, n: int) -> Array:
