@@ -195,7 +195,7 @@ class Table:
 
     def _misspelt(self, key: str) -> str:
         close = difflib.get_close_matches(key, [k for k in self.values if k not in self._asked], n=1)
-        return f"; '{self.path(close[0])}' is not it" if close else ""
+        return f" (found '{self.path(close[0])}' instead)" if close else ""
 
 
 def read_toml(path: str | os.PathLike[str]) -> Table:
