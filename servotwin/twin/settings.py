@@ -1,0 +1,65 @@
+"""What a twin can be told."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from servotwin.errors import InvalidInput
+
+
+@dataclass(frozen=True)
+class TwinSettings:
+    """How a twin estimates, redesigns and insists.
+
+    Parameters
+    ----------
+    method : str
+        Estimator, as `identify.estimate_gap` names them.
+    estimator : object, optional
+        Settings of that estimator; None: its defaults.
+    k_dz : float
+        Dead-zone gain of Eq 21.
+    initial_gap : float
+        rad; what is believed before the first estimate (section 4.2: zero).
+    processing : float
+        s from a window's arrival to the update's departure; the acknowledgement does not wait for it.
+    validity : float
+        s after a window's first sample for which an update that stands on it may still be applied.
+    retry : float
+        s without a receipt after which an update is sent again; longer than a round trip, or each goes out twice.
+    attempts : int
+        How often one update is sent before the twin gives it up.
+
+    Raises
+    ------
+    InvalidInput
+        A value is not a finite number in its range.
+    """
+
+    method: str = "paper"
+    estimator: Any = None
+    k_dz: float = 1.0
+    initial_gap: float = 0.0
+    processing: float = 0.0
+    validity: float = 60.0
+    retry: float = 5.0
+    attempts: int = 4
+
+    def __post_init__(self) -> None:
+        for name, unit in {"k_dz": "", "initial_gap": " rad", "processing": " s"}.items():
+            _check(name, getattr(self, name), unit, "finite and 0 or more", lambda x: x >= 0.0)
+        for name, unit in {"validity": " s", "retry": " s"}.items():
+            _check(name, getattr(self, name), unit, "finite and greater than 0", lambda x: x > 0.0)
+        if isinstance(self.attempts, bool) or not isinstance(self.attempts, int) or self.attempts < 1:
+            raise InvalidInput(f"twin attempts = {self.attempts!r}: must be an integer of 1 or more")
+
+    def replace(self, **changes: Any) -> TwinSettings:
+        """A copy with some values changed, validated again."""
+        return replace(self, **changes)
+
+
+def _check(name: str, value: float, unit: str, allowed: str, accepts: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and accepts(value)):
+        raise InvalidInput(f"twin {name} = {value!r}{unit}: must be {allowed}")

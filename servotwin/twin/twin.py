@@ -1,0 +1,142 @@
+"""The twin of one servo: messages and time in, messages out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
+from servotwin.identify.window import Window
+from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
+from servotwin.messages import Window as WindowMessage
+from servotwin.twin.decode import decode_window
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import Store
+from servotwin.twin.versions import Versions
+
+Estimator = Callable[[Window, float], GapEstimate]
+"""(window, previous gap in rad) -> estimate."""
+Policy = Callable[[GapEstimate], float]
+"""An estimate that is OK -> dead-zone tolerance, m."""
+
+
+class Twin:
+    """Turns windows into estimates and estimates into updates.
+
+    A window is committed to the store, then acknowledged, then estimated, once: a second copy is only acknowledged.
+    Windows may come in any order; every one is estimated, but only one that is newer than all before moves the
+    parameters and the starting point of the next estimate. Only an estimate whose status is OK sets parameters.
+
+    Parameters
+    ----------
+    servo : str
+        Whose messages it takes.
+    estimator : callable
+        (identify.Window, previous gap in rad) -> GapEstimate.
+    policy : callable
+        GapEstimate -> tolerance in m (Eq 21).
+    store : Store
+        Evidence; `add_window` has to return only when the window is safe.
+    settings : TwinSettings
+    """
+
+    def __init__(
+        self, servo: str, estimator: Estimator, policy: Policy, store: Store, settings: TwinSettings | None = None
+    ) -> None:
+        self.servo = servo
+        self.settings = settings or TwinSettings()
+        self._estimator, self._policy, self._store = estimator, policy, store
+        self._versions = Versions()
+        self._gap = self.settings.initial_gap
+        self._sent_at, self._attempts = -math.inf, 0
+
+    def receive(self, message: Message, now: float) -> list[Message]:
+        """What to send after a message that arrived at `now` (s, any steady clock of the twin's own).
+
+        Raises
+        ------
+        InvalidMessage
+            The message is for another servo, or of a kind that only an edge receives.
+        """
+        if message.servo != self.servo:
+            raise InvalidMessage(f"message of servo {message.servo!r} came to the twin of {self.servo!r}")
+        if isinstance(message, WindowMessage):
+            return self._window(message, now)
+        if isinstance(message, Receipt):
+            self._store.add_receipt(message)
+            return self._send(self._versions.settle(message), now)
+        if isinstance(message, Hello):
+            self._versions.hear(message.boot, message.parameter_version)
+            return []
+        raise InvalidMessage(f"a twin does not receive {type(message).__name__} messages")
+
+    def next_wake(self) -> float | None:
+        """When `wake` is due, s; None: nothing is waited for."""
+        return None if self._versions.pending is None else self._sent_at + self.settings.retry
+
+    def wake(self, now: float) -> list[Message]:
+        """The pending update once more when its receipt is overdue; given up after `attempts`."""
+        due = self.next_wake()
+        if due is None or now < due:
+            return []
+        if self._attempts >= self.settings.attempts:
+            self._versions.give_up()
+            return []
+        return self._again(now)
+
+    def estimate(self, message: WindowMessage) -> GapEstimate:
+        """What a window says about the gap; where it cannot be used at all, UNIDENTIFIABLE and why."""
+        try:
+            return self._estimator(decode_window(message), self._gap)
+        except InvalidInput as error:
+            return _nothing(message, str(error))
+
+    def _window(self, message: WindowMessage, now: float) -> list[Message]:
+        new = self._store.add_window(message)
+        acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
+        return [acknowledge, *self._learn(message, now)] if new else [acknowledge]
+
+    def _learn(self, message: WindowMessage, now: float) -> list[Message]:
+        self._versions.hear(message.boot, message.parameter_version)
+        estimate = self.estimate(message)
+        self._store.add_estimate(message, estimate)
+        if not (estimate.ok and self._versions.admits(message)):
+            return []
+        self._gap = estimate.gap
+        return self._send(self._versions.issue(self._draft(message, estimate)), now)
+
+    def _draft(self, message: WindowMessage, estimate: GapEstimate) -> Update:
+        """An update but for its version and base."""
+        low, high = estimate.interval
+        return Update(
+            servo=self.servo,
+            version=1,
+            base_version=0,
+            window=(message.boot, message.sequence),
+            data_time=message.start,
+            gap=finite(estimate.gap),
+            std=finite(estimate.std_total),
+            interval=(finite(low), finite(high)),
+            status=estimate.status.value,
+            tolerance=self._policy(estimate),
+            not_after=message.start + self.settings.validity,
+        )
+
+    def _send(self, update: Update | None, now: float) -> list[Message]:
+        if update is None:
+            return []
+        self._store.add_update(update)
+        self._attempts = 0
+        return self._again(now)
+
+    def _again(self, now: float) -> list[Message]:
+        pending = self._versions.pending
+        self._sent_at, self._attempts = now, self._attempts + 1
+        return [] if pending is None else [pending]
+
+
+def _nothing(message: WindowMessage, reason: str) -> GapEstimate:
+    """The estimate from a window that no estimator accepts."""
+    middle = message.start + 0.5 * (message.samples - 1) / message.rate
+    return GapEstimate(math.nan, math.inf, math.inf, NOTHING_KNOWN, GapStatus.UNIDENTIFIABLE, middle, reasons=(reason,))

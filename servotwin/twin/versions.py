@@ -1,0 +1,86 @@
+"""Which parameters the edge runs, which are on their way, and what may be sent next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import msgspec
+
+from servotwin.messages import Reason, Receipt, Update, Window
+
+
+@dataclass
+class Versions:
+    """The twin's view of one edge's parameter versions.
+
+    Version numbers only rise. The edge swaps a version only for one that names it as its base; when the twin's view
+    was out of date, the receipt says what is in force and the same parameters go out again on that base. Within a boot
+    of the edge, parameters only move forward in the time of their window; a window of an earlier boot never sets any.
+
+    Attributes
+    ----------
+    boot : str or None
+        The edge's current boot; None: nothing was heard yet.
+    in_force : int
+        Newest version known to run at the edge.
+    issued : int
+        Highest version ever given out.
+    pending : Update or None
+        The newest update, while no receipt for it has come.
+    newest : float
+        Data time of the newest update of this boot, s.
+    """
+
+    boot: str | None = None
+    in_force: int = 0
+    issued: int = 0
+    pending: Update | None = None
+    newest: float = -math.inf
+    _earlier: set[str] = field(default_factory=set)
+
+    def hear(self, boot: str, in_force: int) -> bool:
+        """Note what a message says about its boot; False when that boot is over."""
+        if boot in self._earlier:
+            return False
+        if boot != self.boot:
+            self._begin(boot, in_force)
+        self.in_force = max(self.in_force, in_force)
+        self.issued = max(self.issued, self.in_force)
+        return True
+
+    def admits(self, window: Window) -> bool:
+        """Whether parameters that stand on this window would be newer than all before."""
+        return window.boot == self.boot and window.start > self.newest
+
+    def issue(self, update: Update) -> Update:
+        """The update under the next version, on the version that the edge will run when it arrives."""
+        base = self.in_force if self.pending is None else self.pending.version
+        return self._number(update, base)
+
+    def settle(self, receipt: Receipt) -> Update | None:
+        """Note a receipt; the update to send instead when the pending one was refused for its base or number."""
+        if not self.hear(receipt.boot, receipt.parameter_version) or self.pending is None:
+            return None
+        if receipt.version != self.pending.version or receipt.reason is Reason.TOO_SOON:
+            return None
+        refused, self.pending = self.pending, None
+        if receipt.reason is Reason.BASE_MISMATCH or self.in_force > refused.version:
+            return self._number(refused, self.in_force)
+        return None
+
+    def give_up(self) -> None:
+        """Stop waiting for a receipt."""
+        self.pending = None
+
+    def _begin(self, boot: str, in_force: int) -> None:
+        if self.boot is not None:
+            self._earlier.add(self.boot)
+        self.boot, self.in_force = boot, in_force
+        self.pending, self.newest = None, -math.inf
+
+    def _number(self, update: Update, base: int) -> Update:
+        self.issued += 1
+        self.newest = update.data_time
+        self.pending = msgspec.structs.replace(update, version=self.issued, base_version=base)
+        return self.pending
