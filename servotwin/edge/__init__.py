@@ -1,0 +1,1 @@
+"""The machine's side: record, send windows, guard the parameters."""

@@ -1,0 +1,87 @@
+"""A ring buffer of named signals."""
+
+from array import array
+from collections.abc import Iterable, Sequence
+
+from servotwin.errors import InvalidInput
+
+Floats = Iterable[float]
+
+
+class Recorder:
+    """Keeps the last `capacity` samples of each channel; samples are known by their index since the start.
+
+    Parameters
+    ----------
+    names : sequence of str
+    capacity : int
+        Samples per channel.
+    """
+
+    def __init__(self, names: Sequence[str], capacity: int) -> None:
+        if capacity < 1:
+            raise InvalidInput(f"recorder capacity = {capacity!r} samples: must be at least 1")
+        self.names = tuple(names)
+        self.capacity = capacity
+        self.samples = 0
+        self._rings = [array("d", bytes(8 * capacity)) for _ in self.names]
+
+    @property
+    def oldest(self) -> int:
+        """Index of the oldest sample kept."""
+        return max(0, self.samples - self.capacity)
+
+    def append(self, *values: float) -> None:
+        """Record one sample of every channel, in the order of `names`."""
+        place = self.samples % self.capacity
+        for ring, value in zip(self._rings, values, strict=True):
+            ring[place] = value
+        self.samples += 1
+
+    def extend(self, *blocks: "array[float]") -> None:
+        """Record equally long blocks, one per channel in the order of `names`."""
+        count = len(blocks[0])
+        for ring, block in zip(self._rings, blocks, strict=True):
+            self._write(ring, block[max(0, count - self.capacity) :], self.samples + count)
+        self.samples += count
+
+    def cut(self, first: int, last: int) -> dict[str, "array[float]"]:
+        """Samples first ... last - 1 of every channel.
+
+        Raises
+        ------
+        InvalidInput
+            When some are not recorded yet or not kept any more.
+        """
+        if not self.oldest <= first < last <= self.samples:
+            raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
+        return {name: self._read(ring, first, last) for name, ring in zip(self.names, self._rings, strict=True)}
+
+    def _write(self, ring: "array[float]", block: "array[float]", end: int) -> None:
+        """Put a block of at most `capacity` samples where it ends before index `end`."""
+        place = (end - len(block)) % self.capacity
+        room = self.capacity - place
+        ring[place : place + len(block)] = block[:room]
+        ring[: max(0, len(block) - room)] = block[room:]
+
+    def _read(self, ring: "array[float]", first: int, last: int) -> "array[float]":
+        place, count = first % self.capacity, last - first
+        part = ring[place : place + count]
+        return part + ring[: count - len(part)]
+
+
+def as_floats(block: Floats) -> "array[float]":
+    """The block as an array of doubles; buffers of doubles (numpy's) are copied as a whole."""
+    if isinstance(block, array) and block.typecode == "d":
+        return block
+    floats = array("d")
+    try:
+        view = memoryview(block)  # type: ignore[arg-type]
+    except TypeError:
+        floats.extend(block)
+        return floats
+    if view.format == "d" and view.contiguous:
+        floats.frombytes(view.cast("B"))
+    else:
+        floats.extend(block)
+    return floats

@@ -1,0 +1,77 @@
+"""How one servo's agent works."""
+
+import re
+from dataclasses import dataclass, field
+from math import inf, isfinite
+
+from servotwin.edge.guard import Limits, Parameters
+from servotwin.errors import InvalidInput
+from servotwin.link.session import Retry
+from servotwin.messages import NAME_PATTERN
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSettings:
+    """How one servo's agent works.
+
+    Parameters
+    ----------
+    servo, boot : str
+        Names; a new boot name for each start of the edge.
+    sample_rate : float
+        Hz.
+    window_s, pre_trigger_s : float
+        Length of a window, and how much of it lies before the change of the reference; whole samples.
+    retry : Retry
+        When to repeat an unacknowledged window.
+    limits : Limits
+        What updates must respect.
+    parameters : Parameters
+        In force at the start.
+    reference : float
+        Before the first sample, m; the first sample is a change when it differs.
+    model_version : str
+        Description of the servo the edge runs on.
+    """
+
+    servo: str
+    boot: str
+    sample_rate: float
+    window_s: float = 1.0
+    pre_trigger_s: float = 0.0
+    retry: Retry = field(default_factory=Retry)
+    limits: Limits = field(default_factory=Limits)
+    parameters: Parameters = field(default_factory=Parameters)
+    reference: float = 0.0
+    model_version: str = ""
+
+    def __post_init__(self) -> None:
+        for key in ("servo", "boot"):
+            if not re.fullmatch(NAME_PATTERN, getattr(self, key)):
+                raise InvalidInput(f"agent {key} = {getattr(self, key)!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        if not 0.0 < self.sample_rate < inf:
+            raise InvalidInput(f"agent sample_rate = {self.sample_rate!r} Hz: must be greater than 0")
+        for key in ("window_s", "pre_trigger_s"):
+            _check_whole(key, getattr(self, key), self.sample_rate)
+        if self.window_samples < 1:
+            raise InvalidInput(f"agent window_s = {self.window_s!r} s: must be at least one sample")
+        if not 0 <= self.pre_trigger_samples < self.window_samples:
+            allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
+            raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
+
+    @property
+    def window_samples(self) -> int:
+        """Samples per window."""
+        return round(self.window_s * self.sample_rate)
+
+    @property
+    def pre_trigger_samples(self) -> int:
+        """Samples before the change."""
+        return round(self.pre_trigger_s * self.sample_rate)
+
+
+def _check_whole(key: str, seconds: float, rate: float) -> None:
+    """A duration must be a whole number of samples."""
+    samples = seconds * rate
+    if not isfinite(samples) or abs(samples - round(samples)) > 1e-6:
+        raise InvalidInput(f"agent {key} = {seconds!r} s: must be a whole number of samples at {rate!r} Hz")

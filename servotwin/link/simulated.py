@@ -1,0 +1,176 @@
+"""A link on the virtual clock: delay, jitter, loss, duplicates, reordering, outages; every byte string accounted for."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from hashlib import blake2b
+from math import inf, isfinite
+from random import Random
+
+from servotwin.clock import VirtualClock
+from servotwin.errors import InvalidInput
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """How a link treats messages; both directions alike.
+
+    Parameters
+    ----------
+    delay_s, jitter_s : float
+        A message takes delay_s plus up to jitter_s more, evenly distributed.
+    loss, duplicate, reorder : float
+        Probabilities per message: lost; arriving twice; held back by up to hold_s, so that later ones overtake it.
+    hold_s : float
+    outages : tuple of (float, float)
+        (from, to) in s: what is sent or would arrive in between is lost.
+    """
+
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    hold_s: float = 1.0
+    outages: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for key in ("delay_s", "jitter_s", "hold_s"):
+            value = getattr(self, key)
+            if not (isfinite(value) and value >= 0.0):
+                raise InvalidInput(f"link {key} = {value!r} s: must be finite and at least 0")
+        for key in ("loss", "duplicate", "reorder"):
+            if not 0.0 <= getattr(self, key) <= 1.0:
+                raise InvalidInput(f"link {key} = {getattr(self, key)!r}: must be a probability from 0 to 1")
+        for begin, end in self.outages:
+            if not begin < end < inf:
+                raise InvalidInput(f"link outage from {begin!r} s to {end!r} s: must end after it begins")
+
+    def out(self, time: float) -> bool:
+        """Whether the link is cut at that time."""
+        return any(begin <= time < end for begin, end in self.outages)
+
+
+class Fate(StrEnum):
+    """What became of a copy of a message."""
+
+    IN_FLIGHT = "in flight"
+    DELIVERED = "delivered"
+    LOST = "lost"
+    OUTAGE = "lost in an outage"
+
+
+@dataclass(slots=True)
+class Record:
+    """One copy of one message: which, when, and what became of it.
+
+    Attributes
+    ----------
+    serial, copy : int
+        The message's number in its direction; 0, or 1 for a duplicate.
+    data : bytes
+    sent, arrival : float
+        s; the arrival of a lost one is when it would have come.
+    fate : Fate
+    """
+
+    serial: int
+    copy: int
+    data: bytes
+    sent: float
+    arrival: float
+    fate: Fate = Fate.IN_FLIGHT
+
+
+class Line:
+    """One direction of a link.
+
+    Parameters
+    ----------
+    name : str
+        Names its random source, together with `seed`.
+    clock : VirtualClock
+    deliver : callable
+        Called with the bytes when they arrive.
+    settings : LinkSettings
+    seed : int
+    """
+
+    def __init__(
+        self, name: str, clock: VirtualClock, deliver: Callable[[bytes], object], settings: LinkSettings, seed: int
+    ) -> None:
+        self.name, self.settings = name, settings
+        self.offered = 0
+        self.records: list[Record] = []
+        self._clock, self._deliver = clock, deliver
+        self._random = Random(derive_seed(seed, name))
+
+    def send(self, data: bytes) -> None:
+        """Offer a message at the clock's time."""
+        serial, self.offered = self.offered, self.offered + 1
+        first, second, lost, twice = self._delay(), self._delay(), self._chance("loss"), self._chance("duplicate")
+        self._launch(Record(serial, 0, data, self._clock.now, self._clock.now + first), lost)
+        if twice and not lost:
+            self._launch(Record(serial, 1, data, self._clock.now, self._clock.now + second), lost=False)
+
+    def tally(self) -> Counter[Fate]:
+        """How many copies met which fate."""
+        return Counter(record.fate for record in self.records)
+
+    def _launch(self, record: Record, lost: bool) -> None:
+        self.records.append(record)
+        if lost:
+            record.fate = Fate.LOST
+        elif self.settings.out(record.sent):
+            record.fate = Fate.OUTAGE
+        else:
+            self._clock.schedule(record.arrival, partial(self._arrive, record))
+
+    def _arrive(self, record: Record) -> None:
+        if self.settings.out(record.arrival):
+            record.fate = Fate.OUTAGE
+            return
+        record.fate = Fate.DELIVERED
+        self._deliver(record.data)
+
+    def _delay(self) -> float:
+        """Drawn alike whatever the settings, so that changing one leaves the other draws alone."""
+        jitter, hold, held = self._random.random(), self._random.random(), self._chance("reorder")
+        return self.settings.delay_s + jitter * self.settings.jitter_s + held * hold * self.settings.hold_s
+
+    def _chance(self, key: str) -> bool:
+        return self._random.random() < float(getattr(self.settings, key))
+
+
+class SimulatedLink:
+    """Both directions between one servo's edge and its twin.
+
+    Parameters
+    ----------
+    servo : str
+    clock : VirtualClock
+    to_twin, to_edge : callable
+        Called with the bytes that arrive there.
+    settings : LinkSettings
+    seed : int
+    """
+
+    def __init__(
+        self,
+        servo: str,
+        clock: VirtualClock,
+        to_twin: Callable[[bytes], object],
+        to_edge: Callable[[bytes], object],
+        settings: LinkSettings,
+        seed: int,
+    ) -> None:
+        self.up = Line(f"{servo}/up", clock, to_twin, settings, seed)
+        self.down = Line(f"{servo}/down", clock, to_edge, settings, seed)
+
+
+def derive_seed(root: int, *names: str) -> int:
+    """A 64-bit seed for a named random source, the same on every machine and in every run."""
+    text = "\0".join((str(root), *names))
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")
