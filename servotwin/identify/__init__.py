@@ -1,0 +1,1 @@
+"""From measurements to the gap: windows, observers, estimators, and what an estimate says of itself."""

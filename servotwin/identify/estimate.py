@@ -1,0 +1,68 @@
+"""An estimate of the gap is never a bare number: value, spread, interval, status, and what it rests on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+Interval = tuple[float, float]
+NOTHING_KNOWN: Interval = (0.0, math.inf)
+
+
+class GapStatus(StrEnum):
+    """What an estimate may be used for; only OK may reach a controller."""
+
+    OK = "ok"
+    LOWER_BOUND = "lower bound"
+    UNIDENTIFIABLE = "unidentifiable"
+    MODEL_MISMATCH = "model mismatch"
+
+
+@dataclass(frozen=True)
+class GapEstimate:
+    """The total gap as one window shows it.
+
+    Attributes
+    ----------
+    gap : float
+        Total gap, rad; a lower bound where the status says so; NaN when nothing is known.
+    std : float
+        Statistical standard deviation, rad; inf when the window does not determine the gap.
+    std_total : float
+        The same with the systematic error that the method is known to have, rad.
+    interval : (float, float)
+        95 % interval of the gap from `std_total`, rad; its upper end is inf where only a lower bound is known.
+    status : GapStatus
+    time : float
+        Time of the middle of the window, s, to which the value belongs.
+    theta_d0 : float
+        Screw angle at the first sample, rad; NaN when unknown.
+    reasons : tuple of str
+        Why the status is not OK, one sentence each; empty when it is.
+    model_version : str
+        Which model numbers were assumed: `Servo.version`.
+    method : str
+    rms : float
+        Root mean square of the residual over the samples that count, m; NaN when nothing was fitted.
+    evaluations : int
+        Evaluations of the cost.
+    """
+
+    gap: float
+    std: float
+    std_total: float
+    interval: Interval
+    status: GapStatus
+    time: float
+    theta_d0: float = math.nan
+    reasons: tuple[str, ...] = ()
+    model_version: str = ""
+    method: str = ""
+    rms: float = math.nan
+    evaluations: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether the value may be used to set a controller."""
+        return self.status is GapStatus.OK

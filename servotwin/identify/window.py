@@ -1,0 +1,211 @@
+"""A window of measurements as numbers: what every estimator starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.signals import Array
+
+MINIMUM_SAMPLES = 16
+CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
+_JITTER = 0.05  # of a sample interval: what rounded time stamps may deviate from a uniform grid
+
+
+class RunLike(Protocol):
+    """The part of a simulated run that a window is cut from."""
+
+    @property
+    def time(self) -> Array: ...
+    def measured(self, name: str) -> Array: ...
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class Window:
+    """Uniformly sampled measurements of one servo, each channel `(n,)` float64, read-only.
+
+    Parameters
+    ----------
+    position : (n,) array_like
+        Measured position of the last mass, m; at least 16 samples.
+    theta_m : (n,) array_like, optional
+        Motor angle, rad.
+    voltage : (n,) array_like, optional
+        Motor voltage, V.
+    reference : (n,) array_like, optional
+        Position reference, m.
+    sample_rate : float, optional
+        Hz.
+    time : (n,) array_like, optional
+        Sample times, s, uniformly spaced; gives rate and start. Exactly one of `sample_rate` and `time` is needed.
+    start : float
+        Time of the first sample, s; only with `sample_rate`.
+    source : str, optional
+        Where the window comes from, for people; errors begin with it.
+
+    Raises
+    ------
+    InvalidInput
+        A channel is not one-dimensional, has another length than `position`, is too short or holds a value that is not
+        finite; the rate is missing, doubled or not positive; the times are not uniform.
+    """
+
+    position: Array
+    theta_m: Array | None
+    voltage: Array | None
+    reference: Array | None
+    sample_rate: float
+    start: float
+    source: str | None
+
+    def __init__(
+        self,
+        position: ArrayLike,
+        theta_m: ArrayLike | None = None,
+        voltage: ArrayLike | None = None,
+        reference: ArrayLike | None = None,
+        sample_rate: float | None = None,
+        time: ArrayLike | None = None,
+        start: float = 0.0,
+        source: str | None = None,
+    ) -> None:
+        where = f"{source}: " if source else ""
+        given = {"position": position, "theta_m": theta_m, "voltage": voltage, "reference": reference}
+        channels = {name: None if v is None else _channel(where, name, v) for name, v in given.items()}
+        size = _common_size(where, channels)
+        rate, start = _timing(where, size, sample_rate, time, start)
+        for name, value in {**channels, "sample_rate": rate, "start": start, "source": source}.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_run(cls, run: RunLike, start: float, duration: float) -> Window:
+        """The samples of a simulated run from `start` (s) on, `duration` (s) long, as the sensors gave them.
+
+        The last sample is one interval before the end.
+
+        Raises
+        ------
+        InvalidInput
+            The run does not cover the window.
+        """
+        seen: dict[str, Any] = {name: run.measured(name) for name in CHANNELS}
+        whole = cls(**seen, time=run.time)
+        return whole.slice(start, duration)
+
+    def slice(self, start: float, duration: float) -> Window:
+        """The part of `duration` (s) that begins at the sample nearest to `start` (s, on the window's own clock)."""
+        first = round((start - self.start) * self.sample_rate)
+        last = first + round(duration * self.sample_rate)
+        if not 0 <= first < last <= self.position.size:
+            raise InvalidInput(
+                f"{self.where}a window of {duration!r} s from {start!r} s does not lie within the measurements, "
+                f"which last from {self.start!r} s to {self.start + self.duration!r} s"
+            )
+        parts: dict[str, Any] = {name: value[first:last] for name, value in self.channels.items()}
+        return Window(
+            **parts, sample_rate=self.sample_rate, start=self.start + first / self.sample_rate, source=self.source
+        )
+
+    def replace(self, **channels: ArrayLike) -> Window:
+        """A copy with other samples in some channels, validated again."""
+        return replace(self, **channels)  # type: ignore[arg-type]
+
+    @property
+    def channels(self) -> Mapping[str, Array]:
+        """The channels that were measured, by name."""
+        values = {name: getattr(self, name) for name in CHANNELS}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def time(self) -> Array:
+        """(n,) sample times, s."""
+        return self.start + np.arange(self.position.size) / self.sample_rate
+
+    @property
+    def duration(self) -> float:
+        """Number of samples over sample rate, s."""
+        return self.position.size / self.sample_rate
+
+    @property
+    def mid_time(self) -> float:
+        """Time half-way between the first and the last sample, s."""
+        return self.start + 0.5 * (self.position.size - 1) / self.sample_rate
+
+    @property
+    def where(self) -> str:
+        """What a message about this window begins with."""
+        return f"{self.source}: " if self.source else ""
+
+
+def _channel(where: str, name: str, values: ArrayLike) -> Array:
+    try:
+        samples = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidInput(f"{where}{name} must be an array of numbers in {CHANNELS[name]}") from None
+    if samples.ndim != 1 or samples.size < MINIMUM_SAMPLES:
+        raise InvalidInput(f"{where}{name} has shape {samples.shape}: must be (n,) with n >= {MINIMUM_SAMPLES} samples")
+    wrong = np.flatnonzero(~np.isfinite(samples))
+    if wrong.size:
+        index = int(wrong[0])
+        raise InvalidInput(
+            f"{where}{name}[{index}] = {samples[index]} {CHANNELS[name]}: every sample must be a finite number"
+        )
+    samples.flags.writeable = False
+    return samples
+
+
+def _common_size(where: str, channels: Mapping[str, Array | None]) -> int:
+    """Number of samples of every channel that was measured; position, the first, always is."""
+    sizes = {name: samples.size for name, samples in channels.items() if samples is not None}
+    size = sizes["position"]
+    for name, other in sizes.items():
+        if other != size:
+            raise InvalidInput(f"{where}{name} has {other} samples and position {size}: must be equally many")
+    return size
+
+
+def _timing(
+    where: str, size: int, sample_rate: float | None, time: ArrayLike | None, start: float
+) -> tuple[float, float]:
+    """(sample rate, Hz; time of the first sample, s)."""
+    if (sample_rate is None) == (time is None):
+        raise InvalidInput(f"{where}a window needs exactly one of sample_rate (Hz) and time (s)")
+    if time is not None:
+        return _uniform(where, size, time, start)
+    rate = _number(where, "sample_rate", "Hz", sample_rate)
+    if rate <= 0.0:
+        raise InvalidInput(f"{where}sample_rate = {rate!r} Hz: must be greater than 0")
+    return rate, _number(where, "start", "s", start)
+
+
+def _number(where: str, name: str, unit: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise InvalidInput(f"{where}{name} = {value!r} {unit}: must be a finite number")
+    return number
+
+
+def _uniform(where: str, size: int, time: ArrayLike, start: float) -> tuple[float, float]:
+    """Rate and start of uniformly spaced times."""
+    if start != 0.0:
+        raise InvalidInput(f"{where}start = {start!r} s: must be left out when time is given, which says it already")
+    times = np.array(time, dtype=np.float64)
+    if times.shape != (size,):
+        raise InvalidInput(f"{where}time has shape {times.shape} and position ({size},): must be equal")
+    interval = (times[-1] - times[0]) / (size - 1)
+    grid = times[0] + interval * np.arange(size)
+    wrong = np.flatnonzero(~(np.abs(times - grid) <= _JITTER * interval))
+    if wrong.size or not interval > 0.0:
+        index = int(wrong[0]) if wrong.size else size - 1
+        raise InvalidInput(
+            f"{where}time[{index}] = {times[index]} s: times must be finite, increasing and uniformly spaced"
+        )
+    return 1.0 / interval, float(times[0])

@@ -1,0 +1,75 @@
+"""The paper's redesign: a dead zone as wide as the estimated gap (Eq 21)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import GapEstimate
+from servotwin.plant.servo import Servo
+
+
+@dataclass(frozen=True)
+class Redesign:
+    """What a policy decided.
+
+    Attributes
+    ----------
+    tolerance : float or None
+        Half-width of the dead zone, m; None: leave the controller as it is.
+    gap : float
+        Total gap, rad, that the tolerance was made for; NaN without one.
+    reason : str
+        Why the controller is left as it is; empty otherwise.
+    """
+
+    tolerance: float | None
+    gap: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class PaperPolicy:
+    """tolerance = k_dz p gap, from estimates that are OK only.
+
+    Parameters
+    ----------
+    k_dz : float
+        Tolerances per gap (the paper's is one).
+    smoothing : float
+        Share of the previous gap that is kept at each update, 0 (none: Eq 21 as printed) up to, but not including, 1.
+        The paper's "l = 1/10" may mean this; it is not explained there (erratum E14).
+
+    Raises
+    ------
+    InvalidInput
+        A value is outside its range.
+    """
+
+    k_dz: float = 1.0
+    smoothing: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.k_dz) and self.k_dz >= 0.0):
+            raise InvalidInput(f"policy k_dz = {self.k_dz!r}: must be finite and at least 0")
+        if not 0.0 <= self.smoothing < 1.0:
+            raise InvalidInput(f"policy smoothing = {self.smoothing!r}: must be at least 0 and below 1")
+
+    def redesign(self, servo: Servo, estimate: GapEstimate, previous_gap: float | None = None) -> Redesign:
+        """The tolerance for an estimate.
+
+        Parameters
+        ----------
+        servo : Servo
+            For its pitch.
+        estimate : GapEstimate
+        previous_gap : float, optional
+            rad, the gap of the last redesign; None: there was none, so nothing is smoothed.
+        """
+        if not estimate.ok:
+            because = f": {'; '.join(estimate.reasons)}" if estimate.reasons else ""
+            return Redesign(None, math.nan, f"the estimate is {estimate.status.value}{because}")
+        kept = self.smoothing if previous_gap is not None else 0.0
+        gap = (1.0 - kept) * estimate.gap + kept * (previous_gap or 0.0)
+        return Redesign(servo.tolerance_for(gap, self.k_dz), gap, "")
