@@ -93,8 +93,8 @@ def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: S
 
 
 @compiled
-def scan(table: Array, base: int, rows: int, x: Array, out: Array) -> float:
-    """Fill ``out[:rows]`` with the Bernstein rows at `base` times `x`; return the largest."""
+def scan(table: Array, base: int, rows: int, x: Array, out: Array) -> int:
+    """Fill ``out[:rows]`` with the Bernstein rows at `base` times `x`; return how many are positive."""
     count = np.uint64(rows)
     at = np.uint64(base)
     for r in range(count):
@@ -104,10 +104,10 @@ def scan(table: Array, base: int, rows: int, x: Array, out: Array) -> float:
         factor = x[j]
         for r in range(count):
             out[r] += table[at + r] * factor
-    worst = -np.inf
+    positive = 0
     for r in range(count):
-        worst = max(worst, out[r])
-    return worst
+        positive += out[r] > 0.0
+    return positive
 
 
 @compiled
@@ -125,25 +125,33 @@ def clean_intervals(out: Array, guards: int, nodes: int, wanted: int) -> int:
 
 
 @compiled
-def guard_term(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
-    """Taylor coefficient `order` of a guard, or zero when it is lost in the rounding of its own terms."""
-    base = (mode * t.guards + guard) * t.states * TERMS + order
-    value, size = 0.0, 0.0
-    for i in range(t.states):
-        term = t.taylor[base + i * TERMS] * x[i]
-        value += term
-        size += abs(term)
-    return value if abs(value) > SIGNIFICANT * size else 0.0
+def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
+    """The part of a guard's Taylor coefficients (in steps) that is rounding: of all the terms that ever enter them."""
+    size = 0.0
+    for i in range(np.uint64(t.states)):
+        size += t.sizes[mode, guard, i] * abs(x[i])
+    return SIGNIFICANT * size
+
+
+@compiled
+def leading_term(t: Tables, mode: int, guard: int, x: Array) -> tuple[int, float]:
+    """Order and value of the first Taylor coefficient of a guard that is not rounding; order TERMS when all are."""
+    limit = rounding(t, mode, guard, x)
+    base = (mode * t.guards + guard) * t.states * TERMS
+    for order in range(TERMS):
+        value = 0.0
+        for i in range(t.states):
+            value += t.taylor[base + i * TERMS + order] * x[i]
+        if abs(value) > limit:
+            return order, value
+    return TERMS, 0.0
 
 
 @compiled
 def is_leaving(t: Tables, mode: int, guard: int, x: Array) -> bool:
     """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
-    for order in range(TERMS):
-        value = guard_term(t, mode, guard, order, x)
-        if value != 0.0:
-            return value > 0.0
-    return False
+    _, value = leading_term(t, mode, guard, x)
+    return value > 0.0
 
 
 @compiled
@@ -151,11 +159,11 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does not."""
     n = np.uint64(t.states)
     c, b = scratch.series, scratch.rows
-    first = 0
-    while first < TERMS and guard_term(t, mode, guard, first, x) == 0.0:
-        first += 1
+    first, leading = leading_term(t, mode, guard, x)
     if first == TERMS:
         return np.inf
+    if leading > 0.0:
+        return 0.0
     base = np.uint64((mode * t.guards + guard) * t.states * TERMS)
     terms = np.uint64(TERMS)
     for k in range(terms):
@@ -165,8 +173,6 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         for k in range(terms):
             c[k] += t.taylor[base + k] * factor
         base += terms
-    if c[first] > 0.0:
-        return 0.0
     # Leading zeros are divided out: the guard starts at zero and moves away.
     power = 1.0
     for k in range(TERMS - first):
@@ -262,6 +268,31 @@ def cross(
 
 
 @compiled
+def step_once(t: Tables, mode: int, x: Array, step: int, record: Record, scratch: Scratch) -> int:
+    """Advance `x` in place by one search step; return the mode, -1 when Zeno. One product when nothing happens."""
+    n = np.uint64(t.states)
+    rows = np.uint64(t.states + 4 * t.guards)
+    out = scratch.rows
+    at = np.uint64(mode * t.states) * rows
+    for r in range(rows):
+        out[r] = t.single[at + r] * x[0]
+    for j in range(np.uint64(1), n):
+        at += rows
+        factor = x[j]
+        for r in range(rows):
+            out[r] += t.single[at + r] * factor
+    positive = 0
+    for r in range(n, rows):
+        positive += out[r] > 0.0
+    if positive == 0:
+        for i in range(n):
+            x[i] += out[i]
+        return mode
+    mode, _ = cross(t, mode, x, step, 0.0, 1.0, record, scratch)
+    return mode
+
+
+@compiled
 def flow_until(
     t: Tables,
     x: Array,
@@ -286,8 +317,8 @@ def flow_until(
         left = end_step - step
         if fraction == 0.0 and left >= NODES_FINE and calm >= NODES_FINE:
             wanted = min(NODES_COARSE, left // NODES_FINE)
-            worst = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, x, scratch.rows)
-            clean = wanted if worst <= 0.0 else clean_intervals(scratch.rows, t.count[mode], NODES_COARSE, wanted)
+            positive = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, x, scratch.rows)
+            clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_COARSE, wanted)
             if clean > 0:
                 advance(t.jump_coarse, (mode * NODES_COARSE + clean - 1) * n2, x, scratch.change)
                 step += clean * NODES_FINE
@@ -297,8 +328,8 @@ def flow_until(
             left = end_step - step
         if fraction == 0.0 and left > 0:
             wanted = min(NODES_FINE, left)
-            worst = scan(t.fine, mode * t.states * fine_rows, fine_rows, x, scratch.rows)
-            clean = wanted if worst <= 0.0 else clean_intervals(scratch.rows, t.count[mode], NODES_FINE, wanted)
+            positive = scan(t.fine, mode * t.states * fine_rows, fine_rows, x, scratch.rows)
+            clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_FINE, wanted)
             if clean > 0:
                 advance(t.jump_fine, (mode * NODES_FINE + clean - 1) * n2, x, scratch.change)
                 step += clean

@@ -36,11 +36,12 @@ class Tables(NamedTuple):
     coarse: Array  # M * n * (G * 49): Bernstein rows over 16 intervals of 8 steps
     fine: Array  # M * n * (G * 25): the same over 8 intervals of one step
     taylor: Array  # M * G * n * TERMS
-    rows: Array  # (M, G, n)
     jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # M * 8 * n * n, transposed
     jump_part: Array  # M * 32 * n * n, transposed: exp(A j step / 32) - I
     flow_part: Array  # M * n * n, transposed: A step / 32
+    single: Array  # M * n * (n + G * 4): the first of jump_fine beside the first interval's rows of fine
+    sizes: Array  # (M, G, n): sum over the orders of abs(taylor)
     bernstein: Array  # (TERMS, 13): Taylor coefficients on [0, 1] to Bernstein rows over 4 intervals
 
 
@@ -66,7 +67,8 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
                 has_reset[m, g], reset[m, g] = True, guard.reset
     parts = [_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))]
     stacked = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in zip(*parts, strict=True)]
-    return Tables(n, guards, count, target, has_reset, reset, *stacked[:3], rows, *stacked[3:], _bernstein_of_taylor())
+    sizes = np.abs(stacked[2].reshape(len(modes), guards, n, TERMS)).sum(axis=3)
+    return Tables(n, guards, count, target, has_reset, reset, *stacked, sizes, _bernstein_of_taylor())
 
 
 def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
@@ -84,6 +86,7 @@ def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
         fine.transpose(0, 2, 1),
         part.transpose(0, 2, 1),
         (flow.T * (step / PARTS)).astype(np.longdouble),
+        np.hstack([unit.T, _bernstein_rows(rows, slopes * step, fine[:1])]),
     )
 
 

@@ -25,6 +25,8 @@ from servotwin.hybrid.kernel import (
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables, build_tables, search_step
 
 _BLOCK = NODES_COARSE * NODES_FINE
+# Jumps this close to a search step, in steps, are taken on it.
+_ON_GRID = 1e-9
 
 
 class ZenoError(RuntimeError):
@@ -78,8 +80,8 @@ class Trajectory:
         self.step, self.divisor = step / self.refine, divisor * self.refine
         self.tables = tables_for(self.automaton, self.step)
         self.state = np.array(self.state, dtype=float)
-        self.record = _new_record(len(self.state), 4 * EVENTS_PER_STEP, 4 * EVENTS_PER_STEP)
-        self._scratch = _new_scratch(self.tables)
+        self.record = new_record(len(self.state), 4 * EVENTS_PER_STEP, 4 * EVENTS_PER_STEP)
+        self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
         self._at = np.array([0, self.mode, 0, 1], dtype=np.int64)
         self._rows: dict[bytes, Array] = {}
@@ -102,21 +104,7 @@ class Trajectory:
         ZenoError
             With the time and the mode at which no flow is admitted.
         """
-        n = len(self.state)
-        times = np.array([jump.time / self.step for jump in jumps])
-        whole = np.rint(times)
-        near = np.abs(times - whole) <= 1e-9
-        steps = np.where(near, whole, np.floor(times)).astype(np.int64)
-        fractions = np.where(near, 0.0, times - np.floor(times))
-        values = np.full((len(jumps) + 1, n), np.nan)
-        modes = np.tile(np.arange(len(self.automaton.modes)), (len(jumps) + 1, 1))
-        for j, jump in enumerate(jumps):
-            for index, value in jump.values.items():
-                values[j, index] = value
-            if jump.mode_map is not None:
-                modes[j] = jump.mode_map
-        end = sample * self.divisor
-        self._follow(np.append(steps, end), np.append(fractions, 0.0), values, modes)
+        self._follow(*schedule_of(jumps, self.step, self.automaton, sample * self.divisor))
 
     def _follow(self, steps: NDArray[np.int64], fractions: Array, values: Array, modes: NDArray[np.int64]) -> None:
         self._at[2] = 0
@@ -131,7 +119,7 @@ class Trajectory:
                 )
             if status != FULL:
                 break
-            self.record = _grown(self.record)
+            self.record = grown(self.record)
         self.mode = int(self._at[1])
 
     def set(self, values: dict[int, float], mode_map: Sequence[int] | None = None) -> None:
@@ -189,7 +177,26 @@ class Trajectory:
         return [(time, *self.labels[mode][guard], bool(forced)) for time, mode, guard, forced in triples]
 
 
-def _new_record(n: int, segments: int, events: int) -> Record:
+def schedule_of(
+    jumps: Sequence[Jump], step: float, automaton: Automaton, end: int
+) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64]]:
+    """Jumps as the kernel's arrays: step, fraction, states to set (NaN keeps) and mode map, with a last row for the end."""
+    times = np.array([jump.time / step for jump in jumps] + [float(end)])
+    whole = np.rint(times)
+    near = np.abs(times - whole) <= _ON_GRID
+    steps = np.where(near, whole, np.floor(times)).astype(np.int64)
+    values = np.full((len(times), len(automaton.names)), np.nan)
+    modes = np.tile(np.arange(len(automaton.modes)), (len(times), 1))
+    for j, jump in enumerate(jumps):
+        for index, value in jump.values.items():
+            values[j, index] = value
+        if jump.mode_map is not None:
+            modes[j] = jump.mode_map
+    return steps, np.where(near, 0.0, times - np.floor(times)), values, modes
+
+
+def new_record(n: int, segments: int, events: int) -> Record:
+    """An empty record with room for so many segments and events."""
     return Record(
         np.zeros(2, dtype=np.int64),
         np.empty(segments, dtype=np.int64),
@@ -204,16 +211,18 @@ def _new_record(n: int, segments: int, events: int) -> Record:
     )
 
 
-def _grown(record: Record) -> Record:
-    larger = _new_record(record.state.shape[1], 2 * len(record.step), 2 * len(record.event_step))
+def grown(record: Record) -> Record:
+    """A copy with twice the room."""
+    larger = new_record(record.state.shape[1], 2 * len(record.step), 2 * len(record.event_step))
     for old, new in zip(record, larger, strict=True):
         new[: len(old)] = old
     return larger
 
 
-def _new_scratch(tables: Tables) -> Scratch:
+def new_scratch(tables: Tables) -> Scratch:
+    """Working memory for one run."""
     n = tables.states
-    rows = max(tables.guards * (3 * NODES_COARSE + 1), 3 * TERMS)
+    rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
     return Scratch(np.zeros(rows), np.zeros(TERMS), np.zeros(n), np.zeros(n))
 
 

@@ -252,7 +252,7 @@ def _saturated(
     )
     zones = [_Zone(name, wanted, integral, derivative, linear)]
     for side, suffix in ((1, " high"), (-1, " low")):
-        back = (side * limit - wanted) / controller.tracking
+        back = (side * limit - wanted) / max(controller.tracking, controller.Tf * 1e-3)
         leave = (*guards, (limit - side * wanted, name, "saturate", 0))
         zones.append(_Zone(name + suffix, side * limit, integral + back, derivative, leave))
     return zones

@@ -1,0 +1,116 @@
+"""The continuous loop (the paper's): plant and law as one automaton, exact between located events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.trajectory import Jump, Trajectory
+from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation.run import Inputs, quantised
+
+
+@dataclass
+class ContinuousEngine:
+    """Engine of a `Simulation` whose controller has no sample rate."""
+
+    servo: Servo
+    controller: Controller
+    inputs: Inputs
+    theta_d0: float = 0.0
+    refine: int = 1
+
+    def __post_init__(self) -> None:
+        if self.controller.rate_limit is not None:
+            raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
+        signals = {name: self._signal(name) for name in INPUTS}
+        shape = Shape(*(degree(pieces) for pieces in signals.values()), dead_zone=self.inputs.tolerance is not None)
+        self.loop = continuous_loop(self.servo, self.controller, shape)
+        state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
+        for name, pieces in signals.items():
+            for index, value in self.loop.input_values(name, at_zero(pieces)).items():
+                state[index] = value
+        if self.controller.voltage_limit is not None:
+            state[self.loop.automaton.index("voltage limit")] = self.controller.voltage_limit
+        if self.controller.loop_filter_hz is not None:
+            state[self.loop.automaton.index("filtered")] = self.loop.rows["position"][0] @ state
+        mode = self.loop.mode(self._zone(float(self.loop.rows["error"][0] @ state), signals["tolerance"]))
+        self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
+
+    def _signal(self, name: str) -> PiecewiseCubic:
+        pieces: PiecewiseCubic | None = getattr(self.inputs, name)
+        return PiecewiseCubic.constant(0.0) if pieces is None else pieces
+
+    def _zone(self, error: float, tolerance: PiecewiseCubic) -> str:
+        if self.inputs.tolerance is None:
+            return "on"
+        if abs(error) <= self.controller.enter * float(tolerance.value(0.0)):
+            return "inside"
+        return "+" if error > 0.0 else "-"
+
+    @property
+    def index(self) -> int:
+        """Sample reached."""
+        return self.trajectory.samples - 1
+
+    def advance(self, index: int) -> None:
+        """Go on to a sample through the inputs' knots."""
+        begin, end = self.trajectory.time, index / self.inputs.sample_rate
+        knots: dict[float, dict[int, float]] = {}
+        opening: set[float] = set()
+        for name in INPUTS:
+            pieces = self._signal(name)
+            for time, coefficients in zip(pieces.times, pieces.coeffs, strict=True):
+                if begin < time <= end and time > 0.0:
+                    knots.setdefault(float(time), {}).update(self.loop.input_values(name, coefficients))
+            if name == "gap":
+                opening = {float(time) for time in pieces.jumps}
+        jumps = [Jump(t, knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
+        self.trajectory.advance(index, jumps)
+
+    def set_tolerance(self, tolerance: float) -> None:
+        """A constant tolerance from now on."""
+        self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
+
+    def channel(self, name: str) -> Array:
+        """A channel at every sample so far."""
+        if name == "measured_position":
+            return quantised(self.channel("position"), self.servo.position_resolution)
+        return self.trajectory.sampled(self.loop.rows[name])
+
+    def events(self) -> list[tuple[float, str, int, bool]]:
+        """Time, kind, side, and whether the state (not a jump) triggered it."""
+        return [(time, kind, side, not forced) for time, kind, side, forced in self.trajectory.events()]
+
+
+def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:
+    """State at rest: motor at 0, screw at `theta_d0` clamped into the gap, structure in equilibrium."""
+    if not np.isfinite(theta_d0):
+        raise InvalidInput(f"theta_d0 = {theta_d0} rad: must be finite")
+    state = np.zeros(len(loop.automaton.names))
+    screw = float(np.clip(theta_d0, -0.5 * gap, 0.5 * gap))
+    state[loop.automaton.index("theta_d")] = screw
+    rest = servo.chain().equilibrium(servo.p * screw)
+    first = loop.automaton.index("chain0")
+    state[first : first + rest.size] = rest if screw else 0.0
+    return state
+
+
+def at_zero(pieces: PiecewiseCubic) -> Array:
+    """Ascending coefficients, about time 0, of the piece in force there."""
+    piece = max(int(np.searchsorted(pieces.times, 0.0, side="right")) - 1, 0)
+    shift, c = -pieces.times[piece], pieces.coeffs[piece]
+    return np.array(
+        [
+            ((c[3] * shift + c[2]) * shift + c[1]) * shift + c[0],
+            (3.0 * c[3] * shift + 2.0 * c[2]) * shift + c[1],
+            3.0 * c[3] * shift + c[2],
+            c[3],
+        ]
+    )

@@ -1,0 +1,151 @@
+"""What a simulation returns: channels at the samples, evaluated when asked for, and the table of events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from servotwin.hybrid.automaton import Array
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
+
+EVENT_TYPE = np.dtype([("time", float), ("kind", "U10"), ("side", np.int8), ("state_triggered", bool)])
+
+
+@dataclass
+class Inputs:
+    """The inputs of a run as piecewise cubics, and the rate of its samples."""
+
+    reference: PiecewiseCubic
+    gap: PiecewiseCubic
+    tolerance: PiecewiseCubic | None
+    sample_rate: float
+
+    def times(self, first: int, last: int) -> Array:
+        """Times of samples first .. last - 1, s."""
+        return np.arange(first, last) / self.sample_rate
+
+    def retune(self, time: float, tolerance: float) -> None:
+        """From `time` on the tolerance is a constant."""
+        assert self.tolerance is not None
+        keep = self.tolerance.times < time
+        times, coeffs = self.tolerance.times[keep], self.tolerance.coeffs[keep]
+        self.tolerance = PiecewiseCubic(np.append(times, time), np.vstack([coeffs, [[tolerance, 0.0, 0.0, 0.0]]]))
+
+    def jumps(self, until: float) -> list[tuple[float, str]]:
+        """Times and kinds (reference, parameter) of the inputs' jumps in (0, until]."""
+        found = [(float(t), "reference") for t in self.reference.jumps]
+        found += [(float(t), "parameter") for t in self.gap.jumps]
+        found += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
+        return sorted((time, kind) for time, kind in found if 0.0 < time <= until)
+
+
+def quantised(values: Array, resolution: float) -> Array:
+    """The nearest whole counts; resolution 0 is an ideal sensor."""
+    return values if resolution == 0.0 else np.round(values / resolution) * resolution
+
+
+@dataclass
+class Run:
+    """A simulated run, N samples from time 0; arrays are ``(N,)`` unless said otherwise, right-continuous at jumps.
+
+    Channels are evaluated when first asked for.
+    """
+
+    servo: Servo
+    inputs: Inputs
+    samples: int
+    channel: Callable[[str], Array] = field(repr=False)
+    list_events: Callable[[], list[tuple[float, str, int, bool]]] = field(repr=False)
+    _kept: dict[str, Array] = field(default_factory=dict, repr=False)
+
+    def _get(self, name: str, make: Callable[[], Array]) -> Array:
+        if name not in self._kept:
+            self._kept[name] = make()
+        return self._kept[name]
+
+    @property
+    def sample_rate(self) -> float:
+        """Hz."""
+        return self.inputs.sample_rate
+
+    @property
+    def time(self) -> Array:
+        """Sample times, s."""
+        return self._get("time", lambda: self.inputs.times(0, self.samples))
+
+    @property
+    def q(self) -> Array:
+        """Positions of the masses, m, ``(N, n)``."""
+        return self._get("q", lambda: np.column_stack([self._column(f"q{i + 1}") for i in range(self.servo.n)]))
+
+    @property
+    def position(self) -> Array:
+        """Position of the last mass, m."""
+        return self._column("position")
+
+    @property
+    def q3(self) -> Array:
+        """Position of the last mass, the paper's name for it, m."""
+        return self.position
+
+    @property
+    def theta_m(self) -> Array:
+        """Motor angle, rad."""
+        return self._column("theta_m")
+
+    @property
+    def theta_d(self) -> Array:
+        """Screw angle behind the gap, rad."""
+        return self._column("theta_d")
+
+    @property
+    def voltage(self) -> Array:
+        """Voltage applied, V."""
+        return self._column("voltage")
+
+    @property
+    def reference(self) -> Array:
+        """Wanted position, m."""
+        return self._get("reference", lambda: self.inputs.reference.value(self.time))
+
+    @property
+    def gap(self) -> Array:
+        """Total gap, rad."""
+        return self._get("gap", lambda: self.inputs.gap.value(self.time))
+
+    @property
+    def tolerance(self) -> Array:
+        """Half-width of the dead zone, m; zero without one."""
+        pieces = self.inputs.tolerance
+        return self._get("tolerance", lambda: np.zeros(self.samples) if pieces is None else pieces.value(self.time))
+
+    @property
+    def measured_position(self) -> Array:
+        """What the position sensor gave, noise and quantisation included, m."""
+        return self._column("measured_position")
+
+    @property
+    def events(self) -> np.recarray[tuple[int], np.dtype[np.void]]:
+        """Table of (time s, kind, side, state_triggered), in time order.
+
+        Kinds: contact and release of the backlash, enter and leave of the dead zone, saturate (side 0: ends), reference and parameter
+        (jumps of the inputs). `state_triggered` is false for those two and for what they flip at once.
+        """
+        end = (self.samples - 1) / self.sample_rate
+        jumps = [(time, kind, 0, False) for time, kind in self.inputs.jumps(end)]
+        rows = sorted(jumps + self.list_events(), key=lambda event: event[0])
+        return np.array(rows, dtype=EVENT_TYPE).view(np.recarray)
+
+    def measured(self, name: str) -> Array:
+        """A channel as its sensor gave it: theta_m, position, voltage or reference."""
+        if name == "position":
+            return self.measured_position
+        if name == "theta_m":
+            return quantised(self.theta_m, self.servo.encoder_resolution)
+        return self.voltage if name == "voltage" else self.reference
+
+    def _column(self, name: str) -> Array:
+        return self._get(name, lambda: self.channel(name))

@@ -1,0 +1,347 @@
+"""The sampled loop (the deployed one): the edge's tick, compiled, on the exact plant; gap contacts inside a sample are located."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.simulation.continuous import at_zero, plant_start
+from servotwin.control import law
+from servotwin.control.controller import Controller
+from servotwin.control.law import LawParameters, LawState
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.kernel import (
+    CHANGES_AT_ONCE,
+    DONE,
+    EVENTS_PER_STEP,
+    FULL,
+    ZENO,
+    Record,
+    Scratch,
+    follow_schedule,
+    step_once,
+)
+from servotwin.hybrid.tables import Tables, search_step
+from servotwin.hybrid.trajectory import Jump, ZenoError, grown, new_record, new_scratch, schedule_of, tables_for
+from servotwin.plant.automaton import degree, sampled_plant
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import Servo
+from servotwin.simulation.run import Inputs, quantised
+
+tick = compiled(law.tick)
+
+
+class Port(NamedTuple):
+    """Where the sampled loop reads and writes the plant's state, and how its steps divide."""
+
+    voltage: int
+    position: Array  # row of the measured position
+    resolution: float
+    recorded: NDArray[np.int64]  # states written at every recorded step
+    tick_every: int
+    record_every: int
+    searches: int  # search steps per base step
+    room: int  # events after which the record counts as full
+
+
+class Drive(NamedTuple):
+    """What the tick is given, from tick `first` on."""
+
+    first: int
+    reference: Array
+    noise: Array
+    enter: Array
+    leave: Array
+
+
+class Output(NamedTuple):
+    """What is recorded, by absolute index."""
+
+    states: Array  # (recorded, samples)
+    measured: Array  # (ticks,)
+    active: NDArray[np.int8]  # (ticks,)
+
+
+@compiled
+def take_tick(
+    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+) -> LawState:
+    """Measure, tick, hold the voltage."""
+    y = 0.0
+    for j in range(len(x)):
+        y += port.position[j] * x[j]
+    k = i - drive.first
+    y += drive.noise[k]
+    if port.resolution > 0.0:
+        y = np.round(y / port.resolution) * port.resolution
+    now = LawParameters(
+        parameters.Kp,
+        parameters.integral_step,
+        parameters.derivative_gain,
+        parameters.filter_step,
+        drive.enter[k],
+        drive.leave[k],
+        parameters.voltage_limit,
+        parameters.rate_step,
+        parameters.loop_step,
+        parameters.tracking_step,
+    )
+    state = tick(now, state, drive.reference[k], y)
+    x[port.voltage] = state.voltage
+    output.measured[i] = y
+    output.active[i] = 1 if state.active > 0.5 else 0
+    return state
+
+
+@compiled
+def tick_and_record(
+    base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+) -> LawState:
+    """What happens at a base step before the plant flows on."""
+    if base % port.tick_every == 0:
+        state = take_tick(base // port.tick_every, x, parameters, state, port, drive, output)
+    if base % port.record_every == 0:
+        row = base // port.record_every
+        for j in range(len(port.recorded)):
+            output.states[j, row] = x[port.recorded[j]]
+    return state
+
+
+@compiled
+def run_ticks(
+    t: Tables,
+    x: Array,
+    base: int,
+    end: int,
+    mode: int,
+    parameters: LawParameters,
+    state: LawState,
+    port: Port,
+    drive: Drive,
+    output: Output,
+    record: Record,
+    scratch: Scratch,
+) -> tuple[int, int, int, LawState]:
+    """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when `record` is full."""
+    while base < end:
+        if record.size[1] > port.room:
+            return FULL, base, mode, state
+        state = tick_and_record(base, x, parameters, state, port, drive, output)
+        for search in range(base * port.searches, (base + 1) * port.searches):
+            mode = step_once(t, mode, x, search, record, scratch)
+            record.size[0] = 0
+            if mode < 0:
+                return ZENO, base, mode, state
+        base += 1
+    return DONE, base, mode, state
+
+
+_CHUNK = 1 << 15
+_RECORDED = ("theta_m", "theta_d", "voltage")
+
+
+@dataclass
+class SampledEngine:
+    """Engine of a `Simulation` whose controller has a sample rate."""
+
+    servo: Servo
+    controller: Controller
+    inputs: Inputs
+    theta_d0: float
+    samples: int
+    noise: Noise | None
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        assert self.controller.sample_rate is not None
+        self.tick_every, self.record_every = _divide(self.controller.sample_rate, self.inputs.sample_rate)
+        self.rate = self.inputs.sample_rate * self.record_every
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap))
+        step, searches = search_step(self.plant.automaton, 1.0 / self.rate)
+        self.step, self.tables = step, tables_for(self.plant.automaton, step)
+        self.state = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
+        for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
+            self.state[index] = value
+        self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
+        self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
+        self.scratch = new_scratch(self.tables)
+        self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
+        self.parameters = self.controller.law(None)
+        self.source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
+        self.port = self._make_port(searches)
+        total = (self.samples - 1) * self.record_every + 1
+        ticks = -(-total // self.tick_every)
+        rows = len(self.port.recorded)
+        self.output = Output(np.empty((rows, self.samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8))
+
+    def _make_port(self, searches: int) -> Port:
+        names = self.plant.automaton.names
+        chain = [i for i, name in enumerate(names) if name.startswith("chain")]
+        recorded = [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
+        return Port(
+            names.index("voltage"),
+            np.ascontiguousarray(self.plant.rows["position"][0]),
+            self.servo.position_resolution,
+            np.array(recorded),
+            self.tick_every,
+            self.record_every,
+            searches,
+            len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
+        )
+
+    @property
+    def index(self) -> int:
+        """Sample reached."""
+        return self.base // self.record_every
+
+    def advance(self, index: int) -> None:
+        """Go on to a sample; at the last one of the horizon the tick is taken too."""
+        end = index * self.record_every
+        for base, jumps in self._knots(end):
+            self._run(base)
+            self._run_through(base, jumps)
+        self._run(end)
+        if index == self.samples - 1:
+            drive = self._drive(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
+            self.law_state = tick_and_record(
+                self.base, self.state, self.parameters, self.law_state, self.port, drive, self.output
+            )
+            self.finished = True
+
+    def _knots(self, end: int) -> list[tuple[int, list[Jump]]]:
+        """Base steps during or at the end of which the gap's cubic changes, with those changes."""
+        gap, found = self.inputs.gap, dict[int, list[Jump]]()
+        jumping = set(gap.jumps.tolist())
+        for time, coefficients in zip(gap.times.tolist(), gap.coeffs, strict=True):
+            place = time * self.rate
+            base = int(np.ceil(place - 1e-9)) - 1
+            if self.base <= base < end:
+                opened = self.plant.opened if time in jumping else None
+                found.setdefault(base, []).append(Jump(time, self.plant.input_values("gap", coefficients), opened))
+        return sorted(found.items())
+
+    def _drive(self, first: int, last: int) -> Drive:
+        """Inputs of ticks first .. last - 1."""
+        count = max(last - first, 0)
+        times = np.arange(first, first + count) / self.controller.sample_rate
+        if self.inputs.tolerance is None:
+            enter = leave = np.full(count, -1.0)
+        else:
+            tolerance = self.inputs.tolerance.value(times)
+            zero = tolerance == 0.0
+            enter = np.where(zero, -1.0, self.controller.enter * tolerance)
+            leave = np.where(zero, -1.0, self.controller.leave * tolerance)
+        noise = np.zeros(count) if self.source is None else self.source.block(count)
+        return Drive(first, self.inputs.reference.value(times), noise, enter, leave)
+
+    def _run(self, end: int) -> None:
+        while self.base < end:
+            stop = min(end, self.base + _CHUNK)
+            first, last = -(-self.base // self.tick_every), -(-stop // self.tick_every)
+            drive = self._drive(first, last)
+            while self.base < stop:
+                status, self.base, self.mode, self.law_state = run_ticks(
+                    self.tables,
+                    self.state,
+                    self.base,
+                    stop,
+                    self.mode,
+                    self.parameters,
+                    self.law_state,
+                    self.port,
+                    drive,
+                    self.output,
+                    self.record,
+                    self.scratch,
+                )
+                self._check(status)
+
+    def _run_through(self, base: int, jumps: list[Jump]) -> None:
+        """One base step in which the gap's cubic changes."""
+        drive = self._drive(-(-base // self.tick_every), base // self.tick_every + 1)
+        self.law_state = tick_and_record(
+            base, self.state, self.parameters, self.law_state, self.port, drive, self.output
+        )
+        at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
+        schedule = schedule_of(jumps, self.step, self.plant.automaton, (base + 1) * self.port.searches)
+        status = follow_schedule(self.tables, self.state, np.zeros(1), at, *schedule, self.record, self.scratch)
+        self.mode, self.base = int(at[1]), base + 1
+        self.record.size[0] = 0
+        self._check(status)
+
+    def _check(self, status: int) -> None:
+        if status == ZENO:
+            raise ZenoError(f"the backlash changes mode without end at t = {self.base / self.rate:.9g} s")
+        if status == FULL:
+            self.record = grown(self.record)
+            room = len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE
+            self.port = self.port._replace(room=room)
+
+    def set_tolerance(self, _tolerance: float) -> None:
+        """Nothing to do: the ticks to come read the inputs."""
+
+    def channel(self, name: str) -> Array:
+        """A channel at every sample so far; at the present one, before its tick, the voltage is still the last."""
+        if name == "measured_position":
+            return self._measured()
+        row = self.plant.rows[name][0]
+        out = np.zeros(self.index + 1)
+        for j, state in enumerate(self.port.recorded):
+            if row[state] != 0.0:
+                out[:-1] += row[state] * self.output.states[j, : self.index]
+                out[-1] += row[state] * self.state[state]
+        return out
+
+    def _measured(self) -> Array:
+        ticks = np.arange(self.index + 1) * self.record_every // self.tick_every
+        out = self.output.measured[ticks]
+        if not self.finished:
+            out[-1] = quantised(self.channel("position")[-1:], self.servo.position_resolution)[0]
+        return out
+
+    def events(self) -> list[tuple[float, str, int, bool]]:
+        """Contacts and releases, and what the ticks did, in time order."""
+        r, size = self.record, int(self.record.size[1])
+        times = (r.event_step[:size] + r.event_fraction[:size]) * self.step
+        modes = self.plant.automaton.modes
+        found = []
+        for k in range(size):
+            guard = modes[r.event_mode[k]].guards[r.event_guard[k]]
+            found.append((float(times[k]), guard.label, guard.side, not r.event_forced[k]))
+        return sorted(found + self._tick_events(), key=lambda event: event[0])
+
+    def _tick_events(self) -> list[tuple[float, str, int, bool]]:
+        """Dead-zone and saturation events, at the ticks that decided them."""
+        count = (self.base - 1) // self.tick_every + 1 + (1 if self.finished else 0) if self.base else 0
+        count = min(count, len(self.output.active))
+        active, times = self.output.active[:count], np.arange(count) / self.tick_rate
+        changed = np.flatnonzero(np.diff(active, prepend=np.int8(1)))
+        jumps = self.inputs.reference.jumps
+        error = self.inputs.reference.value(times[changed]) - self.output.measured[changed]
+        found = []
+        for k, e in zip(changed.tolist(), error.tolist(), strict=True):
+            forced = bool(np.any(np.abs(jumps - times[k]) < 0.5 / self.tick_rate))
+            found.append((float(times[k]), "leave" if active[k] else "enter", 1 if e > 0 else -1, not forced))
+        return found
+
+    @property
+    def tick_rate(self) -> float:
+        """Ticks per second."""
+        assert self.controller.sample_rate is not None
+        return self.controller.sample_rate
+
+
+def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
+    """Base steps per tick and per sample; one of them is 1."""
+    ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
+    whole = round(ratio)
+    if abs(ratio - whole) > 1e-9 * ratio:
+        raise InvalidInput(
+            f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: one must be a whole multiple of the other"
+        )
+    return (1, whole) if tick_rate >= sample_rate else (whole, 1)

@@ -1,0 +1,151 @@
+"""Simulating a servo exactly: continuous (plant and law in one automaton) or sampled (the edge's own tick, compiled, on the exact plant)."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from servotwin.simulation.continuous import ContinuousEngine
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_nonnegative, as_pieces
+from servotwin.simulation.run import Inputs, Run, quantised
+from servotwin.simulation.sampled import SampledEngine
+
+SAMPLE_RATE = 5000.0
+
+
+class Engine(Protocol):
+    """One way to run the loop; times are sample indices."""
+
+    @property
+    def index(self) -> int: ...
+    def advance(self, index: int) -> None: ...
+    def set_tolerance(self, tolerance: float) -> None: ...
+    def channel(self, name: str) -> Array: ...
+    def events(self) -> list[tuple[float, str, int, bool]]: ...
+
+
+class Simulation:
+    """A run that can be stopped at any sample, looked at, changed and continued.
+
+    Parameters
+    ----------
+    servo : Servo
+    duration : float
+        s; the horizon up to which inputs are laid out.
+    controller : Controller, optional
+        The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
+    reference : number or signal
+        m.
+    gap : number or signal
+        rad, total gap.
+    tolerance : number, signal or None
+        m, half-width of the dead zone; None: no dead zone, and none can be set later. 0 is a dead zone of zero width.
+    theta_d0 : float
+        rad, start of the screw; clamped into the gap around the motor, which starts at 0. The structure starts at rest.
+    sample_rate : float
+        Hz, of what is recorded.
+    noise : Noise, optional
+        On the measured position; needs a sampled controller.
+    seed : int
+        Of the noise.
+
+    Raises
+    ------
+    InvalidInput
+        For a negative gap or tolerance, rates that do not divide one another, or noise without a sampled controller.
+    """
+
+    def __init__(
+        self,
+        servo: Servo,
+        duration: float,
+        controller: Controller | None = None,
+        reference: SignalLike = 0.0,
+        gap: SignalLike = 0.0,
+        tolerance: SignalLike | None = None,
+        theta_d0: float = 0.0,
+        sample_rate: float = SAMPLE_RATE,
+        noise: Noise | None = None,
+        seed: int | np.random.Generator = 0,
+    ) -> None:
+        _check_times(duration, sample_rate)
+        self.servo = servo
+        self.controller = servo.controller if controller is None else controller
+        self.samples = round(duration * sample_rate) + 1
+        self.inputs = Inputs(
+            as_pieces(reference, duration),
+            as_nonnegative(gap, duration, "gap", "rad"),
+            None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
+            sample_rate,
+        )
+        self.engine: Engine
+        if self.controller.sample_rate is None:
+            if noise is not None:
+                raise InvalidInput("noise needs a sampled controller: set the controller's sample_rate, for example to 5000 Hz")
+            self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0)
+        else:
+            rng = np.random.default_rng(seed)
+            self.engine = SampledEngine(servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng)
+
+    @property
+    def index(self) -> int:
+        """Index of the last sample reached."""
+        return self.engine.index
+
+    @property
+    def time(self) -> float:
+        """Its time, s."""
+        return self.engine.index / self.inputs.sample_rate
+
+    def advance(self, index: int) -> None:
+        """Go on to a sample index, at most the last one of the horizon."""
+        if not self.index <= index < self.samples:
+            raise InvalidInput(f"sample {index} is outside {self.index} .. {self.samples - 1}, where this simulation can go")
+        if index > self.index:
+            self.engine.advance(index)
+
+    def set_tolerance(self, tolerance: float) -> None:
+        """A new dead-zone half-width (m) from the present sample on; it replaces whatever was planned."""
+        if self.inputs.tolerance is None:
+            raise InvalidInput("this simulation has no dead zone: start it with tolerance=0.0 to set one later")
+        if not (np.isfinite(tolerance) and tolerance >= 0.0):
+            raise InvalidInput(f"tolerance = {tolerance} m: must be finite and 0 or more")
+        self.inputs.retune(self.time, tolerance)
+        self.engine.set_tolerance(tolerance)
+
+    def measured(self, name: str, first: int, last: int) -> Array:
+        """What a sensor or the law gave at samples first .. last - 1: theta_m, position, voltage or reference; ``(last - first,)``."""
+        return self.run().measured(name)[first:last]
+
+    def run(self) -> Run:
+        """Everything up to the present sample."""
+        return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
+
+
+def simulate(servo: Servo, duration: float, **options: Any) -> Run:
+    """Run a servo from rest; the options are those of `Simulation`.
+
+    Returns
+    -------
+    Run
+        ``round(duration * sample_rate) + 1`` samples, both ends included.
+    """
+    simulation = Simulation(servo, duration, **options)
+    simulation.advance(simulation.samples - 1)
+    return simulation.run()
+
+
+def _check_times(duration: float, sample_rate: float) -> None:
+    if not (np.isfinite(duration) and duration > 0.0):
+        raise InvalidInput(f"duration = {duration} s: must be positive and finite")
+    if not (np.isfinite(sample_rate) and sample_rate > 0.0):
+        raise InvalidInput(f"sample_rate = {sample_rate} Hz: must be positive and finite")
+
+
+__all__ = ["Noise", "PiecewiseCubic", "Run", "Simulation", "quantised", "simulate"]
