@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Reason, Receipt, pack_channel
+from servotwin.plant.servo import Servo
+from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.twin.decode import decode_channel, decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
@@ -35,9 +38,13 @@ def known_gap(window: Window, prior: float) -> GapEstimate:
     return GapEstimate(gap, 0.0, 0.0, (gap, gap), GapStatus.OK, window.mid_time)
 
 
+def eq_21(estimate: GapEstimate, _previous: float | None) -> Redesign:
+    return Redesign(PITCH * estimate.gap, estimate.gap, "")
+
+
 def make(estimator=known_gap, **settings):
     store = MemoryStore()
-    return Twin("axis", estimator, lambda e: PITCH * e.gap, store, TwinSettings(**settings)), store
+    return Twin("axis", estimator, eq_21, store, TwinSettings(**settings)), store
 
 
 def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):
@@ -76,7 +83,7 @@ def test_the_window_is_safe_before_it_is_acknowledged():
         def add_window(self, _):
             raise OSError("disk full")
 
-    twin = Twin("axis", known_gap, lambda _: 0.0, Broken())
+    twin = Twin("axis", known_gap, eq_21, Broken())
     with pytest.raises(OSError, match="disk full"):
         twin.receive(window_message(), 0.0)
 
@@ -226,3 +233,16 @@ def test_settings_out_of_range(name, value):
 def test_decoding_equals_the_edges_own():
     channel = pack_channel("position", "m", np.random.default_rng(5).normal(size=1000))
     assert decode_channel(channel).tolist() == list(messages.unpack_channel(channel))
+
+
+def test_the_policy_smooths_from_the_gap_it_last_tuned_for():
+    servo = Servo.preset("paper")
+    twin = Twin("axis", known_gap, partial(PaperPolicy(smoothing=0.5).redesign, servo), MemoryStore())
+    updates = [twin.receive(window_message(k, 10.0 * k), 0.0)[1] for k in (1, 2, 3)]
+    assert [update.tolerance / servo.p for update in updates] == pytest.approx([0.1, 0.15, 0.225])
+    assert [update.gap for update in updates] == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_a_policy_may_leave_the_controller_alone():
+    twin = Twin("axis", known_gap, lambda _e, _p: Redesign(None, math.nan, "quiet"), MemoryStore())
+    assert len(twin.receive(window_message(1, 10.0), 0.0)) == 1

@@ -15,12 +15,16 @@ class TwinSettings:
 
     Parameters
     ----------
+    enabled : bool
+        False: nobody answers the edge's windows.
     method : str
         Estimator, as `identify.estimate_gap` names them.
     estimator : object, optional
         Settings of that estimator; None: its defaults.
     k_dz : float
         Dead-zone gain of Eq 21.
+    smoothing : float
+        Share of the previous gap that the policy keeps at each update, 0 up to, but not including, 1.
     initial_gap : float
         rad; what is believed before the first estimate (section 4.2: zero).
     processing : float
@@ -38,9 +42,11 @@ class TwinSettings:
         A value is not a finite number in its range.
     """
 
+    enabled: bool = True
     method: str = "paper"
     estimator: Any = None
     k_dz: float = 1.0
+    smoothing: float = 0.0
     initial_gap: float = 0.0
     processing: float = 0.0
     validity: float = 60.0

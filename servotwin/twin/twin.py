@@ -10,6 +10,7 @@ from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
 from servotwin.messages import Window as WindowMessage
+from servotwin.redesign.policy import Redesign
 from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
@@ -17,8 +18,8 @@ from servotwin.twin.versions import Versions
 
 Estimator = Callable[[Window, float], GapEstimate]
 """(window, previous gap in rad) -> estimate."""
-Policy = Callable[[GapEstimate], float]
-"""An estimate that is OK -> dead-zone tolerance, m."""
+Policy = Callable[[GapEstimate, float | None], Redesign]
+"""(estimate, gap of the last redesign in rad or None) -> what to do."""
 
 
 class Twin:
@@ -35,7 +36,7 @@ class Twin:
     estimator : callable
         (identify.Window, previous gap in rad) -> GapEstimate.
     policy : callable
-        GapEstimate -> tolerance in m (Eq 21).
+        (estimate, gap of the last redesign in rad, or None) -> Redesign (Eq 21).
     store : Store
         Evidence; `add_window` has to return only when the window is safe.
     settings : TwinSettings
@@ -49,6 +50,7 @@ class Twin:
         self._estimator, self._policy, self._store = estimator, policy, store
         self._versions = Versions()
         self._gap = self.settings.initial_gap
+        self._tuned_for: float | None = None
         self._sent_at, self._attempts = -math.inf, 0
 
     def receive(self, message: Message, now: float) -> list[Message]:
@@ -104,9 +106,13 @@ class Twin:
         if not (estimate.ok and self._versions.admits(message)):
             return []
         self._gap = estimate.gap
-        return self._send(self._versions.issue(self._draft(message, estimate)), now)
+        redesign = self._policy(estimate, self._tuned_for)
+        if redesign.tolerance is None:
+            return []
+        self._tuned_for = redesign.gap
+        return self._send(self._versions.issue(self._draft(message, estimate, redesign.tolerance)), now)
 
-    def _draft(self, message: WindowMessage, estimate: GapEstimate) -> Update:
+    def _draft(self, message: WindowMessage, estimate: GapEstimate, tolerance: float) -> Update:
         """An update but for its version and base."""
         low, high = estimate.interval
         return Update(
@@ -119,7 +125,7 @@ class Twin:
             std=finite(estimate.std_total),
             interval=(finite(low), finite(high)),
             status=estimate.status.value,
-            tolerance=self._policy(estimate),
+            tolerance=tolerance,
             not_after=message.start + self.settings.validity,
         )
 

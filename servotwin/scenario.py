@@ -1,0 +1,190 @@
+"""A scenario: everything that a co-simulation needs, in one frozen value that a TOML file can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import re
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from servotwin import scenariofile
+from servotwin.control.controller import Controller
+from servotwin.edge.guard import Parameters
+from servotwin.edge.settings import AgentSettings
+from servotwin.errors import InvalidInput
+from servotwin.identify import paper
+from servotwin.identify.window import MINIMUM_SAMPLES
+from servotwin.link.simulated import LinkSettings, derive_seed
+from servotwin.messages import NAME_PATTERN
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.scenariofile import Recording
+from servotwin.tomltable import Table, did_you_mean, parse_toml, read_toml
+from servotwin.twin.settings import TwinSettings
+
+BOOT = "boot-1"
+PRESETS = ("fig15", "fig15-sampled", "fig16")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One servo, its wear, its link and its twin.
+
+    Parameters
+    ----------
+    servo : Servo
+    duration : float
+        s, a whole number of samples.
+    seed : int
+        Root of all randomness: each source has its own generator, from (seed, name, source).
+    name : str
+        The servo's name in messages.
+    reference : number or signal
+        m.
+    gap : number or signal
+        rad, total gap.
+    theta_d0 : float
+        rad, screw at the start; the motor's angle is 0 there, so that 0 is the middle of the backlash.
+    controller : Controller, optional
+        The servo's own by default.
+    noise : Noise, optional
+        On the measured position; needs a sampled controller.
+    recording : Recording
+    uplink, downlink : LinkSettings
+        Edge to twin, and back.
+    twin : TwinSettings
+        Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
+
+    Raises
+    ------
+    InvalidInput
+        A value is out of its range, the gap goes below zero, a rate does not divide, a window is too short.
+    """
+
+    servo: Servo
+    duration: float
+    seed: int = 0
+    name: str = "servo"
+    reference: SignalLike = 0.0
+    gap: SignalLike = 0.0
+    theta_d0: float = 0.0
+    controller: Controller | None = None
+    noise: Noise | None = None
+    recording: Recording = field(default_factory=Recording)
+    uplink: LinkSettings = field(default_factory=LinkSettings)
+    downlink: LinkSettings = field(default_factory=LinkSettings)
+    twin: TwinSettings = field(default_factory=TwinSettings)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(NAME_PATTERN, self.name):
+            raise InvalidInput(f"name = {self.name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        if not (math.isfinite(self.duration) and self.duration > 0.0):
+            raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
+        as_pieces(self.reference, self.duration)
+        as_nonnegative(self.gap, self.duration, "gap", "rad")
+        self._check_rates()
+        self._check_window()
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Scenario:
+        """A scenario from a TOML file; a servo's path in it is relative to the file.
+
+        Raises
+        ------
+        InvalidInput
+            The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed.
+        """
+        return cls._from_table(read_toml(path), Path(path).parent)
+
+    @classmethod
+    def preset(cls, name: str) -> Scenario:
+        """One of the packaged scenarios: "fig15", "fig15-sampled", "fig16"."""
+        if name not in PRESETS:
+            hint = did_you_mean(name, PRESETS)
+            raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
+        text = resources.files("servotwin").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
+        return cls._from_table(parse_toml(text, f"{name}.toml"), Path())
+
+    @classmethod
+    def _from_table(cls, table: Table, folder: Path) -> Scenario:
+        values = scenariofile.read(table, folder)
+        with scenariofile.named(table):
+            return cls(**values)
+
+    def replace(self, **changes: Any) -> Scenario:
+        """A copy with some values changed, validated again."""
+        return dataclasses.replace(self, **changes)
+
+    def with_servo(self, servo: Servo) -> Scenario:
+        """The same with another servo and its own controller, changed where this scenario changes its servo's."""
+        if self.controller is None:
+            return self.replace(servo=servo)
+        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.controller)
+        changes = {name: value for name, value in own.items() if value != default[name]}
+        return self.replace(servo=servo, controller=servo.controller.replace(**changes))
+
+    @property
+    def law(self) -> Controller:
+        """The controller that runs."""
+        return self.servo.controller if self.controller is None else self.controller
+
+    @property
+    def start_tolerance(self) -> float:
+        """Dead-zone half-width before the first update, m (Eq 21)."""
+        return self.servo.tolerance_for(self.twin.initial_gap, self.twin.k_dz)
+
+    @property
+    def samples(self) -> int:
+        """Samples recorded, both ends included."""
+        return round(self.duration * self.recording.sample_rate) + 1
+
+    def agent_settings(self) -> AgentSettings:
+        """What the edge is told."""
+        r = self.recording
+        return AgentSettings(
+            servo=self.name,
+            boot=BOOT,
+            sample_rate=r.sample_rate,
+            window_s=r.window,
+            pre_trigger_s=r.pre_trigger,
+            retry=r.retry,
+            limits=r.limits,
+            parameters=Parameters(tolerance=self.start_tolerance),
+            model_version=self.servo.version,
+        )
+
+    def seed_of(self, source: str) -> int:
+        """The seed of one named source of randomness: the same for equal (seed, name, source), on every machine."""
+        return derive_seed(self.seed, self.name, source)
+
+    def _check_rates(self) -> None:
+        rate, law = self.recording.sample_rate, self.law.sample_rate
+        samples = self.duration * rate
+        if abs(samples - round(samples)) > 1e-6:
+            raise InvalidInput(f"duration = {self.duration!r} s: must be a whole number of samples at {rate!r} Hz")
+        if law is None:
+            if self.noise is not None:
+                raise InvalidInput("noise needs a sampled controller: give the controller a sample rate in Hz")
+            return
+        ratio = max(rate, law) / min(rate, law)
+        if abs(ratio - round(ratio)) > 1e-9 * ratio:
+            raise InvalidInput(
+                f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
+                "whole multiples of one another"
+            )
+
+    def _check_window(self) -> None:
+        """The edge accepts the window's length, and the estimator's observer has time to settle in it."""
+        self.agent_settings()
+        settings = self.twin.estimator or paper.Settings()
+        needed = settings.settle_s + MINIMUM_SAMPLES / self.recording.sample_rate
+        if self.recording.window < needed:
+            raise InvalidInput(
+                f"window = {self.recording.window!r} s is too short for the observer: must be at least {needed:.6g} s, "
+                f"of which it takes {settings.settle_s!r} s to settle"
+            )

@@ -1,0 +1,263 @@
+"""A scenario's TOML: which key, in which unit, becomes which value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from servotwin.control.controller import Controller
+from servotwin.edge.guard import Limits
+from servotwin.errors import InvalidInput
+from servotwin.identify import paper
+from servotwin.identify.gap import METHODS
+from servotwin.link.session import Retry
+from servotwin.link.simulated import LinkSettings
+from servotwin.plant import servofile
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import PRESETS, Servo
+from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
+from servotwin.tomltable import Table
+from servotwin.twin.settings import TwinSettings
+
+MM = 1e-3
+DEG = math.pi / 180.0
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the edge records and sends.
+
+    Parameters
+    ----------
+    sample_rate : float
+        Hz.
+    window, pre_trigger : float
+        s, length of a window and how much of it lies before the change of the reference.
+    retry : Retry
+        When a window without acknowledgement is sent again.
+    limits : Limits
+        What an update must respect.
+    """
+
+    sample_rate: float = 5000.0
+    window: float = 1.0
+    pre_trigger: float = 0.0
+    retry: Retry = field(default_factory=Retry)
+    limits: Limits = field(default_factory=Limits)
+
+
+def read(table: Table, folder: Path) -> dict[str, Any]:
+    """The values of a `Scenario`; a servo's path is relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        A key is unknown or missing, or its value is not allowed.
+    """
+    servo = _servo(table, folder)
+    values: dict[str, Any] = {
+        "servo": servo,
+        "duration": table.number("duration_s", positive=True),
+        "seed": table.integer("seed", 0),
+        "name": table.text("name", "servo"),
+        "theta_d0": table.number("theta_d0_deg", 0.0) * DEG,
+        "reference": _read(table, "reference", _reference),
+        "gap": _read(table, "gap", _gap),
+        "recording": _read(table, "recording", _recording),
+        "twin": _read(table, "twin", _twin),
+    }
+    values["controller"] = _read(table, "controller", lambda t: _controller(t, servo.controller))
+    values["noise"] = _read(table, "noise", _noise) if "noise" in table.values else None
+    values["uplink"], values["downlink"] = _read(table, "link", _links)
+    table.table("noise")
+    table.done()
+    return values
+
+
+@contextmanager
+def named(table: Table) -> Iterator[None]:
+    """Let what a constructor refuses be known by its file and table."""
+    try:
+        yield
+    except InvalidInput as error:
+        if str(error).startswith(table.source):
+            raise
+        where = f"{table.source}: [{table.name}]" if table.name else table.source
+        raise InvalidInput(f"{where}: {error}") from None
+
+
+def _read(table: Table, key: str, read: Callable[[Table], Any]) -> Any:
+    """One table of the file, read to its last key."""
+    inner = table.table(key)
+    with named(inner):
+        value = read(inner)
+    inner.done()
+    return value
+
+
+def _servo(table: Table, folder: Path) -> Servo:
+    name = table.text("servo")
+    if name not in PRESETS and not (folder / name).is_file():
+        raise table.invalid(
+            "servo", f"one of {', '.join(PRESETS)}, or the path of a servo's TOML, relative to this file"
+        )
+    return Servo.resolve(name, folder)
+
+
+def _reference(table: Table) -> SignalLike:
+    return _REFERENCES[table.text("kind", choices=tuple(_REFERENCES))](table)
+
+
+def _square(table: Table) -> SignalLike:
+    amplitude, offset = table.number("amplitude_mm") * MM, table.number("offset_mm", 0.0) * MM
+    return SquareWave(amplitude, table.number("period_s", positive=True), offset)
+
+
+def _step(table: Table) -> SignalLike:
+    return Step(table.number("size_mm") * MM, table.number("at_s", 0.0, minimum=0.0))
+
+
+def _s_curve(table: Table) -> SignalLike:
+    ends = table.number("from_mm") * MM, table.number("to_mm") * MM
+    return SCurve(*ends, table.number("over_s", positive=True), table.number("begin_s", 0.0))
+
+
+def _samples(table: Table) -> SignalLike:
+    times, values = table.numbers("times_s"), table.numbers("values_mm")
+    return Samples(_listed(times), [value * MM for value in _listed(values)])
+
+
+def _constant(table: Table) -> SignalLike:
+    return table.number("value_mm") * MM
+
+
+_REFERENCES: Mapping[str, Callable[[Table], SignalLike]] = {
+    "square": _square,
+    "step": _step,
+    "s-curve": _s_curve,
+    "samples": _samples,
+    "constant": _constant,
+}
+
+
+def _listed(numbers: float | tuple[float, ...]) -> tuple[float, ...]:
+    return numbers if isinstance(numbers, tuple) else (numbers,)
+
+
+def _gap(table: Table) -> SignalLike:
+    """The total gap: `total_deg`, or an S-curve from `from_deg` to `to_deg` in `over_s`."""
+    if "total_deg" in table.values or not table.values:
+        return table.number("total_deg", minimum=0.0) * DEG
+    ends = table.number("from_deg", minimum=0.0) * DEG, table.number("to_deg", minimum=0.0) * DEG
+    return SCurve(*ends, table.number("over_s", positive=True), table.number("begin_s", 0.0))
+
+
+def _controller(table: Table, controller: Controller) -> Controller | None:
+    """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
+    keys = {key.name: key for key in servofile.CONTROLLER}
+    changes = {key.symbol: key.read(table, name) for name, key in keys.items() if name in table.values}
+    for name in keys.keys() - table.values.keys():
+        table.number(name, None)
+    return controller.replace(**changes) if changes else None
+
+
+def _noise(table: Table) -> Noise:
+    kind = table.text("kind", "highpass", choices=("highpass", "white"))
+    band = _listed(table.numbers("band_hz", (10.0, 50.0), positive=True))
+    if len(band) != 2:
+        raise table.invalid("band_hz", "two numbers, the stop and the pass edge")
+    return Noise(
+        table.number("std_mm", minimum=0.0) * MM, (band[0], band[1]), "white" if kind == "white" else "highpass"
+    )
+
+
+def _links(table: Table) -> tuple[LinkSettings, LinkSettings]:
+    """Edge to twin and back: [link] for both, [link.up] and [link.down] for what differs."""
+    both = _link(table, LinkSettings())
+    return _read(table, "up", lambda t: _link(t, both)), _read(table, "down", lambda t: _link(t, both))
+
+
+def _link(table: Table, default: LinkSettings) -> LinkSettings:
+    def share(key: str) -> float:
+        return table.number(key, getattr(default, key), minimum=0.0, maximum=1.0)
+
+    outages = tuple(_outage(each) for each in table.tables("outages"))
+    return LinkSettings(
+        delay_s=table.number("delay_s", default.delay_s, minimum=0.0),
+        jitter_s=table.number("jitter_s", default.jitter_s, minimum=0.0),
+        loss=share("loss"),
+        duplicate=share("duplicate"),
+        reorder=share("reorder"),
+        hold_s=table.number("hold_s", default.hold_s, minimum=0.0),
+        outages=outages or default.outages,
+    )
+
+
+def _outage(table: Table) -> tuple[float, float]:
+    begin, end = table.number("from_s"), table.number("to_s")
+    table.done()
+    return begin, end
+
+
+def _recording(table: Table) -> Recording:
+    default = Recording()
+    return Recording(
+        sample_rate=table.number("sample_rate_hz", default.sample_rate, positive=True),
+        window=table.number("window_s", default.window, positive=True),
+        pre_trigger=table.number("pre_trigger_s", default.pre_trigger, minimum=0.0),
+        retry=_retry(table, default.retry),
+        limits=_read(table, "limits", _limits),
+    )
+
+
+def _retry(table: Table, default: Retry) -> Retry:
+    return Retry(
+        table.number("retry_first_s", default.first_s, positive=True),
+        table.number("retry_factor", default.factor, minimum=1.0),
+        table.number("retry_longest_s", default.longest_s, positive=True),
+    )
+
+
+def _limits(table: Table) -> Limits:
+    return Limits(
+        minimum=table.number("minimum_mm", 0.0, minimum=0.0) * MM,
+        maximum=table.number("maximum_mm", math.inf, minimum=0.0, infinite=True) * MM,
+        max_step=table.number("max_step_mm", math.inf, positive=True, infinite=True) * MM,
+        lifetime_s=table.number("lifetime_s", math.inf, positive=True, infinite=True),
+        interval_s=table.number("interval_s", 0.0, minimum=0.0),
+    )
+
+
+def _twin(table: Table) -> TwinSettings:
+    default = TwinSettings()
+    return TwinSettings(
+        enabled=table.boolean("enabled", True),
+        method=table.text("method", default.method, choices=tuple(METHODS)),
+        estimator=_read(table, "estimator", _estimator) if "estimator" in table.values else None,
+        k_dz=table.number("k_dz", default.k_dz, minimum=0.0),
+        smoothing=table.number("smoothing", default.smoothing, minimum=0.0, maximum=1.0),
+        initial_gap=table.number("initial_gap_deg", 0.0, minimum=0.0) * DEG,
+        processing=table.number("processing_s", default.processing, minimum=0.0),
+        validity=table.number("validity_s", default.validity, positive=True),
+        retry=table.number("retry_s", default.retry, positive=True),
+        attempts=table.integer("attempts", default.attempts, minimum=1),
+    )
+
+
+def _estimator(table: Table) -> paper.Settings:
+    default = paper.Settings()
+    return paper.Settings(
+        alpha=table.number("alpha_rad_per_s", default.alpha, positive=True),
+        settle_s=table.number("settle_s", default.settle_s, minimum=0.0),
+        lowpass_hz=table.number("lowpass_hz", default.lowpass_hz, positive=True),
+        lowpass_order=table.integer("lowpass_order", default.lowpass_order, minimum=1),
+        reversals=table.integer("reversals", default.reversals, minimum=0),
+        rest_speed=table.number("rest_speed_rad_per_s", default.rest_speed, minimum=0.0),
+        contact_travel=table.number("contact_travel_deg", default.contact_travel / DEG, minimum=0.0) * DEG,
+        method_error=table.number("method_error_deg", default.method_error / DEG, minimum=0.0) * DEG,
+        unexplained=table.number("unexplained", default.unexplained, minimum=0.0),
+    )
