@@ -179,11 +179,11 @@ class Table:
         return InvalidInput(f"{self.source}: {self.path(key)} = {shown} is not allowed; give {allowed}")
 
     def _number(self, key: str, value: object, allowed: Range, alternative: str = "") -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not allowed.accepts(float(value)):
-            raise InvalidInput(
-                f"{self.source}: {self.path(key)} = {_shown(value)} is not allowed; give {allowed}{alternative}"
-            )
-        return float(value)
+        number = _as_float(value)
+        if not allowed.accepts(number):
+            shown = _shown(value)
+            raise InvalidInput(f"{self.source}: {self.path(key)} = {shown} is not allowed; give {allowed}{alternative}")
+        return number
 
     def _missing(self, key: str, default: object) -> bool:
         self._asked.add(key)
@@ -229,8 +229,19 @@ def parse_toml(text: str, source: str) -> Table:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A hint such as " (did you mean 'mass_kg'?)", or nothing where no known word is close."""
-    close = difflib.get_close_matches(word, sorted(known), n=1)
+    words = sorted(known)
+    close = [name for name in words if name.lower() == word.lower()] or difflib.get_close_matches(word, words, n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def _as_float(value: object) -> float:
+    """The number as a float; NaN where it is none, or too large for one."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.nan
 
 
 def _listed(words: Iterable[str]) -> str:

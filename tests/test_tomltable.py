@@ -57,6 +57,7 @@ def test_infinity_where_it_is_allowed() -> None:
             "a number, at least 0, inf allowed",
         ),
         ("m = true", lambda t: t.number("m"), "m = True", "a number, finite"),
+        (f"m = {10**400}", lambda t: t.number("m"), f"m = 1{'0' * 56}...", "a number, finite"),
         ('m = "5 kg"', lambda t: t.number("m"), "m = '5 kg'", "a number, finite"),
         ("m = 3", lambda t: t.number("m", minimum=0, maximum=1), "m = 3", "a number, at least 0, at most 1, finite"),
         ("m = [1, -2]", lambda t: t.numbers("m", positive=True), "m[1] = -2", "a positive number, finite"),
@@ -165,3 +166,4 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_did_you_mean() -> None:
     assert did_you_mean("mass", ["mass_kg", "pitch"]) == " (did you mean 'mass_kg'?)"
     assert did_you_mean("zzz", ["mass_kg"]) == ""
+    assert did_you_mean("kp", ["p", "Kp"]) == " (did you mean 'Kp'?)"

@@ -112,23 +112,31 @@ def level_crossings(numerator: Array, denominator: Array, level: float) -> Array
 
 
 def peak(numerator: Array, denominator: Array) -> tuple[float, float]:
-    """(omega, value) of the largest abs(N / D) on the imaginary axis, to 1e-10 (Bruinsma and Steinbuch's two steps).
+    """(omega, value) of the largest abs(N / D) on the imaginary axis, to 1e-10; omega = inf where only approached.
 
     Between two crossings of a level the function lies above it: raise the level to the value in the middle until
-    nothing crosses it any more.
+    nothing crosses it any more (Bruinsma and Steinbuch's two steps).
     """
 
     def value(w: Array) -> Array:
         return np.abs(poly.polyval(1j * w, numerator) / poly.polyval(1j * w, denominator))
 
-    candidates = np.abs(poly.polyroots(denominator))
-    while True:
-        best = int(np.argmax(value(candidates)))
-        omega, level = float(candidates[best]), float(value(candidates[best]))
+    candidates = np.append(0.0, np.abs(poly.polyroots(denominator)))
+    omega, level = math.inf, _at_infinity(numerator, denominator)
+    while candidates.size:
+        found = value(candidates)
+        best = int(np.argmax(found))
+        if found[best] <= level * (1.0 + _PEAK_ACCURACY):
+            break
+        omega, level = float(candidates[best]), float(found[best])
         crossings = level_crossings(numerator, denominator, level * (1.0 + _PEAK_ACCURACY))
         candidates = np.sqrt(crossings[:-1] * crossings[1:])
-        if candidates.size == 0 or np.max(value(candidates)) <= level * (1.0 + _PEAK_ACCURACY):
-            return omega, level
+    return omega, level
+
+
+def _at_infinity(numerator: Array, denominator: Array) -> float:
+    """abs(N / D) for w to infinity, of a proper fraction."""
+    return abs(float(numerator[-1] / denominator[-1])) if numerator.size == denominator.size else 0.0
 
 
 def _margin(value: complex) -> float:

@@ -94,6 +94,8 @@ class NoiseSource:
 
     def block(self, n: int) -> Array:
         """(n,) m, the next n samples."""
+        if n == 0:
+            return np.zeros(0)
         out, self.state = signal.sosfilt(self.sections, self.rng.standard_normal(n), zi=self.state)
         return np.asarray(self.std * out)
 
