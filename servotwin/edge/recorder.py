@@ -74,14 +74,12 @@ def as_floats(block: Floats) -> "array[float]":
     """The block as an array of doubles; buffers of doubles (numpy's) are copied as a whole."""
     if isinstance(block, array) and block.typecode == "d":
         return block
-    floats = array("d")
     try:
         view = memoryview(block)  # type: ignore[arg-type]
     except TypeError:
-        floats.extend(block)
-        return floats
-    if view.format == "d" and view.contiguous:
-        floats.frombytes(view.cast("B"))
-    else:
-        floats.extend(block)
+        return array("d", block)
+    if view.format != "d" or not view.contiguous:
+        return array("d", block)
+    floats = array("d")
+    floats.frombytes(view.cast("B"))
     return floats

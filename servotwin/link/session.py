@@ -1,11 +1,11 @@
-"""Windows across an unreliable link, at least once sent and exactly once counted; no I/O, time comes in.
+"""The edge's half of the session: windows repeated until they are acknowledged; no I/O, time comes in.
 
-The edge's `Sender` repeats every window of its outbox, with growing pauses, until it is acknowledged. The twin's
-`Receiver` tells new windows from repeated ones and says which one may move the parameters forward. The twin
-acknowledges after it has stored a window, repeated ones too: the first acknowledgement may have been lost.
+Every window is sent at least once and repeated with growing pauses. The twin acknowledges a window after it has stored
+it under its unique (servo, boot, sequence), and a repeated one again, since the first acknowledgement may have been
+lost: so each window counts once, over any transport.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 
 from servotwin.errors import InvalidInput
@@ -30,26 +30,17 @@ class Retry:
         if not 1.0 <= self.factor < inf:
             raise InvalidInput(f"retry factor = {self.factor!r}: must be at least 1")
 
-    def pause(self, attempts: int) -> float:
-        """Seconds to wait after that many attempts (one or more)."""
-        pause = self.first_s
-        for _ in range(attempts - 1):
-            pause = min(pause * self.factor, self.longest_s)
-            if pause == self.longest_s:
-                break
-        return pause
-
 
 @dataclass(slots=True)
 class _Attempt:
-    """How often a window was sent and when it is due again."""
+    """When a window is due, and how long to wait after that."""
 
     due: float
-    count: int = 0
+    pause: float
 
 
 class Sender:
-    """The edge's half: what to send, and when.
+    """What to send, and when.
 
     Parameters
     ----------
@@ -61,7 +52,7 @@ class Sender:
     def __init__(self, outbox: Outbox, retry: Retry | None = None) -> None:
         self._outbox = outbox
         self._retry = retry or Retry()
-        self._attempts: dict[Key, _Attempt] = {key: _Attempt(-inf) for key in outbox.pending()}
+        self._attempts: dict[Key, _Attempt] = {key: _Attempt(-inf, self._retry.first_s) for key in outbox.pending()}
 
     @property
     def next_time(self) -> float | None:
@@ -70,7 +61,7 @@ class Sender:
 
     def offer(self, window: Window, now: float) -> None:
         """Take charge of a window: it is due now."""
-        self._attempts[window.boot, window.sequence] = _Attempt(now)
+        self._attempts[window.boot, window.sequence] = _Attempt(now, self._retry.first_s)
         for drop in self._outbox.put(window):
             self._attempts.pop(drop.key, None)
 
@@ -79,8 +70,8 @@ class Sender:
         keys = [key for key, attempt in self._attempts.items() if attempt.due <= now]
         for key in keys:
             attempt = self._attempts[key]
-            attempt.count += 1
-            attempt.due = now + self._retry.pause(attempt.count)
+            attempt.due = now + attempt.pause
+            attempt.pause = min(attempt.pause * self._retry.factor, self._retry.longest_s)
         return [self._outbox.get(key) for key in keys]
 
     def acknowledged(self, message: Acknowledge) -> bool:
@@ -88,50 +79,3 @@ class Sender:
         key = message.boot, message.sequence
         self._attempts.pop(key, None)
         return self._outbox.remove(key)
-
-
-@dataclass(slots=True)
-class _Seen:
-    """The sequence numbers seen of one boot: all below `below`, and those `beyond`."""
-
-    below: int = 0
-    beyond: set[int] = field(default_factory=set)
-    newest: float = -inf
-
-    def add(self, sequence: int) -> bool:
-        if sequence < self.below or sequence in self.beyond:
-            return False
-        self.beyond.add(sequence)
-        while self.below in self.beyond:
-            self.beyond.remove(self.below)
-            self.below += 1
-        return True
-
-
-class Receiver:
-    """The twin's half: which windows are new, and which may move the parameters. Serves any number of servos."""
-
-    def __init__(self) -> None:
-        self._seen: dict[tuple[str, str], _Seen] = {}
-
-    def accept(self, window: Window) -> bool:
-        """Whether the window is new; False: seen before, acknowledge it again and do nothing else."""
-        return self._of(window).add(window.sequence)
-
-    def advance(self, window: Window) -> bool:
-        """Whether the window is newer than all it has been called with before, within its boot.
-
-        Estimates may be made in any order; parameters move forward only.
-        """
-        seen = self._of(window)
-        newer = window.start > seen.newest
-        seen.newest = max(seen.newest, window.start)
-        return newer
-
-    def _of(self, window: Window) -> _Seen:
-        return self._seen.setdefault((window.servo, window.boot), _Seen())
-
-
-def acknowledge(window: Window) -> Acknowledge:
-    """The acknowledgement of a window."""
-    return Acknowledge(window.servo, window.boot, window.sequence)

@@ -1,4 +1,4 @@
-"""A link on the virtual clock: delay, jitter, loss, duplicates, reordering, outages; every byte string accounted for."""
+"""A link on the virtual clock: delay, jitter, loss, duplicates, reordering, outages; all bytes accounted for."""
 
 from collections import Counter
 from collections.abc import Callable
