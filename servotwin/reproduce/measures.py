@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 TAIL = 5.0  # s: several periods of every limit cycle seen (0.9 to 1.5 Hz), a quarter of the paper's half period
 SETTLED = 0.01  # of the reference amplitude

@@ -12,9 +12,11 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin import outputs
+from servotwin.reproduce.measures import Array, Complex
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
@@ -52,7 +54,7 @@ def panels(
     rows: int, columns: int = 1, height: float = 2.3, heights: Sequence[float] | None = None, share: bool = True
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure 7.2 inches wide and its axes (rows, columns); `height` in inches per row, `heights` relative."""
-    figure = Figure(figsize=(7.2, height * rows), layout="constrained")
+    figure = sheet(7.2, height * rows)
     axes = figure.subplots(
         rows, columns, squeeze=False, sharex="col" if share else False, height_ratios=heights
     )
@@ -70,10 +72,11 @@ def envelope(time: ArrayLike, values: ArrayLike, columns: int = 1200) -> tuple[N
     time, values = np.asarray(time), np.asarray(values)
     if values.size <= 4 * columns:
         return time, values
-    width = values.size // columns
-    blocks = values[: columns * width].reshape(columns, width)
-    inside = np.sort(np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)], axis=1), axis=1)
-    keep = np.concatenate([[0], (inside + np.arange(columns)[:, None] * width).ravel(), [values.size - 1]])
+    width = -(-values.size // columns)
+    padded = np.pad(values, (0, -values.size % width), mode="edge").reshape(-1, width)
+    inside = np.sort(np.stack([padded.argmin(axis=1), padded.argmax(axis=1)], axis=1), axis=1)
+    keep = (inside + np.arange(len(padded))[:, None] * width).ravel()
+    keep = np.concatenate([[0], np.minimum(keep, values.size - 1), [values.size - 1]])
     keep = np.unique(keep)
     return time[keep], values[keep]
 
@@ -83,9 +86,24 @@ def trace(axes: Axes, time: ArrayLike, values: ArrayLike, color: str, label: str
     axes.plot(*envelope(time, values), color=color, label=label, **how)
 
 
+def sheet(width: float, height: float) -> Figure:
+    """An empty figure, size in inches."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def bode(upper: Axes, lower: Axes, omega: Array, response: Complex, color: str, label: str) -> None:
+    """Magnitude in dB above, unwrapped phase below, over frequency in rad/s."""
+    upper.semilogx(omega, 20.0 * np.log10(np.abs(response)), color=color)
+    upper.set_ylabel(label)
+    lower.semilogx(omega, np.degrees(np.unwrap(np.angle(response))), color=color)
+    lower.set(ylabel="Phase (deg)", xlabel="Frequency (rad/s)", xlim=(omega[0], omega[-1]))
+    span = float(np.ptp(lower.get_ylim()))
+    lower.yaxis.set_major_locator(MultipleLocator(90.0 if span > 180.0 else 30.0))
+
+
 def legend(axes: Axes, columns: int = 4, **how: Any) -> None:
     """A legend in one line above the axes, where it covers no data."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.2, handlelength=1.6, **how)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.2, handlelength=1.5, columnspacing=1.0, handletextpad=0.5, **how)
 
 
 def svg(figure: Figure, name: str) -> bytes:

@@ -1,0 +1,10 @@
+"""The paper's figures, one module each; `PLATES` lists them in the paper's order."""
+
+from servotwin.reproduce.figures import fig4, fig5, fig7, fig9, fig10b, fig11, fig12, figA1
+from servotwin.reproduce.figures.plate import Plate
+
+PLATES: tuple[Plate, ...] = tuple(
+    module.PLATE for module in (fig4, fig5, fig7, fig9, fig10b, fig11, fig12, figA1)
+)
+
+__all__ = ["PLATES", "Plate"]

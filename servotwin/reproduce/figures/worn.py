@@ -1,0 +1,53 @@
+"""The panels that Figs 12, 15 and 16 share: position under a wearing gap, and the gap with its estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servotwin.reproduce.figures import style
+from servotwin.reproduce.measures import Array
+from servotwin.reproduce.runs import DURATION, Trace
+
+
+def sheet(rows: int) -> tuple[Figure, list[Axes]]:
+    """Panels over 200 s, the last one for the gap."""
+    figure, axes = style.panels(rows, 1, height=1.9)
+    panels = list(axes[:, 0])
+    panels[-1].set(xlabel="Time (s)", xlim=(0.0, DURATION), ylabel="Total gap (deg)")
+    panels[-1].set_xticks(range(0, round(DURATION) + 1, 20))
+    style.letter(panels)
+    return figure, panels
+
+
+def position(axes: Axes, trace: Trace, what: str = "position $q_3$") -> None:
+    """Reference and position; steps that did not settle are shaded."""
+    for step in trace.steps:
+        if not step.settled:
+            axes.axvspan(step.begin, step.end, color=style.ORANGE, alpha=0.22, linewidth=0.0)
+    style.trace(axes, trace.time, trace.position * style.MM, style.BLUE, what, linewidth=0.9)
+    axes.plot(*held(trace.time[:-1], trace.reference[:-1] * style.MM), color=style.BLACK, linewidth=1.0, label="reference $r$")
+    if not all(step.settled for step in trace.steps):
+        axes.fill_between([], [], color=style.ORANGE, alpha=0.22, linewidth=0.0, label="step not settled")
+    axes.set_ylabel("Position (mm)")
+    style.legend(axes)
+
+
+def held(time: Array, values: Array) -> tuple[Array, Array]:
+    """The corners of a piecewise constant signal."""
+    jumps = np.flatnonzero(np.diff(values))
+    keep = np.unique(np.concatenate([[0], jumps, jumps + 1, [len(values) - 1]]))
+    corners = time[keep].copy()
+    corners[np.isin(keep, jumps)] = time[jumps + 1]
+    return corners, values[keep]
+
+
+def true_gap(axes: Axes, trace: Trace) -> None:
+    """The gap as it is."""
+    style.trace(axes, trace.time, trace.gap * style.DEG, style.BLACK, "actual gap $θ_b$")
+
+
+def gap_in_force(axes: Axes, trace: Trace, pitch: float, label: str) -> None:
+    """The gap that the dead zone in force is made for: tolerance over pitch (Eq 21 with k_DZ = 1)."""
+    axes.plot(*held(trace.time, trace.tolerance / pitch * style.DEG), color=style.RED, label=label)
