@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
+from servotwin.identify.gap import estimate_gap
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
 from servotwin.messages import Window as WindowMessage
-from servotwin.redesign.policy import Redesign
+from servotwin.plant.servo import Servo
+from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
@@ -52,6 +55,15 @@ class Twin:
         self._gap = self.settings.initial_gap
         self._tuned_for: float | None = None
         self._sent_at, self._attempts = -math.inf, 0
+
+    @classmethod
+    def of(
+        cls, name: str, servo: Servo, store: Store, settings: TwinSettings, estimator: Estimator | None = None
+    ) -> Twin:
+        """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs."""
+        policy = PaperPolicy(settings.k_dz, settings.smoothing)
+        own = estimator or partial(_estimate, servo, settings)
+        return cls(name, own, partial(policy.redesign, servo), store, settings)
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """What to send after a message that arrived at `now` (s, any steady clock of the twin's own).
@@ -140,6 +152,10 @@ class Twin:
         pending = self._versions.pending
         self._sent_at, self._attempts = now, self._attempts + 1
         return [] if pending is None else [pending]
+
+
+def _estimate(servo: Servo, settings: TwinSettings, window: Window, previous: float) -> GapEstimate:
+    return estimate_gap(window, servo, settings.method, previous, settings.estimator)
 
 
 def _nothing(message: WindowMessage, reason: str) -> GapEstimate:

@@ -1,0 +1,259 @@
+"""Co-simulation: plant and law, edge agent, link and twin under one virtual clock.
+
+Time is event time in seconds; the machine moves in whole samples. Something that happens between two samples, or exactly
+at one, takes effect at the later one, before that sample is taken. The plant runs ahead only as far as nothing can happen
+to it: to the next event, to what the agent waits for, at most to where a change not seen yet could complete a window.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+
+from servotwin.clock import Event, VirtualClock
+from servotwin.edge.agent import Agent, Outgoing
+from servotwin.identify.estimate import GapEstimate
+from servotwin.link.simulated import Fate, Line, LinkSettings
+from servotwin.messages import Message, Receipt, Update, Window, decode, encode
+from servotwin.scenario import Scenario
+from servotwin.simulation import Run, Simulation
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Estimator, Twin
+
+Progress = Callable[[float], object]
+"""Called with the share done, 0 .. 1."""
+
+CHANNELS = ("reference", "theta_m", "position", "voltage")
+TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", "tolerance")
+_ROUNDING = 1e-6  # of a sample: times that are sums of delays are known to rounding only
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """One copy of a message on its way.
+
+    Attributes
+    ----------
+    direction : str
+        "up", edge to twin, or "down".
+    serial, copy : int
+        The message's number in its direction; 1 for a duplicate.
+    data : bytes
+    sent, arrival : float
+        s; a lost one's arrival is when it would have come.
+    fate : Fate
+    """
+
+    direction: str
+    serial: int
+    copy: int
+    data: bytes
+    sent: float
+    arrival: float
+    fate: Fate
+
+    @property
+    def message(self) -> Message:
+        """What the bytes say."""
+        return decode(self.data)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a co-simulation returns.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    run : Run
+        The trajectory.
+    windows : tuple of messages.Window
+        As decoded by the twin, each once, in the order of arrival.
+    estimates : tuple of GapEstimate
+        One for each window.
+    updates : tuple of messages.Update
+        Every version that the twin gave out.
+    receipts : tuple of messages.Receipt
+        Every decision of the edge, in its order (repeated answers included).
+    messages : tuple of Transmission
+        Every copy of every message, in the order of sending.
+    accounts : Counter
+        Windows cut by the edge: "delivered", "in flight" (kept at the edge, not at the twin), or why they were dropped.
+    """
+
+    scenario: Scenario
+    run: Run
+    windows: tuple[Window, ...]
+    estimates: tuple[GapEstimate, ...]
+    updates: tuple[Update, ...]
+    receipts: tuple[Receipt, ...]
+    messages: tuple[Transmission, ...]
+    accounts: Counter[str]
+
+    @property
+    def applied(self) -> tuple[Receipt, ...]:
+        """The first receipt of each update that was applied, in order."""
+        first = {receipt.version: receipt for receipt in reversed(self.receipts) if receipt.applied}
+        return tuple(sorted(first.values(), key=lambda receipt: receipt.sample))
+
+    def digest(self) -> str:
+        """SHA-256 over every message (bytes, times, fate) and the whole trajectory: equal only for runs equal bit for bit."""
+        total = hashlib.sha256()
+        for m in self.messages:
+            total.update(
+                f"{m.direction} {m.serial} {m.copy} {m.sent!r} {m.arrival!r} {m.fate} {len(m.data)}\n".encode()
+            )
+            total.update(m.data)
+        for name in TRAJECTORY:
+            total.update(getattr(self.run, name).tobytes())
+        return total.hexdigest()
+
+
+def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: Estimator | None = None) -> Loop:
+    """Run a scenario: same scenario, same bytes.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    progress : callable, optional
+        Called with the share done, 0 .. 1, at least once per window length.
+    estimator : callable, optional
+        Replaces the twin's own: (identify.Window, previous gap in rad) -> GapEstimate.
+
+    Returns
+    -------
+    Loop
+    """
+    machine = _Cosimulation(scenario, estimator)
+    while not machine.done:
+        machine.advance()
+        if progress is not None:
+            progress(machine.share)
+    return machine.loop()
+
+
+class _Cosimulation:
+    """The four parts, and the clock that connects them."""
+
+    def __init__(self, scenario: Scenario, estimator: Estimator | None) -> None:
+        self.scenario = scenario
+        self.clock = VirtualClock()
+        self.simulation = _simulation(scenario)
+        self.agent = Agent(scenario.agent_settings())
+        self.store = MemoryStore()
+        self.twin = Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
+        self.up = self._line("up", scenario.uplink, self._at_twin)
+        self.down = self._line("down", scenario.downlink, self._at_edge)
+        self.receipts: list[Receipt] = []
+        self._wake: Event | None = None
+
+    @property
+    def done(self) -> bool:
+        return self.simulation.index == self.simulation.samples - 1
+
+    @property
+    def share(self) -> float:
+        return self.simulation.index / (self.simulation.samples - 1)
+
+    def advance(self) -> None:
+        """To the next sample at which something may happen, and through what does."""
+        first, stop = self.simulation.index, self._next_stop()
+        self.simulation.advance(stop)
+        blocks = (self.simulation.measured(name, first, stop) for name in CHANNELS)
+        for outgoing in self.agent.absorb_block(*blocks):
+            time = outgoing.sample / self.scenario.recording.sample_rate
+            self.clock.schedule(max(time, self.clock.now), partial(self._send_up, outgoing))
+        while (due := self.clock.next_time) is not None and self._sample_at(due) <= stop:
+            self.clock.step()
+
+    def loop(self) -> Loop:
+        """Everything so far."""
+        return Loop(
+            scenario=self.scenario,
+            run=self.simulation.run(),
+            windows=tuple(self.store.windows.values()),
+            estimates=tuple(self.store.estimates.values()),
+            updates=tuple(self.store.updates),
+            receipts=tuple(self.receipts),
+            messages=tuple(sorted(self._transmissions(), key=lambda m: (m.sent, m.direction, m.serial, m.copy))),
+            accounts=self._accounts(),
+        )
+
+    def _next_stop(self) -> int:
+        """The next event, what the agent waits for, or where a change not seen yet could complete a window."""
+        index, settings = self.simulation.index, self.agent.settings
+        stops = [index + settings.window_samples - settings.pre_trigger_samples, self.simulation.samples - 1]
+        if self.clock.next_time is not None:
+            stops.append(self._sample_at(self.clock.next_time))
+        if self.agent.deadline is not None:
+            stops.append(self.agent.deadline)
+        return max(min(stops), index + 1)
+
+    def _sample_at(self, time: float) -> int:
+        """The first sample at or after a time."""
+        return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
+
+    def _send_up(self, outgoing: Outgoing) -> None:
+        if isinstance(outgoing.message, Receipt):
+            self.receipts.append(outgoing.message)
+        self.up.send(encode(outgoing.message))
+
+    def _at_edge(self, data: bytes) -> None:
+        """Bytes arrive at the machine."""
+        version = self.agent.parameters.version
+        for outgoing in self.agent.receive(decode(data)):
+            self._send_up(outgoing)
+        if self.agent.parameters.version != version:
+            self.simulation.set_tolerance(self.agent.parameters.tolerance)
+
+    def _at_twin(self, data: bytes) -> None:
+        """Bytes arrive at the twin; one that is switched off lets them lie."""
+        if self.scenario.twin.enabled:
+            self._answer(self.twin.receive(decode(data), self.clock.now))
+
+    def _wake_twin(self) -> None:
+        self._wake = None
+        self._answer(self.twin.wake(self.clock.now))
+
+    def _answer(self, messages: Iterable[Message]) -> None:
+        """Send what the twin says, updates after its processing time, and note when it wants to be woken."""
+        for message in messages:
+            delay = self.scenario.twin.processing if isinstance(message, Update) else 0.0
+            self.clock.schedule(self.clock.now + delay, partial(self.down.send, encode(message)))
+        if self._wake is not None:
+            self.clock.cancel(self._wake)
+        due = self.twin.next_wake()
+        self._wake = None if due is None else self.clock.schedule(max(due, self.clock.now), self._wake_twin)
+
+    def _line(self, direction: str, settings: LinkSettings, deliver: Callable[[bytes], object]) -> Line:
+        return Line(f"{self.scenario.name}/{direction}", self.clock, deliver, settings, self.scenario.seed)
+
+    def _transmissions(self) -> Iterable[Transmission]:
+        for direction, line in (("up", self.up), ("down", self.down)):
+            for r in line.records:
+                yield Transmission(direction, r.serial, r.copy, r.data, r.sent, r.arrival, r.fate)
+
+    def _accounts(self) -> Counter[str]:
+        delivered = {(boot, sequence) for _, boot, sequence in self.store.windows}
+        waiting = [key for key in self.agent.outbox.pending() if key not in delivered]
+        counts = Counter({"delivered": len(delivered), "in flight": len(waiting)})
+        return +(counts + self.agent.dropped)
+
+
+def _simulation(scenario: Scenario) -> Simulation:
+    return Simulation(
+        scenario.servo,
+        scenario.duration,
+        controller=scenario.law,
+        reference=scenario.reference,
+        gap=scenario.gap,
+        tolerance=scenario.start_tolerance,
+        theta_d0=scenario.theta_d0,
+        sample_rate=scenario.recording.sample_rate,
+        noise=scenario.noise,
+        seed=scenario.seed_of("noise"),
+    )

@@ -1,0 +1,27 @@
+"""An estimator that knows the truth: it shows what the loop could do if estimation were perfect."""
+
+from __future__ import annotations
+
+from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.window import Window
+from servotwin.plant.signals import SignalLike, as_nonnegative
+from servotwin.twin.twin import Estimator
+
+
+def known_gap(gap: SignalLike, duration: float) -> Estimator:
+    """An estimator that ignores the measurements and gives the true total gap in the middle of the window.
+
+    Parameters
+    ----------
+    gap : number or signal
+        rad, total gap.
+    duration : float
+        s, up to when the signal is asked for.
+    """
+    truth = as_nonnegative(gap, duration, "gap", "rad")
+
+    def estimate(window: Window, _previous: float) -> GapEstimate:
+        value = max(0.0, float(truth.value(window.mid_time)))
+        return GapEstimate(value, 0.0, 0.0, (value, value), GapStatus.OK, window.mid_time, method="known")
+
+    return estimate
