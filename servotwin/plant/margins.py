@@ -44,7 +44,7 @@ class Margins:
     gain_crossovers, phase_crossovers : tuple
         All of them, by frequency.
     Ms, Ms_omega : float
-        Largest abs(1 / (1 + L)) and where, rad/s.
+        Largest abs(1 / (1 + L)) and where, rad/s; (inf, nan) for an unstable closed loop.
     bandwidth : float
         rad/s, where the closed loop first falls 3 dB below its gain at rest; inf where it never does.
     stable : bool
@@ -61,10 +61,9 @@ class Margins:
 
 def margins(loop: LinearSystem, closed_loop: LinearSystem) -> Margins:
     """All margins of L and of the closed loop made from it."""
-    Ms_omega, Ms = peak(loop.denominator, plus(loop.denominator, loop.numerator))
-    return Margins(
-        gain_crossovers(loop), phase_crossovers(loop), Ms, Ms_omega, bandwidth(closed_loop), closed_loop.is_stable()
-    )
+    stable = closed_loop.is_stable()
+    Ms_omega, Ms = peak(loop.denominator, plus(loop.denominator, loop.numerator)) if stable else (math.nan, math.inf)
+    return Margins(gain_crossovers(loop), phase_crossovers(loop), Ms, Ms_omega, bandwidth(closed_loop), stable)
 
 
 def gain_crossovers(loop: LinearSystem) -> tuple[GainCrossover, ...]:
@@ -121,16 +120,16 @@ def peak(numerator: Array, denominator: Array) -> tuple[float, float]:
     def value(w: Array) -> Array:
         return np.abs(poly.polyval(1j * w, numerator) / poly.polyval(1j * w, denominator))
 
-    candidates = np.append(0.0, np.abs(poly.polyroots(denominator)))
     omega, level = math.inf, _at_infinity(numerator, denominator)
+    candidates = np.append(0.0, np.abs(poly.polyroots(denominator)))
     while candidates.size:
         found = value(candidates)
         best = int(np.argmax(found))
-        if found[best] <= level * (1.0 + _PEAK_ACCURACY):
-            break
-        omega, level = float(candidates[best]), float(found[best])
+        if found[best] > level:
+            omega, level = float(candidates[best]), float(found[best])
         crossings = level_crossings(numerator, denominator, level * (1.0 + _PEAK_ACCURACY))
         candidates = np.sqrt(crossings[:-1] * crossings[1:])
+        candidates = candidates[value(candidates) > level * (1.0 + _PEAK_ACCURACY)]
     return omega, level
 
 

@@ -18,6 +18,7 @@ from servotwin.errors import InvalidInput
 
 Array: TypeAlias = NDArray[np.float64]
 _ROUNDING = 64 * float(np.finfo(float).eps)
+_SMALLEST = float(np.finfo(float).tiny)
 
 
 @runtime_checkable
@@ -91,7 +92,7 @@ class PiecewiseCubic:
         left = np.sum(self.coeffs[:-1] * powers, axis=1)
         right = self.coeffs[1:, 0]
         scale = np.sum(np.abs(self.coeffs[:-1]) * powers, axis=1) + np.abs(right)
-        jumped: Array = self.times[1:][np.abs(right - left) > _ROUNDING * scale]
+        jumped: Array = self.times[1:][np.abs(right - left) > np.maximum(_ROUNDING * scale, _SMALLEST)]
         return jumped
 
     def changes(self, duration: float) -> Array:
@@ -111,7 +112,7 @@ class PiecewiseCubic:
             for elapsed in _candidates(c, first, last):
                 value = float(((c[3] * elapsed + c[2]) * elapsed + c[1]) * elapsed + c[0])
                 if value < best[1]:
-                    best = (float(start + elapsed), value)
+                    best = (min(float(start + elapsed), duration), value)
         return best
 
     def scaled(self, factor: float) -> PiecewiseCubic:
