@@ -18,16 +18,25 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def compiled(function: _Function) -> _Function:
     """Compile `function` with ``numba.njit``: no GIL, IEEE arithmetic in the order written, cached on disk."""
-    dispatcher = njit(cache=True, nogil=True, error_model="numpy", boundscheck=None)(function)
-    dispatcher.stamp = _stamp(function)
+    return _compile(function, forceinline=False)
+
+
+def inlined(function: _Function) -> _Function:
+    """The same for a helper of a hot loop: a call would copy every array header of its arguments and count references."""
+    return _compile(function, forceinline=True)
+
+
+def _compile(function: _Function, **options: bool) -> _Function:
+    dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    dispatcher.stamp = _stamp(function, repr(options))
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
     return dispatcher  # type: ignore[no-any-return]
 
 
-def _stamp(function: Callable[..., Any]) -> str:
+def _stamp(function: Callable[..., Any], options: str) -> str:
     code = function.__code__
-    parts = [_fingerprint(code)]
+    parts = [options, _fingerprint(code)]
     for name in code.co_names:
         value = function.__globals__.get(name)
         if hasattr(value, "stamp"):

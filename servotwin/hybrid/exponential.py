@@ -38,7 +38,10 @@ def powers(step: Long, count: int) -> Long:
 
 
 def taylor_rows(row: NDArray[np.float64], flow: NDArray[np.float64], time: float, terms: int) -> Long:
-    """Rows ``row @ (flow*time)**k / k!`` for k = 0 .. terms - 1, ``(terms, n)``: the Taylor series of ``row @ x(t)`` over `time`."""
+    """Rows ``row @ (flow*time)**k / k!``, k = 0 .. terms - 1: the Taylor series of ``row @ x(t)`` over `time`.
+
+    `row` is ``(n,)`` or ``(r, n)``; the result is ``(terms, n)`` or ``(terms, r, n)``.
+    """
     scaled = flow.astype(np.longdouble) * np.longdouble(time)
     rows = [row.astype(np.longdouble)]
     for order in range(1, terms):

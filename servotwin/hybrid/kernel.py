@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.compiled import compiled, inlined
 from servotwin.hybrid.polynomial import first_positive
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PARTS, PIECES, TERMS, Tables
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, PARTS, PIECES, TERMS, Tables
 
 DONE, FULL, ZENO = 0, 1, 2
 # More events than this inside one search step, or mode changes at one instant, is Zeno behaviour or sliding.
@@ -23,7 +23,6 @@ EVENTS_PER_STEP = 1000
 CHANGES_AT_ONCE = 64
 # A guard value or derivative below this part of its own terms is rounding, hence zero.
 SIGNIFICANT = 1e-13
-_PART_TERMS = 9
 
 
 class Record(NamedTuple):
@@ -47,70 +46,74 @@ class Scratch(NamedTuple):
     rows: Array
     series: Array
     change: Array
-    term: Array
+    terms: Array
 
 
-@compiled
+@inlined
+def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
+    """``out[r] = sum of table[base + j * stride + r] * x[j]``: four columns at a time, so that `out` is stored less often."""
+    count, n, at, step = np.uint64(rows), np.uint64(x.size), np.uint64(base), np.uint64(stride)
+    fours = n // np.uint64(4)
+    for r in range(count):
+        out[r] = 0.0
+    for block in range(fours):
+        j = block * np.uint64(4)
+        x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
+        b = at + step
+        c = b + step
+        d = c + step
+        for r in range(count):
+            out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
+        at = d + step
+    for j in range(fours * np.uint64(4), n):
+        factor = x[j]
+        for r in range(count):
+            out[r] += table[at + r] * factor
+        at += step
+
+
+@inlined
 def advance(table: Array, base: int, x: Array, change: Array) -> None:
     """``x += P @ x`` with the transposed ``(n, n)`` matrix at `base`."""
-    n = np.uint64(x.size)
+    product(table, base, x.size, x.size, x, change)
+    for i in range(np.uint64(x.size)):
+        x[i] += change[i]
+
+
+@inlined
+def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
+    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
+    n = np.uint64(t.states)
+    n2 = t.states * t.states
+    part = min(int(fraction * PARTS), PARTS - 1)
+    rest = fraction * PARTS - part
+    if part > 0:
+        advance(t.jump_part, (mode * PARTS + part) * n2, x, scratch.change)
+    terms = scratch.terms
+    product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
+    at = np.uint64(PART_TERMS * t.states)
+    change = scratch.change
     for i in range(n):
         change[i] = 0.0
-    at = np.uint64(base)
-    for j in range(n):
-        factor = x[j]
+    for _ in range(PART_TERMS):
+        at -= n
         for i in range(n):
-            change[i] += table[at + i] * factor
-        at += n
+            change[i] = (change[i] + terms[at + i]) * rest
     for i in range(n):
         x[i] += change[i]
 
 
-@compiled
-def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
-    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
-    n = np.uint64(t.states)
-    part = min(int(fraction * PARTS), PARTS - 1)
-    rest = fraction * PARTS - part
-    change, term = scratch.change, scratch.term
-    if part > 0:
-        advance(t.jump_part, (mode * PARTS + part) * t.states * t.states, x, change)
-    for i in range(n):
-        term[i] = x[i]
-    for order in range(1, _PART_TERMS):
-        factor = rest / order
-        for i in range(n):
-            change[i] = 0.0
-        at = np.uint64(mode * t.states * t.states)
-        for j in range(n):
-            scaled = term[j] * factor
-            for i in range(n):
-                change[i] += t.flow_part[at + i] * scaled
-            at += n
-        for i in range(n):
-            term[i] = change[i]
-            x[i] += change[i]
-
-
-@compiled
-def scan(table: Array, base: int, rows: int, x: Array, out: Array) -> int:
+@inlined
+def scan(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> int:
     """Fill ``out[:rows]`` with the Bernstein rows at `base` times `x`; return how many are positive."""
-    count = np.uint64(rows)
-    at = np.uint64(base)
-    for r in range(count):
-        out[r] = table[at + r] * x[0]
-    for j in range(np.uint64(1), np.uint64(x.size)):
-        at += count
-        factor = x[j]
-        for r in range(count):
-            out[r] += table[at + r] * factor
+    product(table, base, stride, rows, x, out)
     positive = 0
-    for r in range(count):
+    for r in range(np.uint64(rows)):
         positive += out[r] > 0.0
     return positive
 
 
-@compiled
+@inlined
 def clean_intervals(out: Array, guards: int, nodes: int, wanted: int) -> int:
     """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
     rows = 3 * nodes + 1
@@ -124,55 +127,49 @@ def clean_intervals(out: Array, guards: int, nodes: int, wanted: int) -> int:
     return clean
 
 
-@compiled
+@inlined
 def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
     """The part of a guard's Taylor coefficients (in steps) that is rounding: of all the terms that ever enter them."""
     size = 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
     for i in range(np.uint64(t.states)):
-        size += t.sizes[mode, guard, i] * abs(x[i])
+        size += t.sizes[base + i] * abs(x[i])
     return SIGNIFICANT * size
 
 
-@compiled
-def leading_term(t: Tables, mode: int, guard: int, x: Array) -> tuple[int, float]:
-    """Order and value of the first Taylor coefficient of a guard that is not rounding; order TERMS when all are."""
+@inlined
+def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
+    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not rounding."""
+    product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
     limit = rounding(t, mode, guard, x)
-    base = (mode * t.guards + guard) * t.states * TERMS
     for order in range(TERMS):
-        value = 0.0
-        for i in range(t.states):
-            value += t.taylor[base + i * TERMS + order] * x[i]
-        if abs(value) > limit:
-            return order, value
-    return TERMS, 0.0
+        if abs(c[order]) > limit:
+            return order
+    return TERMS
 
 
-@compiled
-def is_leaving(t: Tables, mode: int, guard: int, x: Array) -> bool:
+@inlined
+def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
     """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
-    _, value = leading_term(t, mode, guard, x)
-    return value > 0.0
+    value = 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
+    for i in range(np.uint64(t.states)):
+        value += t.rows[base + i] * x[i]
+    if abs(value) > rounding(t, mode, guard, x):
+        return value > 0.0
+    first = series(t, mode, guard, x, c)
+    return first < TERMS and c[first] > 0.0
 
 
-@compiled
+@inlined
 def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does not."""
-    n = np.uint64(t.states)
-    c, b = scratch.series, scratch.rows
-    first, leading = leading_term(t, mode, guard, x)
+    c = scratch.series
+    first = series(t, mode, guard, x, c)
     if first == TERMS:
         return np.inf
-    if leading > 0.0:
+    if c[first] > 0.0:
         return 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states * TERMS)
-    terms = np.uint64(TERMS)
-    for k in range(terms):
-        c[k] = 0.0
-    for i in range(n):
-        factor = x[i]
-        for k in range(terms):
-            c[k] += t.taylor[base + k] * factor
-        base += terms
     # Leading zeros are divided out: the guard starts at zero and moves away.
     power = 1.0
     for k in range(TERMS - first):
@@ -180,17 +177,12 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         power *= length
     for k in range(TERMS - first, TERMS):
         c[k] = 0.0
-    return _search_unit(t, c, b) * length
+    return _search_unit(t, c, scratch.rows) * length
 
 
-@compiled
+@inlined
 def _search_unit(t: Tables, c: Array, b: Array) -> float:
-    rows = np.uint64(3 * PIECES + 1)
-    for r in range(rows):
-        b[r] = 0.0
-    for k in range(np.uint64(TERMS)):
-        for r in range(rows):
-            b[r] += t.bernstein[k, r] * c[k]
+    product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
     for piece in range(PIECES):
         at = 3 * piece
         if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
@@ -200,7 +192,7 @@ def _search_unit(t: Tables, c: Array, b: Array) -> float:
     return np.inf
 
 
-@compiled
+@inlined
 def note_segment(record: Record, step: int, fraction: float, mode: int, x: Array) -> None:
     """Start a segment at a place."""
     at = record.size[0]
@@ -210,7 +202,7 @@ def note_segment(record: Record, step: int, fraction: float, mode: int, x: Array
     record.size[0] = at + 1
 
 
-@compiled
+@inlined
 def fire(t: Tables, mode: int, guard: int, x: Array, step: int, fraction: float, forced: bool, record: Record) -> int:
     """Record the event, apply the guard's reset and return the mode entered."""
     at = record.size[1]
@@ -227,13 +219,15 @@ def fire(t: Tables, mode: int, guard: int, x: Array, step: int, fraction: float,
     return t.target[mode, guard]
 
 
-@compiled
-def settle(t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: Record) -> int:
+@inlined
+def settle(
+    t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: Record, scratch: Scratch
+) -> int:
     """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none."""
     for _ in range(CHANGES_AT_ONCE):
         leaving = -1
         for g in range(t.count[mode]):
-            if is_leaving(t, mode, g, x):
+            if is_leaving(t, mode, g, x, scratch.series):
                 leaving = g
                 break
         if leaving < 0:
@@ -242,7 +236,7 @@ def settle(t: Tables, mode: int, x: Array, step: int, fraction: float, forced: b
     return -1
 
 
-@compiled
+@inlined
 def cross(
     t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: Record, scratch: Scratch
 ) -> tuple[int, int]:
@@ -260,27 +254,21 @@ def cross(
         advance_fraction(t, mode, x, first, scratch)
         place = min(place + first, end)
         mode = fire(t, mode, which, x, step, place, False, record)
-        mode = settle(t, mode, x, step, place, False, record)
+        mode = settle(t, mode, x, step, place, False, record, scratch)
         if mode < 0:
             break
         note_segment(record, step, place, mode, x)
     return -1, record.size[1] - before
 
 
-@compiled
+@inlined
 def step_once(t: Tables, mode: int, x: Array, step: int, record: Record, scratch: Scratch) -> int:
     """Advance `x` in place by one search step; return the mode, -1 when Zeno. One product when nothing happens."""
     n = np.uint64(t.states)
-    rows = np.uint64(t.states + 4 * t.guards)
+    stride = t.states + 4 * t.guards
+    rows = np.uint64(t.states + 4 * t.count[mode])
     out = scratch.rows
-    at = np.uint64(mode * t.states) * rows
-    for r in range(rows):
-        out[r] = t.single[at + r] * x[0]
-    for j in range(np.uint64(1), n):
-        at += rows
-        factor = x[j]
-        for r in range(rows):
-            out[r] += t.single[at + r] * factor
+    product(t.single, mode * t.states * stride, stride, t.states + 4 * t.count[mode], x, out)
     positive = 0
     for r in range(n, rows):
         positive += out[r] > 0.0
@@ -317,7 +305,8 @@ def flow_until(
         left = end_step - step
         if fraction == 0.0 and left >= NODES_FINE and calm >= NODES_FINE:
             wanted = min(NODES_COARSE, left // NODES_FINE)
-            positive = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, x, scratch.rows)
+            rows = t.count[mode] * (3 * NODES_COARSE + 1)
+            positive = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, rows, x, scratch.rows)
             clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_COARSE, wanted)
             if clean > 0:
                 advance(t.jump_coarse, (mode * NODES_COARSE + clean - 1) * n2, x, scratch.change)
@@ -328,7 +317,8 @@ def flow_until(
             left = end_step - step
         if fraction == 0.0 and left > 0:
             wanted = min(NODES_FINE, left)
-            positive = scan(t.fine, mode * t.states * fine_rows, fine_rows, x, scratch.rows)
+            rows = t.count[mode] * (3 * NODES_FINE + 1)
+            positive = scan(t.fine, mode * t.states * fine_rows, fine_rows, rows, x, scratch.rows)
             clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_FINE, wanted)
             if clean > 0:
                 advance(t.jump_fine, (mode * NODES_FINE + clean - 1) * n2, x, scratch.change)
@@ -369,7 +359,7 @@ def follow_schedule(
     """
     while True:
         if at[3] == 1:
-            mode = settle(t, at[1], x, at[0], place[0], True, record)
+            mode = settle(t, at[1], x, at[0], place[0], True, record, scratch)
             if mode < 0:
                 return ZENO
             at[1], at[3] = mode, 0

@@ -18,9 +18,10 @@ from servotwin.hybrid.exponential import Long, expm1, powers, taylor_rows
 NODES_COARSE = 16
 NODES_FINE = 8
 PARTS = 32
-PIECES = 4
-# |eigenvalue| * step <= 2 by the choice of the step: 2**26 / 26! = 2e-19.
-TERMS = 26
+PIECES = 5
+# |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 32)**9 / 9! = 4e-17.
+TERMS = 24
+PART_TERMS = 8
 SPECTRAL_STEP = 2.0
 
 
@@ -39,10 +40,11 @@ class Tables(NamedTuple):
     jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # M * 8 * n * n, transposed
     jump_part: Array  # M * 32 * n * n, transposed: exp(A j step / 32) - I
-    flow_part: Array  # M * n * n, transposed: A step / 32
+    flow_part: Array  # M * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside the first interval's rows of fine
-    sizes: Array  # (M, G, n): sum over the orders of abs(taylor)
-    bernstein: Array  # (TERMS, 13): Taylor coefficients on [0, 1] to Bernstein rows over 4 intervals
+    rows: Array  # M * G * n
+    sizes: Array  # M * G * n: sum over the orders of abs(taylor)
+    bernstein: Array  # TERMS * 16: Taylor coefficients on [0, 1] to Bernstein rows over 5 intervals
 
 
 def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
@@ -67,8 +69,8 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
                 has_reset[m, g], reset[m, g] = True, guard.reset
     parts = [_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))]
     stacked = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in zip(*parts, strict=True)]
-    sizes = np.abs(stacked[2].reshape(len(modes), guards, n, TERMS)).sum(axis=3)
-    return Tables(n, guards, count, target, has_reset, reset, *stacked, sizes, _bernstein_of_taylor())
+    sizes = np.abs(stacked[2].reshape(len(modes), guards, n, TERMS)).sum(axis=3).ravel()
+    return Tables(n, guards, count, target, has_reset, reset, *stacked, rows.ravel(), sizes, _bernstein_of_taylor().ravel())
 
 
 def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
@@ -85,7 +87,7 @@ def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
         coarse.transpose(0, 2, 1),
         fine.transpose(0, 2, 1),
         part.transpose(0, 2, 1),
-        (flow.T * (step / PARTS)).astype(np.longdouble),
+        taylor_rows(np.eye(len(flow)), flow, step / PARTS, PART_TERMS + 1)[1:].reshape(-1, len(flow)).T,
         np.hstack([unit.T, _bernstein_rows(rows, slopes * step, fine[:1])]),
     )
 

@@ -22,7 +22,7 @@ from servotwin.hybrid.kernel import (
     advance_fraction,
     follow_schedule,
 )
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables, build_tables, search_step
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, TERMS, Tables, build_tables, search_step
 
 _BLOCK = NODES_COARSE * NODES_FINE
 # Jumps this close to a search step, in steps, are taken on it.
@@ -146,6 +146,19 @@ class Trajectory:
         sample_segments(size, r.step, r.fraction, r.mode, r.state, table, self.divisor, result)
         return result
 
+    def between(self, rows: ArrayLike, first: int, last: int) -> Array:
+        """The same output at samples first .. last - 1, bit for bit, without evaluating the rest."""
+        table, r, size = self._output_table(rows), self.record, int(self.record.size[0])
+        step, stride = r.step[:size], self.divisor
+        begin = int(np.searchsorted(step, first * stride - _BLOCK))
+        end = min(size, int(np.searchsorted(step, last * stride)) + 1)
+        start = min(first, int(step[begin]) // stride)
+        result = np.empty(max(last, int(step[end - 1]) // stride + 1) - start + 1)
+        part = slice(begin, end)
+        moved = step[part] - start * stride
+        sample_segments(end - begin, moved, r.fraction[part], r.mode[part], r.state[part], table, stride, result)
+        return result[first - start : last - start]
+
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
         """The same output at any times within the run, right-continuous; ``(len(times),)``."""
         places = np.asarray(times, dtype=float) / self.step
@@ -223,7 +236,7 @@ def new_scratch(tables: Tables) -> Scratch:
     """Working memory for one run."""
     n = tables.states
     rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
-    return Scratch(np.zeros(rows), np.zeros(TERMS), np.zeros(n), np.zeros(n))
+    return Scratch(np.zeros(rows), np.zeros(TERMS), np.zeros(n), np.zeros(n * PART_TERMS))
 
 
 def _output_table(tables: Tables, rows: Array) -> Array:

@@ -84,6 +84,12 @@ class ContinuousEngine:
             return quantised(self.channel("position"), self.servo.position_resolution)
         return self.trajectory.sampled(self.loop.rows[name])
 
+    def part(self, name: str, first: int, last: int) -> Array:
+        """A channel at samples first .. last - 1."""
+        if name == "measured_position":
+            return quantised(self.part("position", first, last), self.servo.position_resolution)
+        return self.trajectory.between(self.loop.rows[name], first, last)
+
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Time, kind, side, and whether the state (not a jump) triggered it."""
         return [(time, kind, side, not forced) for time, kind, side, forced in self.trajectory.events()]

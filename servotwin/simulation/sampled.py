@@ -14,7 +14,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, LawState
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.compiled import compiled, inlined
 from servotwin.hybrid.kernel import (
     CHANGES_AT_ONCE,
     DONE,
@@ -33,14 +33,14 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.simulation.run import Inputs, quantised
 
-tick = compiled(law.tick)
+tick = inlined(law.tick)
 
 
 class Port(NamedTuple):
     """Where the sampled loop reads and writes the plant's state, and how its steps divide."""
 
     voltage: int
-    position: Array  # row of the measured position
+    position: int
     resolution: float
     recorded: NDArray[np.int64]  # states written at every recorded step
     tick_every: int
@@ -67,16 +67,13 @@ class Output(NamedTuple):
     active: NDArray[np.int8]  # (ticks,)
 
 
-@compiled
+@inlined
 def take_tick(
     i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
 ) -> LawState:
     """Measure, tick, hold the voltage."""
-    y = 0.0
-    for j in range(len(x)):
-        y += port.position[j] * x[j]
     k = i - drive.first
-    y += drive.noise[k]
+    y = x[port.position] + drive.noise[k]
     if port.resolution > 0.0:
         y = np.round(y / port.resolution) * port.resolution
     now = LawParameters(
@@ -98,6 +95,13 @@ def take_tick(
     return state
 
 
+@inlined
+def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
+    """Record the states of one sample."""
+    for j in range(len(port.recorded)):
+        output.states[j, row] = x[port.recorded[j]]
+
+
 @compiled
 def tick_and_record(
     base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
@@ -106,9 +110,7 @@ def tick_and_record(
     if base % port.tick_every == 0:
         state = take_tick(base // port.tick_every, x, parameters, state, port, drive, output)
     if base % port.record_every == 0:
-        row = base // port.record_every
-        for j in range(len(port.recorded)):
-            output.states[j, row] = x[port.recorded[j]]
+        write_sample(base // port.record_every, x, port, output)
     return state
 
 
@@ -128,16 +130,29 @@ def run_ticks(
     scratch: Scratch,
 ) -> tuple[int, int, int, LawState]:
     """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when `record` is full."""
+    i, row = (base - 1) // port.tick_every + 1, (base - 1) // port.record_every + 1
+    to_tick, to_record = i * port.tick_every - base, row * port.record_every - base
+    search = base * port.searches
     while base < end:
         if record.size[1] > port.room:
             return FULL, base, mode, state
-        state = tick_and_record(base, x, parameters, state, port, drive, output)
-        for search in range(base * port.searches, (base + 1) * port.searches):
+        if to_tick == 0:
+            state = take_tick(i, x, parameters, state, port, drive, output)
+            to_tick = port.tick_every
+            i += 1
+        if to_record == 0:
+            write_sample(row, x, port, output)
+            to_record = port.record_every
+            row += 1
+        for _ in range(port.searches):
             mode = step_once(t, mode, x, search, record, scratch)
+            search += 1
             record.size[0] = 0
             if mode < 0:
                 return ZENO, base, mode, state
         base += 1
+        to_tick -= 1
+        to_record -= 1
     return DONE, base, mode, state
 
 
@@ -185,7 +200,7 @@ class SampledEngine:
         recorded = [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
         return Port(
             names.index("voltage"),
-            np.ascontiguousarray(self.plant.rows["position"][0]),
+            int(np.argmax(self.plant.rows["position"][0])),
             self.servo.position_resolution,
             np.array(recorded),
             self.tick_every,
@@ -290,11 +305,18 @@ class SampledEngine:
         if name == "measured_position":
             return self._measured()
         row = self.plant.rows[name][0]
-        out = np.zeros(self.index + 1)
+        now = sum(row[state] * self.state[state] for state in self.port.recorded if row[state] != 0.0)
+        return np.append(self.part(name, 0, self.index), now)
+
+    def part(self, name: str, first: int, last: int) -> Array:
+        """A channel at samples first .. last - 1, all of them before the present one."""
+        if name == "measured_position":
+            return self.output.measured[np.arange(first, last) * self.record_every // self.tick_every]
+        row = self.plant.rows[name][0]
+        out = np.zeros(last - first)
         for j, state in enumerate(self.port.recorded):
             if row[state] != 0.0:
-                out[:-1] += row[state] * self.output.states[j, : self.index]
-                out[-1] += row[state] * self.state[state]
+                out += row[state] * self.output.states[j, first:last]
         return out
 
     def _measured(self) -> Array:

@@ -27,6 +27,7 @@ class Engine(Protocol):
     def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
     def channel(self, name: str) -> Array: ...
+    def part(self, name: str, first: int, last: int) -> Array: ...
     def events(self) -> list[tuple[float, str, int, bool]]: ...
 
 
@@ -120,8 +121,14 @@ class Simulation:
         self.engine.set_tolerance(tolerance)
 
     def measured(self, name: str, first: int, last: int) -> Array:
-        """What a sensor or the law gave at samples first .. last - 1: theta_m, position, voltage or reference; ``(last - first,)``."""
-        return self.run().measured(name)[first:last]
+        """What a sensor or the law gave at samples first .. last - 1: theta_m, position, voltage or reference; ``(last - first,)``.
+
+        All of them lie before the present one, whose voltage is not decided yet.
+        """
+        if name == "reference":
+            return self.inputs.reference.value(self.inputs.times(first, last))
+        values = self.engine.part("measured_position" if name == "position" else name, first, last)
+        return quantised(values, self.servo.encoder_resolution) if name == "theta_m" else values
 
     def run(self) -> Run:
         """Everything up to the present sample."""
