@@ -1,4 +1,7 @@
-"""Noise of the position sensor: Gaussian, white or high-passed, with a stated standard deviation (section 4.3)."""
+"""Noise of the position sensor: Gaussian, white or high-passed, with a stated standard deviation (section 4.3).
+
+scipy.signal takes most of a second to import, so only what draws noise imports it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import linalg, signal
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
@@ -57,6 +59,8 @@ class Noise:
             raise InvalidInput(
                 f"noise band = {self.band} Hz: the pass edge must be below half the sample rate of {rate} Hz"
             )
+        from scipy import signal
+
         order, edge = signal.buttord(passed, stop, PASSBAND_RIPPLE_DB, STOPBAND_ATTENUATION_DB, fs=rate)
         sections: Array = signal.butter(order, edge, "highpass", output="sos", fs=rate)
         sections[0, :3] /= noise_gain(sections)
@@ -66,7 +70,7 @@ class Noise:
         """A source that goes on from block to block, stationary from its first sample."""
         sections = self.filter(rate)
         A, B, _, _ = state_space(sections)
-        start = _square_root(linalg.solve_discrete_lyapunov(A, np.outer(B, B))) @ rng.standard_normal(B.size)
+        start = _square_root(_covariance(A, B)) @ rng.standard_normal(B.size)
         return NoiseSource(self.std, sections, start.reshape(-1, 2), rng)
 
     def samples(self, n: int, rate: float, rng: np.random.Generator) -> Array:
@@ -94,6 +98,8 @@ class NoiseSource:
 
     def block(self, n: int) -> Array:
         """(n,) m, the next n samples."""
+        from scipy import signal
+
         if n == 0:
             return np.zeros(0)
         out, self.state = signal.sosfilt(self.sections, self.rng.standard_normal(n), zi=self.state)
@@ -106,8 +112,7 @@ def noise_gain(sections: Array) -> float:
     In closed form: C P C' + D^2 with P the solution of the discrete Lyapunov equation P = A P A' + B B'.
     """
     A, B, C, D = state_space(sections)
-    P = linalg.solve_discrete_lyapunov(A, np.outer(B, B))
-    return float(np.sqrt(C @ P @ C + D * D))
+    return float(np.sqrt(C @ _covariance(A, B) @ C + D * D))
 
 
 def state_space(sections: Array) -> tuple[Array, Array, Array, float]:
@@ -123,6 +128,13 @@ def state_space(sections: Array) -> tuple[Array, Array, Array, float]:
         C, D = b0 * C, b0 * D
         C[2 * i] = 1.0
     return A, B, C, D
+
+
+def _covariance(A: Array, B: Array) -> Array:
+    """P = A P A' + B B', the stationary covariance of the state driven by unit white noise."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    return np.asarray(solve_discrete_lyapunov(A, np.outer(B, B)))
 
 
 def _square_root(covariance: Array) -> Array:
