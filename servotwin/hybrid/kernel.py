@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import compiled, inlined
+from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.polynomial import first_positive
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, PARTS, PIECES, TERMS, Tables
 
@@ -47,6 +47,8 @@ class Scratch(NamedTuple):
     series: Array
     change: Array
     terms: Array
+    starts: Array
+    ends: Array
 
 
 @inlined
@@ -177,16 +179,17 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         power *= length
     for k in range(TERMS - first, TERMS):
         c[k] = 0.0
-    return _search_unit(t, c, scratch.rows) * length
+    return _search_unit(t, scratch) * length
 
 
 @inlined
-def _search_unit(t: Tables, c: Array, b: Array) -> float:
+def _search_unit(t: Tables, scratch: Scratch) -> float:
+    c, b = scratch.series, scratch.rows
     product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
     for piece in range(PIECES):
         at = 3 * piece
         if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
-            root = first_positive(c, piece / PIECES, (piece + 1) / PIECES)
+            root = first_positive(c, piece / PIECES, (piece + 1) / PIECES, scratch.starts, scratch.ends)
             if root < np.inf:
                 return root
     return np.inf
@@ -203,19 +206,24 @@ def note_segment(record: Record, step: int, fraction: float, mode: int, x: Array
 
 
 @inlined
-def fire(t: Tables, mode: int, guard: int, x: Array, step: int, fraction: float, forced: bool, record: Record) -> int:
+def fire(
+    t: Tables,
+    mode: int,
+    guard: int,
+    x: Array,
+    step: int,
+    fraction: float,
+    forced: bool,
+    record: Record,
+    scratch: Scratch,
+) -> int:
     """Record the event, apply the guard's reset and return the mode entered."""
     at = record.size[1]
     record.event_step[at], record.event_fraction[at] = step, fraction
     record.event_mode[at], record.event_guard[at], record.event_forced[at] = mode, guard, forced
     record.size[1] = at + 1
     if t.has_reset[mode, guard]:
-        old = x.copy()
-        for i in range(t.states):
-            total = 0.0
-            for j in range(t.states):
-                total += t.reset[mode, guard, i, j] * old[j]
-            x[i] = total
+        advance(t.reset, (mode * t.guards + guard) * t.states * t.states, x, scratch.change)
     return t.target[mode, guard]
 
 
@@ -232,7 +240,7 @@ def settle(
                 break
         if leaving < 0:
             return mode
-        mode = fire(t, mode, leaving, x, step, fraction, forced, record)
+        mode = fire(t, mode, leaving, x, step, fraction, forced, record, scratch)
     return -1
 
 
@@ -253,7 +261,7 @@ def cross(
             return mode, record.size[1] - before
         advance_fraction(t, mode, x, first, scratch)
         place = min(place + first, end)
-        mode = fire(t, mode, which, x, step, place, False, record)
+        mode = fire(t, mode, which, x, step, place, False, record, scratch)
         mode = settle(t, mode, x, step, place, False, record, scratch)
         if mode < 0:
             break
@@ -280,7 +288,7 @@ def step_once(t: Tables, mode: int, x: Array, step: int, record: Record, scratch
     return mode
 
 
-@compiled
+@bare
 def flow_until(
     t: Tables,
     x: Array,
@@ -340,7 +348,7 @@ def flow_until(
     return DONE, step, fraction, mode
 
 
-@compiled
+@bare
 def follow_schedule(
     t: Tables,
     x: Array,

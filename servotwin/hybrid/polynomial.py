@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.compiled import inlined
 
-_DEPTH = 40
-_NEWTON_STEPS = 60
+DEPTH = 40
+_NEWTON_STEPS = 100
+_CONVERGED = 1e-9
 
 
-@compiled
+@inlined
 def value_and_slope(c: Array, t: float) -> tuple[float, float]:
     """Horner's scheme for the polynomial ``sum c[k] t**k`` and its derivative."""
     value, slope = c[-1], 0.0
@@ -21,11 +22,9 @@ def value_and_slope(c: Array, t: float) -> tuple[float, float]:
     return value, slope
 
 
-@compiled
-def bracketed_root(c: Array, low: float, high: float) -> float:
-    """Root in [low, high] where ``p(low) <= 0 < p(high)``: Newton from the secant, bisection whenever it leaves the bracket."""
-    at_low, _ = value_and_slope(c, low)
-    at_high, _ = value_and_slope(c, high)
+@inlined
+def bracketed_root(c: Array, low: float, high: float, at_low: float, at_high: float) -> float:
+    """Root in [low, high] given ``p(low) <= 0 < p(high)``: Newton from the secant, bisection whenever it leaves the bracket."""
     t = low - at_low * (high - low) / (at_high - at_low)
     for _ in range(_NEWTON_STEPS):
         value, slope = value_and_slope(c, t)
@@ -33,25 +32,25 @@ def bracketed_root(c: Array, low: float, high: float) -> float:
             high = t
         else:
             low = t
-        step = value / slope if slope > 0.0 else np.inf
-        new = t - step
+        new = t - value / slope if slope > 0.0 else high + 1.0
         if not low <= new <= high:
             new = 0.5 * (low + high)
-        if abs(new - t) <= 2e-16 * abs(new) or value == 0.0:
+        # Newton's next error is of the order of this one's square.
+        if abs(new - t) <= _CONVERGED * abs(new):
             return new
         t = new
     return t
 
 
-@compiled
-def first_positive(c: Array, low: float, high: float) -> float:
+@inlined
+def first_positive(c: Array, low: float, high: float, starts: Array, ends: Array) -> float:
     """First t in (low, high] from which ``p > 0``, given ``p(low) <= 0``; inf when there is none.
 
     Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero or rises through it monotonically.
+    `starts` and `ends` are working memory for DEPTH + 2 intervals.
     """
-    starts, ends = np.empty(_DEPTH + 2), np.empty(_DEPTH + 2)
     starts[0], ends[0] = low, high
-    smallest = (high - low) * 0.5**_DEPTH
+    smallest = (high - low) * 0.5**DEPTH
     top = 1
     while top > 0:
         top -= 1
@@ -67,7 +66,7 @@ def first_positive(c: Array, low: float, high: float) -> float:
         rises = at_b > 0.0 and slope_a >= 0.0 and slope_b > 0.0 and inner_b >= inner_a
         if rises or b - a <= smallest:
             if at_b > 0.0:
-                return bracketed_root(c, a, b)
+                return bracketed_root(c, a, b, at_a, at_b)
             continue
         middle = 0.5 * (a + b)
         starts[top], ends[top] = middle, b

@@ -33,7 +33,7 @@ class Tables(NamedTuple):
     count: NDArray[np.int64]  # (M,) guards of each mode
     target: NDArray[np.int64]  # (M, G)
     has_reset: NDArray[np.bool_]  # (M, G)
-    reset: Array  # (M, G, n, n)
+    reset: Array  # M * G * n * n, transposed: reset - I
     coarse: Array  # M * n * (G * 49): Bernstein rows over 16 intervals of 8 steps
     fine: Array  # M * n * (G * 25): the same over 8 intervals of one step
     taylor: Array  # M * G * n * TERMS
@@ -66,11 +66,11 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
         for g, guard in enumerate(mode.guards):
             target[m, g], rows[m, g] = guard.target, guard.row
             if guard.reset is not None:
-                has_reset[m, g], reset[m, g] = True, guard.reset
+                has_reset[m, g], reset[m, g] = True, (np.asarray(guard.reset) - np.eye(n)).T
     parts = [_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))]
     stacked = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in zip(*parts, strict=True)]
     sizes = np.abs(stacked[2].reshape(len(modes), guards, n, TERMS)).sum(axis=3).ravel()
-    return Tables(n, guards, count, target, has_reset, reset, *stacked, rows.ravel(), sizes, _bernstein_of_taylor().ravel())
+    return Tables(n, guards, count, target, has_reset, reset.ravel(), *stacked, rows.ravel(), sizes, _bernstein_of_taylor().ravel())
 
 
 def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.compiled import compiled
+from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.kernel import (
     CHANGES_AT_ONCE,
     EVENTS_PER_STEP,
@@ -22,6 +22,7 @@ from servotwin.hybrid.kernel import (
     advance_fraction,
     follow_schedule,
 )
+from servotwin.hybrid.polynomial import DEPTH
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, TERMS, Tables, build_tables, search_step
 
 _BLOCK = NODES_COARSE * NODES_FINE
@@ -167,7 +168,7 @@ class Trajectory:
         segments = np.maximum(np.searchsorted(starts, places, side="right") - 1, 0)
         rows = np.broadcast_to(np.asarray(rows, dtype=float), (len(self.automaton.modes), len(self.state)))
         result = np.empty(len(places))
-        evaluate(self.tables, segments, places - starts[segments], r.mode, r.state, rows, result, self._scratch)
+        evaluate(self.tables, segments, places - starts[segments], r.mode, r.state, rows, result, np.empty(len(self.state)), self._scratch)
         return result
 
     def _output_table(self, rows: ArrayLike) -> Array:
@@ -236,7 +237,8 @@ def new_scratch(tables: Tables) -> Scratch:
     """Working memory for one run."""
     n = tables.states
     rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
-    return Scratch(np.zeros(rows), np.zeros(TERMS), np.zeros(n), np.zeros(n * PART_TERMS))
+    sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
+    return Scratch(*(np.zeros(size) for size in sizes))
 
 
 def _output_table(tables: Tables, rows: Array) -> Array:
@@ -252,7 +254,7 @@ def _output_table(tables: Tables, rows: Array) -> Array:
     return np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
 
 
-@compiled
+@bare
 def sample_segments(
     size: int,
     step: NDArray[np.int64],
@@ -295,7 +297,7 @@ def sample_segments(
                 out[sample] = total
 
 
-@compiled
+@bare
 def evaluate(
     t: Tables,
     segments: NDArray[np.int64],
@@ -304,12 +306,15 @@ def evaluate(
     state: Array,
     rows: Array,
     out: Array,
+    x: Array,
     scratch: Scratch,
 ) -> None:
     """Dense output: advance each segment's start by an offset in steps and apply the row of its mode."""
     n2 = t.states * t.states
     for k in range(len(segments)):
-        x, m = state[segments[k]].copy(), mode[segments[k]]
+        m = mode[segments[k]]
+        for i in range(t.states):
+            x[i] = state[segments[k], i]
         whole = int(offsets[k])
         eights, ones = min(whole // NODES_FINE, NODES_COARSE), 0
         ones = min(whole - eights * NODES_FINE, NODES_FINE)

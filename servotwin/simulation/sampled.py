@@ -14,7 +14,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, LawState
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import compiled, inlined
+from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.kernel import (
     CHANGES_AT_ONCE,
     DONE,
@@ -33,7 +33,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.simulation.run import Inputs, quantised
 
-tick = inlined(law.tick)
+tick = verbatim(law.tick)
 
 
 class Port(NamedTuple):
@@ -102,7 +102,7 @@ def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
         output.states[j, row] = x[port.recorded[j]]
 
 
-@compiled
+@bare
 def tick_and_record(
     base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
 ) -> LawState:
@@ -114,7 +114,7 @@ def tick_and_record(
     return state
 
 
-@compiled
+@bare
 def run_ticks(
     t: Tables,
     x: Array,
