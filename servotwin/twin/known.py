@@ -21,7 +21,8 @@ def known_gap(gap: SignalLike, duration: float) -> Estimator:
     truth = as_nonnegative(gap, duration, "gap", "rad")
 
     def estimate(window: Window, _previous: float) -> GapEstimate:
-        value = max(0.0, float(truth.value(window.mid_time)))
-        return GapEstimate(value, 0.0, 0.0, (value, value), GapStatus.OK, window.mid_time, method="known")
+        middle = window.start + 0.5 * window.duration
+        value = max(0.0, float(truth.value(middle)))
+        return GapEstimate(value, 0.0, 0.0, (value, value), GapStatus.OK, middle, method="known")
 
     return estimate

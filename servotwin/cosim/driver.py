@@ -1,24 +1,25 @@
 """Co-simulation: plant and law, edge agent, link and twin under one virtual clock.
 
-Time is event time in seconds; the machine moves in whole samples. Something that happens between two samples, or exactly
-at one, takes effect at the later one, before that sample is taken. The plant runs ahead only as far as nothing can happen
-to it: to the next event, to what the agent waits for, at most to where a change not seen yet could complete a window.
+Time is event time in seconds; the machine moves in whole samples. Something that happens between two samples, or
+exactly at one, takes effect at the later one, before that sample is taken. The plant runs ahead only as far as nothing
+can happen to it: to the next event, to what the agent waits for, at most to where a change not seen yet could complete
+a window.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 from servotwin.clock import Event, VirtualClock
+from servotwin.cosim.loop import Loop, Transmission
 from servotwin.edge.agent import Agent, Outgoing
-from servotwin.identify.estimate import GapEstimate
-from servotwin.link.simulated import Fate, Line, LinkSettings
-from servotwin.messages import Message, Receipt, Update, Window, decode, encode
+from servotwin.edge.recorder import Floats
+from servotwin.link.simulated import Line, LinkSettings
+from servotwin.messages import Message, Receipt, Update, decode, encode
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run, Simulation
 from servotwin.twin.store import MemoryStore
@@ -28,89 +29,7 @@ Progress = Callable[[float], object]
 """Called with the share done, 0 .. 1."""
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
-TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", "tolerance")
 _ROUNDING = 1e-6  # of a sample: times that are sums of delays are known to rounding only
-
-
-@dataclass(frozen=True)
-class Transmission:
-    """One copy of a message on its way.
-
-    Attributes
-    ----------
-    direction : str
-        "up", edge to twin, or "down".
-    serial, copy : int
-        The message's number in its direction; 1 for a duplicate.
-    data : bytes
-    sent, arrival : float
-        s; a lost one's arrival is when it would have come.
-    fate : Fate
-    """
-
-    direction: str
-    serial: int
-    copy: int
-    data: bytes
-    sent: float
-    arrival: float
-    fate: Fate
-
-    @property
-    def message(self) -> Message:
-        """What the bytes say."""
-        return decode(self.data)
-
-
-@dataclass(frozen=True)
-class Loop:
-    """What a co-simulation returns.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    run : Run
-        The trajectory.
-    windows : tuple of messages.Window
-        As decoded by the twin, each once, in the order of arrival.
-    estimates : tuple of GapEstimate
-        One for each window.
-    updates : tuple of messages.Update
-        Every version that the twin gave out.
-    receipts : tuple of messages.Receipt
-        Every decision of the edge, in its order (repeated answers included).
-    messages : tuple of Transmission
-        Every copy of every message, in the order of sending.
-    accounts : Counter
-        Windows cut by the edge: "delivered", "in flight" (kept at the edge, not at the twin), or why they were dropped.
-    """
-
-    scenario: Scenario
-    run: Run
-    windows: tuple[Window, ...]
-    estimates: tuple[GapEstimate, ...]
-    updates: tuple[Update, ...]
-    receipts: tuple[Receipt, ...]
-    messages: tuple[Transmission, ...]
-    accounts: Counter[str]
-
-    @property
-    def applied(self) -> tuple[Receipt, ...]:
-        """The first receipt of each update that was applied, in order."""
-        first = {receipt.version: receipt for receipt in reversed(self.receipts) if receipt.applied}
-        return tuple(sorted(first.values(), key=lambda receipt: receipt.sample))
-
-    def digest(self) -> str:
-        """SHA-256 over every message (bytes, times, fate) and the whole trajectory: equal only for runs equal bit for bit."""
-        total = hashlib.sha256()
-        for m in self.messages:
-            total.update(
-                f"{m.direction} {m.serial} {m.copy} {m.sent!r} {m.arrival!r} {m.fate} {len(m.data)}\n".encode()
-            )
-            total.update(m.data)
-        for name in TRAJECTORY:
-            total.update(getattr(self.run, name).tobytes())
-        return total.hexdigest()
 
 
 def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: Estimator | None = None) -> Loop:
@@ -128,21 +47,41 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
     -------
     Loop
     """
-    machine = _Cosimulation(scenario, estimator)
-    while not machine.done:
-        machine.advance()
+    machine = simulation_of(scenario)
+    cosimulation = Cosimulation(scenario, machine, estimator)
+    while not cosimulation.done:
+        cosimulation.advance()
         if progress is not None:
-            progress(machine.share)
-    return machine.loop()
+            progress(cosimulation.share)
+    return cosimulation.loop(machine.run())
 
 
-class _Cosimulation:
-    """The four parts, and the clock that connects them."""
+class Machine(Protocol):
+    """What is controlled, with its controller: a `Simulation`, or a stub in a test."""
 
-    def __init__(self, scenario: Scenario, estimator: Estimator | None) -> None:
+    samples: int
+
+    @property
+    def index(self) -> int:
+        """The present sample."""
+
+    def advance(self, index: int) -> None:
+        """Go on to a sample."""
+
+    def measured(self, name: str, first: int, last: int) -> Floats:
+        """A channel at samples first .. last - 1, all before the present one."""
+
+    def set_tolerance(self, tolerance: float) -> None:
+        """A new dead zone (m) from the present sample on."""
+
+
+class Cosimulation:
+    """Machine, agent, link and twin, and the clock that connects them; `advance` it until it is `done`."""
+
+    def __init__(self, scenario: Scenario, machine: Machine, estimator: Estimator | None = None) -> None:
         self.scenario = scenario
         self.clock = VirtualClock()
-        self.simulation = _simulation(scenario)
+        self.machine = machine
         self.agent = Agent(scenario.agent_settings())
         self.store = MemoryStore()
         self.twin = Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
@@ -153,28 +92,30 @@ class _Cosimulation:
 
     @property
     def done(self) -> bool:
-        return self.simulation.index == self.simulation.samples - 1
+        """Whether the last sample is reached."""
+        return self.machine.index == self.machine.samples - 1
 
     @property
     def share(self) -> float:
-        return self.simulation.index / (self.simulation.samples - 1)
+        """How much is done, 0 .. 1."""
+        return self.machine.index / (self.machine.samples - 1)
 
     def advance(self) -> None:
         """To the next sample at which something may happen, and through what does."""
-        first, stop = self.simulation.index, self._next_stop()
-        self.simulation.advance(stop)
-        blocks = (self.simulation.measured(name, first, stop) for name in CHANNELS)
+        first, stop = self.machine.index, self._next_stop()
+        self.machine.advance(stop)
+        blocks = (self.machine.measured(name, first, stop) for name in CHANNELS)
         for outgoing in self.agent.absorb_block(*blocks):
             time = outgoing.sample / self.scenario.recording.sample_rate
             self.clock.schedule(max(time, self.clock.now), partial(self._send_up, outgoing))
         while (due := self.clock.next_time) is not None and self._sample_at(due) <= stop:
             self.clock.step()
 
-    def loop(self) -> Loop:
-        """Everything so far."""
+    def loop(self, run: Run) -> Loop:
+        """Everything so far, with the machine's run."""
         return Loop(
             scenario=self.scenario,
-            run=self.simulation.run(),
+            run=run,
             windows=tuple(self.store.windows.values()),
             estimates=tuple(self.store.estimates.values()),
             updates=tuple(self.store.updates),
@@ -185,8 +126,8 @@ class _Cosimulation:
 
     def _next_stop(self) -> int:
         """The next event, what the agent waits for, or where a change not seen yet could complete a window."""
-        index, settings = self.simulation.index, self.agent.settings
-        stops = [index + settings.window_samples - settings.pre_trigger_samples, self.simulation.samples - 1]
+        index, settings = self.machine.index, self.agent.settings
+        stops = [index + settings.window_samples - settings.pre_trigger_samples, self.machine.samples - 1]
         if self.clock.next_time is not None:
             stops.append(self._sample_at(self.clock.next_time))
         if self.agent.deadline is not None:
@@ -208,7 +149,7 @@ class _Cosimulation:
         for outgoing in self.agent.receive(decode(data)):
             self._send_up(outgoing)
         if self.agent.parameters.version != version:
-            self.simulation.set_tolerance(self.agent.parameters.tolerance)
+            self.machine.set_tolerance(self.agent.parameters.tolerance)
 
     def _at_twin(self, data: bytes) -> None:
         """Bytes arrive at the twin; one that is switched off lets them lie."""
@@ -244,7 +185,8 @@ class _Cosimulation:
         return +(counts + self.agent.dropped)
 
 
-def _simulation(scenario: Scenario) -> Simulation:
+def simulation_of(scenario: Scenario) -> Simulation:
+    """The plant and its controller at the start of a scenario."""
     return Simulation(
         scenario.servo,
         scenario.duration,

@@ -1,0 +1,16 @@
+"""Plant, edge, link and twin under one virtual clock."""
+
+from servotwin.cosim.driver import Cosimulation, Machine, cosimulate, simulation_of
+from servotwin.cosim.loop import Loop, Transmission
+from servotwin.cosim.quantisation import Quantisation, quantisation
+
+__all__ = [
+    "Cosimulation",
+    "Loop",
+    "Machine",
+    "Quantisation",
+    "Transmission",
+    "cosimulate",
+    "quantisation",
+    "simulation_of",
+]

@@ -1,0 +1,96 @@
+"""What a co-simulation returns: the trajectory, and everything that crossed the link."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from dataclasses import dataclass
+
+from servotwin.identify.estimate import GapEstimate
+from servotwin.link.simulated import Fate
+from servotwin.messages import Message, Receipt, Update, Window, decode
+from servotwin.scenario import Scenario
+from servotwin.simulation import Run
+
+TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", "tolerance")
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """One copy of a message on its way.
+
+    Attributes
+    ----------
+    direction : str
+        "up", edge to twin, or "down".
+    serial, copy : int
+        The message's number in its direction; 1 for a duplicate.
+    data : bytes
+    sent, arrival : float
+        s; a lost one's arrival is when it would have come.
+    fate : Fate
+    """
+
+    direction: str
+    serial: int
+    copy: int
+    data: bytes
+    sent: float
+    arrival: float
+    fate: Fate
+
+    @property
+    def message(self) -> Message:
+        """What the bytes say."""
+        return decode(self.data)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What a co-simulation returns.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    run : Run
+        The trajectory.
+    windows : tuple of messages.Window
+        As decoded by the twin, each once, in the order of arrival.
+    estimates : tuple of GapEstimate
+        One for each window.
+    updates : tuple of messages.Update
+        Every version that the twin gave out.
+    receipts : tuple of messages.Receipt
+        Every decision of the edge, in its order (repeated answers included).
+    messages : tuple of Transmission
+        Every copy of every message, in the order of sending.
+    accounts : Counter
+        Windows cut by the edge: "delivered", "in flight" (kept at the edge, not at the twin), or why they were dropped.
+    """
+
+    scenario: Scenario
+    run: Run
+    windows: tuple[Window, ...]
+    estimates: tuple[GapEstimate, ...]
+    updates: tuple[Update, ...]
+    receipts: tuple[Receipt, ...]
+    messages: tuple[Transmission, ...]
+    accounts: Counter[str]
+
+    @property
+    def applied(self) -> tuple[Receipt, ...]:
+        """The first receipt of each update that was applied, in order."""
+        first = {receipt.version: receipt for receipt in reversed(self.receipts) if receipt.applied}
+        return tuple(sorted(first.values(), key=lambda receipt: receipt.sample))
+
+    def digest(self) -> str:
+        """SHA-256 over every message (bytes, times, fate) and the trajectory: equal only for runs equal bit for bit."""
+        total = hashlib.sha256()
+        for m in self.messages:
+            total.update(
+                f"{m.direction} {m.serial} {m.copy} {m.sent!r} {m.arrival!r} {m.fate} {len(m.data)}\n".encode()
+            )
+            total.update(m.data)
+        for name in TRAJECTORY:
+            total.update(getattr(self.run, name).tobytes())
+        return total.hexdigest()

@@ -1,0 +1,63 @@
+"""What sending windows as int16 does to the estimates that are made from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servotwin.cosim.loop import Loop
+from servotwin.identify.gap import estimate_gap
+from servotwin.identify.window import Window as NumericWindow
+from servotwin.messages import Window
+from servotwin.simulation import Run
+from servotwin.twin.decode import decode_window
+
+
+@dataclass(frozen=True)
+class Quantisation:
+    """What the int16 channels of one window did to its estimate.
+
+    Attributes
+    ----------
+    start : float
+        s, of the window.
+    position_step, theta_m_step : float
+        m and rad: one count of the channel's code, the most that neighbouring codes can tell apart.
+    gap_change : float
+        rad: gap from the decoded window less gap from what the sensors gave; NaN where one of them gives none.
+    """
+
+    start: float
+    position_step: float
+    theta_m_step: float
+    gap_change: float
+
+
+def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
+    """What sending int16 did to each estimate: every window is estimated once more from the unquantised samples.
+
+    Both estimates start from the same previous gap, that of the window before (as the twin does while windows arrive in
+    order).
+    """
+    settings, servo = loop.scenario.twin, loop.scenario.servo
+    previous, found = settings.initial_gap, []
+    for window in loop.windows:
+        pair = decode_window(window), _raw(loop.run, window)
+        decoded, raw = (estimate_gap(w, servo, settings.method, previous, settings.estimator) for w in pair)
+        steps = {channel.name: channel.scale for channel in window.channels}
+        found.append(Quantisation(window.start, steps["position"], steps["theta_m"], decoded.gap - raw.gap))
+        previous = decoded.gap if decoded.ok else previous
+    return tuple(found)
+
+
+def _raw(run: Run, window: Window) -> NumericWindow:
+    """The same samples as the sensors gave them."""
+    first = round(window.start * window.rate)
+    part = slice(first, first + window.samples)
+    return NumericWindow(
+        run.measured("position")[part],
+        theta_m=run.measured("theta_m")[part],
+        voltage=run.measured("voltage")[part],
+        reference=run.measured("reference")[part],
+        sample_rate=window.rate,
+        start=window.start,
+    )
