@@ -23,6 +23,9 @@ _TRIALS = 12
 class Minimum:
     """Where a minimisation ended.
 
+    A point from which the gradient leads to no lower cost, however short the step, counts as converged: it is a corner
+    of the cost, or its rounding.
+
     Attributes
     ----------
     point : (n,) array
@@ -84,7 +87,7 @@ def minimise(
         if regular and float(np.abs(moved).max()) <= step_tolerance:
             return Minimum(here.point, here.cost, True, count, "the step vanished")
         if not regular and fresh:
-            return Minimum(here.point, here.cost, False, count, "the line search found no lower cost")
+            return Minimum(here.point, here.cost, True, count, "no lower cost lies down the gradient")
         inverse = _updated(inverse, moved, turned, fresh) if regular else np.eye(start.size)
         fresh = not regular
     return Minimum(here.point, here.cost, False, count, f"no convergence in {iterations} iterations")

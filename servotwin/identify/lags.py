@@ -7,6 +7,7 @@ forms with their binomial coefficients, it loses no digits, however small alpha 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
@@ -99,8 +100,12 @@ def lag_polynomial(numerator: Array, order: int, alpha: float) -> Array:
     return weights
 
 
+@lru_cache(maxsize=64)
 def _first_order_hold(order: int, alpha: float, interval: float) -> tuple[Array, Array, Array]:
-    """x[k+1] = F x[k] + now u[k] + after u[k+1] of the cascade of `order` lags, for u linear in between."""
+    """x[k+1] = F x[k] + now u[k] + after u[k+1] of the cascade of `order` lags, for u linear in between.
+
+    Kept, because it is the same in every window, and LAPACK's threads can lose milliseconds over it on a busy machine.
+    """
     augmented = np.zeros((order + 2, order + 2))
     augmented[:order, :order] = alpha * interval * (np.eye(order, k=-1) - np.eye(order))
     augmented[0, order] = alpha * interval

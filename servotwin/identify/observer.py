@@ -43,6 +43,11 @@ class Observer:
         return self.denominator.size - 1
 
     @property
+    def static_gain(self) -> float:
+        """q3 over theta_d at rest, m/rad."""
+        return float(self.numerator[0] / self.denominator[0])
+
+    @property
     def A_o(self) -> Array:
         """(N, N) plant in observable canonical form (Eq A.1)."""
         return _companion(self.denominator)
@@ -85,7 +90,7 @@ class Observer:
 
         e(0) = x(0) holds only for x_hat(0) = 0 (erratum E7).
         """
-        return np.array([(expm(self.A * t) @ state)[0] for t in times])
+        return np.asarray(expm(self.A * np.asarray(times)[:, None, None])[:, 0] @ state)
 
     def estimate(self, theta_d: Array, position: Array, sample_rate: float) -> Array:
         """(n,) q3_hat from samples of theta_d (rad) and q3 (m), exact where they are linear between samples.

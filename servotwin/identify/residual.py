@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from servotwin.hybrid.compiled import compiled
 from servotwin.identify.lags import LagFilter
@@ -94,10 +92,11 @@ class PlayResidual:
         cost = self.cost(point)
         return cost, np.array([(self.cost(point + step) - cost) / step.sum() for step in self._steps(point)])
 
-    def sensitivities(self, point: Array) -> Array:
-        """(n - skip, 2) derivatives of `values`; a column vanishes where its parameter has no effect."""
+    def sensitivities(self, point: Array) -> tuple[Array, Array]:
+        """Derivatives of `values` by gap and theta_d0, (n - skip,) each: zeros where there is no effect."""
         values = self.values(point)
-        return np.column_stack([(self.values(point + step) - values) / step.sum() for step in self._steps(point)])
+        by_gap, by_start = ((self.values(point + step) - values) / step.sum() for step in self._steps(point))
+        return by_gap, by_start
 
     def _steps(self, point: Array) -> tuple[Array, Array]:
         """Steps in gap and theta_d0; the second towards theta_m[0], because outside the gap theta_d0 has no effect."""
@@ -108,6 +107,11 @@ class PlayResidual:
         """Residual over the filtered position's own variation (rms both): near 1 when the model explains nothing."""
         variation = float(np.std(self.base[self.skip :]))
         return math.sqrt(cost) / variation if variation > 0.0 else math.inf
+
+    def first_screw_angle(self, gap: float, point: Array) -> float:
+        """Screw angle (rad) at the first sample: that of `point`, clamped into the gap (rad); NaN when that is unknown."""
+        angle, first = self.scale * float(point[1]), self.scale * float(self.theta_m[0])
+        return math.nan if math.isnan(gap) else min(max(angle, first - 0.5 * gap), first + 0.5 * gap)
 
     def screw_motion(self, point: Array) -> tuple[float, float, float]:
         """How far (rad) the motor pushed the screw forwards and backwards, and how far it moved without pushing."""
@@ -139,15 +143,3 @@ def screw_motion(theta_m: Array, half: float, start: float) -> tuple[float, floa
         lowest = min(lowest, theta_m[i] - w)
         highest = max(highest, theta_m[i] - w)
     return upward, downward, highest - lowest
-
-
-def zero_phase(signal: Array, cutoff_hz: float, order: int, sample_rate: float) -> Array:
-    """Butterworth low-pass run forwards and backwards (section 4.3; in effect twice the order, erratum E18)."""
-    sections = _butterworth(order, cutoff_hz, sample_rate)
-    padding = min(signal.size - 1, round(sample_rate / cutoff_hz))
-    return np.asarray(sosfiltfilt(sections, signal, padlen=padding))
-
-
-@lru_cache(maxsize=16)
-def _butterworth(order: int, cutoff_hz: float, sample_rate: float) -> Array:
-    return np.asarray(butter(order, cutoff_hz, fs=sample_rate, output="sos"))
