@@ -1,8 +1,8 @@
 """What a run is measured by: amplitude, bias, settled, settling time, limit cycle. Plain arrays in, numbers out.
 
-Definitions, used everywhere in the reproduction. The *tail* of a step is its last `TAIL` seconds. The *amplitude* is half the
-peak-to-peak of the position over the tail; a step has *settled* when its amplitude is below `SETTLED` times the reference
-amplitude; its *bias* is the reference minus the mean position over the tail.
+Definitions, used everywhere in the reproduction. The *tail* of a step is its last `TAIL` seconds. The *amplitude* is
+half the peak-to-peak of the position over the tail; a step has *settled* when its amplitude is below `SETTLED` times
+the reference amplitude; its *bias* is the reference minus the mean position over the tail.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def has_settled(values: Array, scale: float, share: float = SETTLED) -> bool:
 
 
 def settling_time(time: Array, values: Array, target: float, band: float) -> float:
-    """Time from time[0] until abs(values - target) stays within `band`, interpolated; inf when the last sample is outside."""
+    """Time from time[0] until abs(values - target) stays within `band`, interpolated; inf if the last is outside."""
     outside = np.flatnonzero(np.abs(values - target) > band)
     if outside.size == 0:
         return 0.0
@@ -120,9 +120,7 @@ def steps(time: Array, position: Array, reference: Array, gap: Array, scale: flo
     return tuple(_step(time, position, reference, gap, scale, begin, end) for begin, end in pairs)
 
 
-def _step(
-    time: Array, position: Array, reference: Array, gap: Array, scale: float, begin: float, end: float
-) -> Step:
+def _step(time: Array, position: Array, reference: Array, gap: Array, scale: float, begin: float, end: float) -> Step:
     whole, last = between(time, begin, end), tail(time, end)
     values = position[last]
     final, goal = float(values.mean()), float(reference[whole][0])

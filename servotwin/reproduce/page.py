@@ -25,7 +25,8 @@ def image(vector: bytes, text: str) -> str:
 
 def figure(vector: bytes, title: str, caption: str) -> str:
     """An image with its title and caption."""
-    return f"<figure>{image(vector, title)}<figcaption><strong>{escape(title)}</strong> {escape(caption)}</figcaption></figure>"
+    text = f"<strong>{escape(title)}</strong> {escape(caption)}"
+    return f"<figure>{image(vector, title)}<figcaption>{text}</figcaption></figure>"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = False) -> str:

@@ -78,7 +78,7 @@ class Job(Hashable, Protocol[_R]):
 
 @dataclass(frozen=True, slots=True)
 class StepJob:
-    """A step from rest with a constant gap; `dead_zone_deg` is the gap that the dead zone is made for, None: no dead zone."""
+    """A step from rest with a constant gap; `dead_zone_deg` is the gap that the dead zone is made for, None: none."""
 
     preset: str
     gap_deg: float
@@ -117,6 +117,17 @@ class SettleJob:
         still = np.zeros_like(run.time)
         size = abs(self.step.amplitude)
         return measures.steps(run.time, run.position, run.reference, still, size)[0]
+
+
+@dataclass(frozen=True, slots=True)
+class ReactionJob:
+    """How far the motor turns (rad, at most) in a step run."""
+
+    step: StepJob
+
+    def run(self) -> float:
+        """The largest angle."""
+        return float(np.abs(self.step.simulate().theta_m).max())
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,14 +195,18 @@ class Runs:
         return tuple(self.settle(float(gap), dead_zone_deg) for gap in gaps_deg)
 
     def ensemble(self, gap_deg: float, dead_zone_deg: float) -> tuple[Step, ...]:
-        """Measures over reference amplitudes (0.5 to 2 mm) and initial screw angles (the whole gap), erratum E17."""
+        """81 members over reference amplitudes (0.5 to 2 mm) and initial screw angles (the whole gap), erratum E17."""
         starts = np.linspace(-0.5, 0.5, 9) * gap_deg
         sizes = AMPLITUDE * np.geomspace(0.5, 2.0, 9)
         return tuple(
-            self.settle(gap_deg, dead_zone_deg, amplitude=float(size), theta_d0_deg=float(start))
+            self.settle(gap_deg, dead_zone_deg, amplitude=float(size), theta_d0_deg=float(start), duration=30.0)
             for size in sizes
             for start in starts
         )
+
+    def reaction(self, gap_deg: float, amplitude: float) -> float:
+        """Largest motor angle (rad) in 5 s after a step, with the dead zone made for the gap."""
+        return self.get(ReactionJob(StepJob(self.preset, gap_deg, gap_deg, amplitude, duration=5.0)))
 
     def wear(self, square: Square = BIPOLAR, to_deg: float = END_DEG) -> Trace:
         """Signals of Fig 12."""

@@ -10,14 +10,14 @@ from matplotlib.figure import Figure
 from servotwin.reproduce.figures import style
 from servotwin.reproduce.figures.plate import Plate
 from servotwin.reproduce.measures import Array
-from servotwin.reproduce.runs import ESTIMATE_DEG, RATE, Runs, StepJob
+from servotwin.reproduce.runs import ESTIMATE_DEG, Runs, StepJob
 
 SPAN = 4.0  # s
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Time (s), error e and dead-zone error e_DZ (m), voltage (V), tolerance (m); times of entering and leaving the zone."""
+    """Time (s), error e and dead-zone error e_DZ (m), voltage (V), tolerance (m); when the zone is entered and left."""
 
     time: Array
     error: Array
@@ -53,9 +53,10 @@ def plot(d: Data) -> Figure:
     """Error and dead-zone error above, voltage below; the dead zone shaded where it is active."""
     figure, axes = style.panels(2, 1, height=1.9)
     upper, lower = axes[:, 0]
-    upper.axhspan(-d.tolerance * style.MM, d.tolerance * style.MM, color=style.YELLOW, alpha=0.5, lw=0, label="tolerance $±ε_{DZ}$")
+    tolerance, fed = d.tolerance * style.MM, d.dead_zone_error * style.MM
+    upper.axhspan(-tolerance, tolerance, color=style.YELLOW, alpha=0.5, linewidth=0.0, label="tolerance $±ε_{DZ}$")
     upper.plot(d.time, d.error * style.MM, color=style.BLUE, label="error $e$")
-    upper.plot(d.time, d.dead_zone_error * style.MM, color=style.RED, linewidth=1.0, linestyle="--", label="dead-zone error $e_{DZ}$")
+    upper.plot(d.time, fed, color=style.RED, linewidth=1.0, linestyle="--", label="dead-zone error $e_{DZ}$")
     upper.set_ylabel("Error (mm)")
     style.legend(upper)
     lower.plot(d.time, d.voltage, color=style.BLACK, linewidth=1.0, label="voltage $u$")
@@ -75,8 +76,8 @@ def open_intervals(d: Data) -> list[tuple[float, float]]:
 PLATE = Plate(
     "fig10b",
     "Fig 10(b). The dead-zone controller at work.",
-    f"A 1 mm step with a gap of 10 deg and the dead zone for it, simulated exactly and shown at {RATE:g} Hz: above, the error and what"
-    " the controller is fed; below, the voltage, zero while the error is inside the tolerance (shaded).",
+    "A 1 mm step with a gap of 10 deg and the dead zone for it: above, the error and what the controller is fed;"
+    " below, the voltage, zero while the error is inside the tolerance (shaded).",
     data,
     plot,
 )

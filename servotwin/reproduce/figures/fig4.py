@@ -43,7 +43,8 @@ def plot(d: Data) -> Figure:
 PLATE = Plate(
     "fig4",
     "Fig 4. The two linear parts of the plant.",
-    "Frequency response (a) of the motor, voltage to angle, and (b) of the structure, screw angle to position of the last mass.",
+    "Frequency response (a) of the motor, from voltage to angle, and (b) of the structure, from the screw's angle to"
+    " the position of the last mass.",
     data,
     plot,
 )

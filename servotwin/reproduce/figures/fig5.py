@@ -59,7 +59,8 @@ def plot(d: Data) -> Figure:
 PLATE = Plate(
     "fig5",
     "Fig 5. The linear closed loop.",
-    "(a) Position of the last mass after a 1 mm step of the reference; (b) frequency response from reference to position.",
+    "(a) Position of the last mass after a 1 mm step of the reference; (b) frequency response from reference to"
+    " position.",
     data,
     plot,
 )

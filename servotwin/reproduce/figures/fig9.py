@@ -15,7 +15,8 @@ def data(runs: Runs) -> gaps.Data:
 PLATE = Plate(
     "fig9",
     "Fig 9. The gap makes the loop oscillate.",
-    "(a) Position of the last mass after a 1 mm step and (b) the angles of motor and screw, for four total gaps, without a dead zone.",
+    "(a) Position of the last mass after a 1 mm step and (b) the angles of motor and screw, for four total gaps and"
+    " without a dead zone.",
     data,
     gaps.plot,
 )

@@ -35,7 +35,7 @@ class Data:
 
 
 def data(runs: Runs) -> Data:
-    """Eq 19's motion through a gap of 30 deg into G2, which starts from the paper's initial state; observers start from zero."""
+    """Eq 19's motion through a gap of 30 deg into G2 from the paper's initial state; the observers start from zero."""
     time = np.arange(round(SPAN * RATE) + 1) / RATE
     theta_m = (1.0 + time / 10.0) * np.sin(2.0 * np.pi * time)
     theta_d = play(theta_m, math.radians(GAP_DEG), 0.0)
@@ -61,15 +61,15 @@ def plot(d: Data) -> Figure:
     lower.set(ylabel="Position (mm)", xlabel="Time (s)", xlim=(0.0, SPAN))
     style.legend(upper)
     style.legend(lower)
-    style.letter(axes[:, 0])
+    style.letter((upper, lower))
     return figure
 
 
 PLATE = Plate(
     "figA1",
     "Fig A.1. Observers that forget what they did not know.",
-    "(a) Our input, Eq 19, and the screw behind a gap of 30 deg; (b) the structure's output from the paper's initial state and three"
-    " observers that start from zero. The dotted line marks 0.25 s.",
+    "(a) Our input, Eq 19, and the screw behind a gap of 30 deg; (b) the structure's output from the paper's initial"
+    " state and three observers that start from zero. The dotted line marks 0.25 s.",
     data,
     plot,
 )

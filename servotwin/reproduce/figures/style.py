@@ -24,7 +24,7 @@ GREY = "#7F7F7F"
 CYCLE = (BLUE, ORANGE, GREEN, RED, PINK, SKY)  # for series that are alike
 MM, DEG = 1e3, float(np.degrees(1.0))  # from m and rad
 
-_LOOK: dict[str, Any] = {
+_LOOK: Any = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.0,
@@ -55,9 +55,7 @@ def panels(
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure 7.2 inches wide and its axes (rows, columns); `height` in inches per row, `heights` relative."""
     figure = sheet(7.2, height * rows)
-    axes = figure.subplots(
-        rows, columns, squeeze=False, sharex="col" if share else False, height_ratios=heights
-    )
+    axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if share else False, height_ratios=heights)
     return figure, axes
 
 
@@ -68,7 +66,7 @@ def letter(axes: Sequence[Axes]) -> None:
 
 
 def envelope(time: ArrayLike, values: ArrayLike, columns: int = 1200) -> tuple[NDArray[Any], NDArray[Any]]:
-    """At most two samples per column, the least and the greatest in their order: what a screen would show of all of them."""
+    """At most two samples per column, the least and the greatest in their order: what a screen would show of all."""
     time, values = np.asarray(time), np.asarray(values)
     if values.size <= 4 * columns:
         return time, values
@@ -103,7 +101,8 @@ def bode(upper: Axes, lower: Axes, omega: Array, response: Complex, color: str, 
 
 def legend(axes: Axes, columns: int = 4, **how: Any) -> None:
     """A legend in one line above the axes, where it covers no data."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.2, handlelength=1.5, columnspacing=1.0, handletextpad=0.5, **how)
+    spacing = {"borderaxespad": 0.2, "handlelength": 1.5, "columnspacing": 1.0, "handletextpad": 0.5}
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, **spacing, **how)
 
 
 def svg(figure: Figure, name: str) -> bytes:

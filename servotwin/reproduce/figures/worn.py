@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servotwin.reproduce.figures import style
+from servotwin.reproduce.loops import Record
 from servotwin.reproduce.measures import Array
 from servotwin.reproduce.runs import DURATION, Trace
 
@@ -27,9 +28,10 @@ def position(axes: Axes, trace: Trace, what: str = "position $q_3$") -> None:
         if not step.settled:
             axes.axvspan(step.begin, step.end, color=style.ORANGE, alpha=0.22, linewidth=0.0)
     style.trace(axes, trace.time, trace.position * style.MM, style.BLUE, what, linewidth=0.9)
-    axes.plot(*held(trace.time[:-1], trace.reference[:-1] * style.MM), color=style.BLACK, linewidth=1.0, label="reference $r$")
+    reference = held(trace.time[:-1], trace.reference[:-1] * style.MM)
+    axes.plot(*reference, color=style.BLACK, linewidth=1.0, label="reference $r$")
     if not all(step.settled for step in trace.steps):
-        axes.fill_between([], [], color=style.ORANGE, alpha=0.22, linewidth=0.0, label="step not settled")
+        axes.fill_between([], [], color=style.ORANGE, alpha=0.22, linewidth=0.0, label="not settled")
     axes.set_ylabel("Position (mm)")
     style.legend(axes)
 
@@ -46,6 +48,14 @@ def held(time: Array, values: Array) -> tuple[Array, Array]:
 def true_gap(axes: Axes, trace: Trace) -> None:
     """The gap as it is."""
     style.trace(axes, trace.time, trace.gap * style.DEG, style.BLACK, "actual gap $θ_b$")
+
+
+def gaps(axes: Axes, record: Record, pitch: float) -> None:
+    """The gap, the twin's estimates with their spread, and what the dead zone in force is made for."""
+    true_gap(axes, record.trace)
+    gap_in_force(axes, record.trace, pitch, "dead zone in force")
+    time, value, spread = zip(*((e.time, e.gap * style.DEG, e.std * style.DEG) for e in record.estimates), strict=True)
+    axes.errorbar(time, value, spread, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
 
 
 def gap_in_force(axes: Axes, trace: Trace, pitch: float, label: str) -> None:
