@@ -19,6 +19,14 @@ RATE, STEPS, HOSTILE_S, TAIL_S = 10.0, 10, 20.0, 40.0
 """Tiny windows of four samples, a reference step every two seconds, then a clean link to settle on."""
 
 
+def make_update(version: int, base: int, window: Window, lifetime_s: float) -> Update:
+    """An update whose tolerance tells its window."""
+    known, start = (None, None, (None, None)), window.start
+    tolerance = 1e-5 * (1 + window.sequence)
+    identity = (window.boot, window.sequence)
+    return Update("axis-1", version, base, identity, start, *known, "OK", tolerance, start + lifetime_s)
+
+
 @dataclass
 class StubTwin:
     """Makes a tolerance of every window, and insists on the newest until the edge has it."""
@@ -26,7 +34,7 @@ class StubTwin:
     lifetime_s: float
     version: int = 0
     base: int = 0
-    newest: float = -1.0
+    newest: Window | None = None
     pending: Update | None = None
     seen: set[int] = field(default_factory=set)
 
@@ -34,44 +42,62 @@ class StubTwin:
         if isinstance(message, Window):
             return self._window(message)
         if isinstance(message, Receipt) and self.pending and message.version == self.pending.version:
-            return self._receipt(message, self.pending)
+            return self._receipt(message)
         return []
 
     def repeat(self) -> list[Message]:
         return [self.pending] if self.pending else []
 
     def _window(self, window: Window) -> list[Message]:
-        new = window.sequence not in self.seen
         self.seen.add(window.sequence)
         answer: list[Message] = [Acknowledge(window.servo, window.boot, window.sequence)]
-        if new and window.start > self.newest:
-            self.newest = window.start
-            answer += self._issue((window.boot, window.sequence), window.start)
+        if self.newest is None or window.start > self.newest.start:
+            self.newest = window
+            answer += self._issue(window)
         return answer
 
-    def _receipt(self, receipt: Receipt, pending: Update) -> list[Message]:
+    def _receipt(self, receipt: Receipt) -> list[Message]:
         self.base, self.pending = receipt.parameter_version, None
-        if receipt.reason in (Reason.BASE_MISMATCH, Reason.OLD_VERSION):
-            return self._issue(pending.window, pending.data_time)
-        return []
+        refused = receipt.reason in (Reason.BASE_MISMATCH, Reason.OLD_VERSION)
+        return self._issue(self.newest) if refused and self.newest else []
 
-    def _issue(self, window: tuple[str, int], start: float) -> list[Message]:
+    def _issue(self, window: Window) -> list[Message]:
         self.version = max(self.version, self.base) + 1
-        tolerance, expiry = 1e-5 * (1 + window[1]), start + self.lifetime_s
-        self.pending = Update(
-            "axis-1", self.version, self.base, window, start, None, None, (None, None), "OK", tolerance, expiry
-        )
+        self.pending = make_update(self.version, self.base, window, self.lifetime_s)
         return [self.pending]
+
+
+@dataclass
+class CarelessTwin:
+    """Takes windows as they come, old and repeated ones too, guesses bases, uses versions twice, repeats what it said and
+    listens to no receipt: the guard alone has to keep order."""
+
+    lifetime_s: float
+    version: int = 1
+    said: list[Message] = field(default_factory=list)
+    seen: set[int] = field(default_factory=set)
+
+    def receive(self, message: Message) -> list[Message]:
+        if not isinstance(message, Window):
+            return []
+        self.seen.add(message.sequence)
+        self.version += message.sequence % 3 != 0
+        base = max(0, self.version - 1 - message.sequence % 2)
+        self.said.append(make_update(self.version, base, message, self.lifetime_s))
+        return [Acknowledge(message.servo, message.boot, message.sequence), self.said[-1]]
+
+    def repeat(self) -> list[Message]:
+        return self.said[-6:]
 
 
 class Loop:
     """Everything joined on one virtual clock."""
 
-    def __init__(self, link: LinkSettings, seed: int, capacity: int, lifetime_s: float) -> None:
+    def __init__(self, link: LinkSettings, seed: int, capacity: int, twin: StubTwin | CarelessTwin) -> None:
         self.clock = VirtualClock()
         edge = AgentSettings("axis-1", "b0", RATE, 0.4, 0.1, Retry(1.5, 2.0, 4.0), Limits(maximum=1.0))
         self.outbox = MemoryOutbox(capacity)
-        self.agent, self.twin = Agent(edge, self.outbox), StubTwin(lifetime_s)
+        self.agent, self.twin = Agent(edge, self.outbox), twin
         self.link = SimulatedLink("axis-1", self.clock, self._at_twin, self._at_edge, link, seed)
         self.history: list[Parameters] = []
         self.receipts: list[Receipt] = []
@@ -159,9 +185,11 @@ def check_bytes(loop: Loop) -> None:
 
 
 @settings(max_examples=1000, deadline=None)
-@given(LINKS, SEEDS, CAPACITIES, LIFETIMES)
-def test_whatever_the_link_does(link: LinkSettings, seed: int, capacity: int, lifetime_s: float) -> None:
-    loop = Loop(link, seed, capacity, lifetime_s)
+@given(LINKS, SEEDS, CAPACITIES, LIFETIMES, st.booleans())
+def test_whatever_the_link_does(
+    link: LinkSettings, seed: int, capacity: int, lifetime_s: float, careless: bool
+) -> None:
+    loop = Loop(link, seed, capacity, CarelessTwin(lifetime_s) if careless else StubTwin(lifetime_s))
     loop.run(HOSTILE_S)
     assert loop.agent.windows_cut == STEPS
     check_parameters(loop)
@@ -172,7 +200,7 @@ def test_whatever_the_link_does(link: LinkSettings, seed: int, capacity: int, li
 @settings(max_examples=100, deadline=None)
 @given(LINKS, SEEDS)
 def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed: int) -> None:
-    loop = Loop(link, seed, capacity=100, lifetime_s=1e6)
+    loop = Loop(link, seed, 100, twin := StubTwin(1e6))
     loop.run(HOSTILE_S)
     loop.link.up.settings = loop.link.down.settings = LinkSettings(delay_s=0.2)
     loop.run(HOSTILE_S + TAIL_S)
@@ -180,13 +208,13 @@ def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed:
     assert loop.twin.seen == set(range(STEPS))
     assert loop.outbox.pending() == []
     assert loop.history[-1].window == ("b0", STEPS - 1)
-    assert loop.twin.pending is None
+    assert twin.pending is None
 
 
 @settings(max_examples=50, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES)
 def test_equal_seeds_give_equal_bytes(link: LinkSettings, seed: int, capacity: int, lifetime_s: float) -> None:
-    first, second = Loop(link, seed, capacity, lifetime_s), Loop(link, seed, capacity, lifetime_s)
+    first, second = (Loop(link, seed, capacity, StubTwin(lifetime_s)) for _ in range(2))
     for loop in (first, second):
         loop.run(HOSTILE_S)
     assert first.link.up.records == second.link.up.records
@@ -195,7 +223,7 @@ def test_equal_seeds_give_equal_bytes(link: LinkSettings, seed: int, capacity: i
 
 
 def test_on_a_clean_link_every_window_moves_the_parameters_once() -> None:
-    loop = Loop(LinkSettings(delay_s=0.12), 0, 100, 1e6)
+    loop = Loop(LinkSettings(delay_s=0.12), 0, 100, StubTwin(1e6))
     loop.run(HOSTILE_S)
     assert [parameters.window for parameters in loop.history] == [("b0", k) for k in range(STEPS)]
     assert [parameters.version for parameters in loop.history] == list(range(1, STEPS + 1))
