@@ -1,8 +1,8 @@
 """A piecewise-affine automaton: per mode a linear flow, linear guards and linear resets.
 
-Everything is homogeneous in the state: constants, ramps and polynomial inputs are states of an exosystem (a constant ``1`` with zero
-derivative makes a flow affine). So no threshold in the whole kernel is absolute, and scaling a start by a power of two scales the
-whole trajectory bit for bit.
+Everything is homogeneous in the state: constants, ramps and polynomial inputs are states of an exosystem (a constant
+``1`` with zero derivative makes a flow affine). So no threshold in the whole kernel is absolute, and scaling a start by
+a power of two scales the whole trajectory bit for bit.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ class Automaton:
                 if guard.reset is not None:
                     _check(f"reset of guard {guard.label!r}", guard.reset, (n, n))
                 if not 0 <= guard.target < len(self.modes):
-                    raise InvalidInput(f"guard {guard.label!r} leads to mode {guard.target}; modes are 0 to {len(self.modes) - 1}")
+                    raise InvalidInput(
+                        f"guard {guard.label!r} leads to mode {guard.target}; modes are 0 to {len(self.modes) - 1}"
+                    )
         object.__setattr__(self, "flows", np.array([mode.flow for mode in self.modes], dtype=float))
 
     @cached_property

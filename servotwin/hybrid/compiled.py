@@ -1,7 +1,8 @@
 """Compilation with numba, cached on disk, never stale.
 
-numba keys its disk cache on the file that defines a function, so an edit to an *imported* compiled helper would go unnoticed. Here
-the key is a digest of the function's own code and of every compiled function that it names, and theirs in turn.
+numba keys its disk cache on the file that defines a function, so an edit to an *imported* compiled helper would go
+unnoticed. Here the key is a digest of the function's own code and of every compiled function that it names, and theirs
+in turn.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from types import CodeType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from numba import njit
 
@@ -22,7 +23,8 @@ def compiled(function: _Function) -> _Function:
 
 
 def bare(function: _Function) -> _Function:
-    """The same without reference counting, half the time of a hot loop: the function allocates nothing and returns no array."""
+    """The same without reference counting, half the time of a hot loop: the function allocates nothing and returns no
+    array."""
     return _compile(function, fastmath={"contract"}, _nrt=False)
 
 
@@ -37,18 +39,18 @@ def verbatim(function: _Function) -> _Function:
 
 
 def _compile(function: _Function, **options: Any) -> _Function:
-    dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     dispatcher.stamp = _stamp(function, repr(sorted(options.items())))
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
-    return dispatcher  # type: ignore[no-any-return]
+    return cast(_Function, dispatcher)
 
 
-def _stamp(function: Callable[..., Any], options: str) -> str:
+def _stamp(function: Any, options: str) -> str:
     code = function.__code__
     parts = [options, _fingerprint(code)]
     for name in code.co_names:
-        value = function.__globals__.get(name)
+        value: Any = function.__globals__.get(name)
         if hasattr(value, "stamp"):
             parts.append(value.stamp)
         elif isinstance(value, int | float | str | tuple):

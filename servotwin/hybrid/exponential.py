@@ -1,7 +1,7 @@
 """Matrix exponentials in extended precision, kept as ``exp(A t) - I``.
 
-A step is applied as ``x += P @ x``: the rounding of a stored ``exp(A t)`` would be the same in every step and accumulate; that of ``P`` is
-smaller by the size of the step.
+A step is applied as ``x += P @ x``: the rounding of a stored ``exp(A t)`` would be the same in every step and
+accumulate; that of ``P`` is smaller by the size of the step.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ _TERMS = 24
 
 
 def expm1(flow: NDArray[np.float64], time: float) -> Long:
-    """``exp(flow * time) - I`` of an ``(n, n)`` matrix, by scaling, Taylor series and squaring of the deviation from one."""
+    """``exp(flow * time) - I`` of an ``(n, n)`` matrix, by scaling, Taylor series and squaring of the deviation from
+    one."""
     balanced, (scale, _) = matrix_balance(flow, permute=False, separate=True)
     matrix = balanced.astype(np.longdouble) * np.longdouble(time)
     halvings = max(0, int(np.ceil(np.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300)))) + 2)

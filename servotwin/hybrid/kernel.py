@@ -1,13 +1,14 @@
 """The compiled kernel: exact flow, events located to rounding, none missed.
 
-A *place* is a search step and a fraction of it in [0, 1); time is ``(step + fraction) * h``. Between events the state is advanced by tables
-of ``exp(A t) - I``; a guard is looked at as in `tables`, coarse first, and wherever it might become positive again at the next finer
-scale, down to its Taylor polynomial inside one step, whose first root is the event.
+A *place* is a search step and a fraction of it in [0, 1); time is ``(step + fraction) * h``. Between events the state
+is advanced by tables of ``exp(A t) - I``; a guard is looked at as in `tables`, coarse first, and wherever it might
+become positive again at the next finer scale, down to its Taylor polynomial inside one step, whose first root is the
+event.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,8 @@ SIGNIFICANT = 1e-13
 
 
 class Record(NamedTuple):
-    """Growing output: segments (start of a stretch of one flow) and events; ``size[0]`` segments and ``size[1]`` events are filled."""
+    """Growing output: segments (start of a stretch of one flow) and events; ``size[0]`` segments and ``size[1]`` events
+    are filled."""
 
     size: NDArray[np.int64]
     step: NDArray[np.int64]
@@ -53,8 +55,10 @@ class Scratch(NamedTuple):
 
 @inlined
 def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
-    """``out[r] = sum of table[base + j * stride + r] * x[j]``: four columns at a time, so that `out` is stored less often."""
-    count, n, at, step = np.uint64(rows), np.uint64(x.size), np.uint64(base), np.uint64(stride)
+    """``out[r] = sum of table[base + j * stride + r] * x[j]``: four columns at a time, so that `out` is stored less
+    often."""
+    count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
+    at: Any = np.uint64(base)
     fours = n // np.uint64(4)
     for r in range(count):
         out[r] = 0.0
@@ -106,19 +110,28 @@ def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: S
 
 
 @inlined
-def scan(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> int:
-    """Fill ``out[:rows]`` with the Bernstein rows at `base` times `x`; return how many are positive."""
-    product(table, base, stride, rows, x, out)
+def advance_clean(
+    t: Tables, table: Array, jumps: Array, nodes: int, wanted: int, mode: int, x: Array, scratch: Scratch
+) -> int:
+    """Advance through the first intervals of a block, at most `wanted`, in which no guard may become positive.
+
+    `table` and `jumps` are those of one scale; returns the number of intervals advanced.
+    """
+    out, guards = scratch.rows, t.guard_count[mode]
+    rows = 3 * nodes + 1
+    product(table, mode * t.states * t.guards * rows, t.guards * rows, guards * rows, x, out)
     positive = 0
-    for r in range(np.uint64(rows)):
+    for r in range(np.uint64(guards * rows)):
         positive += out[r] > 0.0
-    return positive
+    clean = wanted if positive == 0 else clean_intervals(out, guards, rows, wanted)
+    if clean > 0:
+        advance(jumps, (mode * nodes + clean - 1) * t.states * t.states, x, scratch.change)
+    return clean
 
 
 @inlined
-def clean_intervals(out: Array, guards: int, nodes: int, wanted: int) -> int:
+def clean_intervals(out: Array, guards: int, rows: int, wanted: int) -> int:
     """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
-    rows = 3 * nodes + 1
     clean = wanted
     for g in range(guards):
         for k in range(clean):
@@ -141,7 +154,8 @@ def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
 
 @inlined
 def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
-    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not rounding."""
+    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
+    rounding."""
     product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
     limit = rounding(t, mode, guard, x)
     for order in range(TERMS):
@@ -165,7 +179,8 @@ def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
 
 @inlined
 def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
-    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does not."""
+    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
+    not."""
     c = scratch.series
     first = series(t, mode, guard, x, c)
     if first == TERMS:
@@ -234,7 +249,7 @@ def settle(
     """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none."""
     for _ in range(CHANGES_AT_ONCE):
         leaving = -1
-        for g in range(t.count[mode]):
+        for g in range(t.guard_count[mode]):
             if is_leaving(t, mode, g, x, scratch.series):
                 leaving = g
                 break
@@ -248,11 +263,12 @@ def settle(
 def cross(
     t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: Record, scratch: Scratch
 ) -> tuple[int, int]:
-    """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number of events."""
+    """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number
+    of events."""
     place, before = start, record.size[1]
     while record.size[1] - before < EVENTS_PER_STEP:
         first, which = np.inf, -1
-        for g in range(t.count[mode]):
+        for g in range(t.guard_count[mode]):
             time = next_crossing(t, mode, g, x, end - place, scratch)
             if time < first:
                 first, which = time, g
@@ -274,9 +290,9 @@ def step_once(t: Tables, mode: int, x: Array, step: int, record: Record, scratch
     """Advance `x` in place by one search step; return the mode, -1 when Zeno. One product when nothing happens."""
     n = np.uint64(t.states)
     stride = t.states + 4 * t.guards
-    rows = np.uint64(t.states + 4 * t.count[mode])
+    rows = np.uint64(t.states + 4 * t.guard_count[mode])
     out = scratch.rows
-    product(t.single, mode * t.states * stride, stride, t.states + 4 * t.count[mode], x, out)
+    product(t.single, mode * t.states * stride, stride, t.states + 4 * t.guard_count[mode], x, out)
     positive = 0
     for r in range(n, rows):
         positive += out[r] > 0.0
@@ -300,9 +316,10 @@ def flow_until(
     record: Record,
     scratch: Scratch,
 ) -> tuple[int, int, float, int]:
-    """Advance `x` in place from one place to another; return status, place reached (of the failure when Zeno) and mode."""
-    n2 = t.states * t.states
-    coarse_rows, fine_rows = t.guards * (3 * NODES_COARSE + 1), t.guards * (3 * NODES_FINE + 1)
+    """Advance `x` in place from one place to another.
+
+    Returns status, place reached (of the failure when Zeno) and mode.
+    """
     calm = 0
     room = len(record.step) - EVENTS_PER_STEP - 4
     room_events = len(record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE - 4
@@ -310,26 +327,19 @@ def flow_until(
     while step < end_step or fraction < end_fraction:
         if record.size[0] > room or record.size[1] > room_events:
             return FULL, step, fraction, mode
-        left = end_step - step
-        if fraction == 0.0 and left >= NODES_FINE and calm >= NODES_FINE:
-            wanted = min(NODES_COARSE, left // NODES_FINE)
-            rows = t.count[mode] * (3 * NODES_COARSE + 1)
-            positive = scan(t.coarse, mode * t.states * coarse_rows, coarse_rows, rows, x, scratch.rows)
-            clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_COARSE, wanted)
+        if fraction == 0.0 and calm >= NODES_FINE and end_step - step >= NODES_FINE:
+            # Only after a while without events: what they excite may be fast.
+            wanted = min(NODES_COARSE, (end_step - step) // NODES_FINE)
+            clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, wanted, mode, x, scratch)
             if clean > 0:
-                advance(t.jump_coarse, (mode * NODES_COARSE + clean - 1) * n2, x, scratch.change)
                 step += clean * NODES_FINE
                 note_segment(record, step, 0.0, mode, x)
             if clean == wanted:
                 continue
-            left = end_step - step
-        if fraction == 0.0 and left > 0:
-            wanted = min(NODES_FINE, left)
-            rows = t.count[mode] * (3 * NODES_FINE + 1)
-            positive = scan(t.fine, mode * t.states * fine_rows, fine_rows, rows, x, scratch.rows)
-            clean = wanted if positive == 0 else clean_intervals(scratch.rows, t.count[mode], NODES_FINE, wanted)
+        if fraction == 0.0 and step < end_step:
+            wanted = min(NODES_FINE, end_step - step)
+            clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, wanted, mode, x, scratch)
             if clean > 0:
-                advance(t.jump_fine, (mode * NODES_FINE + clean - 1) * n2, x, scratch.change)
                 step += clean
                 calm += clean
                 note_segment(record, step, 0.0, mode, x)
@@ -340,10 +350,7 @@ def flow_until(
         if mode < 0:
             return ZENO, step, record.event_fraction[record.size[1] - 1], mode
         calm = 0 if events > 0 else calm + 1
-        if stop == 1.0:
-            step, fraction = step + 1, 0.0
-        else:
-            fraction = stop
+        step, fraction = (step + 1, 0.0) if stop == 1.0 else (step, stop)
         note_segment(record, step, fraction, mode, x)
     return DONE, step, fraction, mode
 
@@ -363,7 +370,8 @@ def follow_schedule(
 ) -> int:
     """Flow from jump to jump, apply each (NaN keeps a state), settle; the last row only marks the end.
 
-    ``place = [fraction]`` and ``at = [step, mode, next jump, fresh]`` are updated in place, so that a run resumes when `record` has grown.
+    ``place = [fraction]`` and ``at = [step, mode, next jump, fresh]`` are updated in place, so that a run resumes when
+    `record` has grown.
     """
     while True:
         if at[3] == 1:

@@ -24,7 +24,8 @@ def value_and_slope(c: Array, t: float) -> tuple[float, float]:
 
 @inlined
 def bracketed_root(c: Array, low: float, high: float, at_low: float, at_high: float) -> float:
-    """Root in [low, high] given ``p(low) <= 0 < p(high)``: Newton from the secant, bisection whenever it leaves the bracket."""
+    """Root in [low, high] given ``p(low) <= 0 < p(high)``: Newton from the secant, bisection whenever it leaves the
+    bracket."""
     t = low - at_low * (high - low) / (at_high - at_low)
     for _ in range(_NEWTON_STEPS):
         value, slope = value_and_slope(c, t)
@@ -46,8 +47,8 @@ def bracketed_root(c: Array, low: float, high: float, at_low: float, at_high: fl
 def first_positive(c: Array, low: float, high: float, starts: Array, ends: Array) -> float:
     """First t in (low, high] from which ``p > 0``, given ``p(low) <= 0``; inf when there is none.
 
-    Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero or rises through it monotonically.
-    `starts` and `ends` are working memory for DEPTH + 2 intervals.
+    Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero or rises
+    through it monotonically. `starts` and `ends` are working memory for DEPTH + 2 intervals.
     """
     starts[0], ends[0] = low, high
     smallest = (high - low) * 0.5**DEPTH

@@ -1,8 +1,9 @@
 """The numbers that the kernel needs for one automaton and one search step, in flat arrays.
 
-Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every step, and a single step
-as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; the table's rows give that cubic's Bernstein
-coefficients, so "no coefficient above zero" means "the cubic does not leave the mode", and one product settles a whole block.
+Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every
+step, and a single step as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; the
+table's rows give that cubic's Bernstein coefficients, so "no coefficient above zero" means "the cubic does not leave
+the mode", and one product settles a whole block.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Tables(NamedTuple):
 
     states: int
     guards: int
-    count: NDArray[np.int64]  # (M,) guards of each mode
+    guard_count: NDArray[np.int64]  # (M,) guards of each mode
     target: NDArray[np.int64]  # (M, G)
     has_reset: NDArray[np.bool_]  # (M, G)
     reset: Array  # M * G * n * n, transposed: reset - I
@@ -67,10 +68,28 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
             target[m, g], rows[m, g] = guard.target, guard.row
             if guard.reset is not None:
                 has_reset[m, g], reset[m, g] = True, (np.asarray(guard.reset) - np.eye(n)).T
-    parts = [_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))]
-    stacked = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in zip(*parts, strict=True)]
-    sizes = np.abs(stacked[2].reshape(len(modes), guards, n, TERMS)).sum(axis=3).ravel()
-    return Tables(n, guards, count, target, has_reset, reset.ravel(), *stacked, rows.ravel(), sizes, _bernstein_of_taylor().ravel())
+    parts = zip(*(_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))), strict=True)
+    flat = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in parts]
+    coarse, fine, taylor, jump_coarse, jump_fine, jump_part, flow_part, single = flat
+    return Tables(
+        states=n,
+        guards=guards,
+        guard_count=count,
+        target=target,
+        has_reset=has_reset,
+        reset=reset.ravel(),
+        coarse=coarse,
+        fine=fine,
+        taylor=taylor,
+        jump_coarse=jump_coarse,
+        jump_fine=jump_fine,
+        jump_part=jump_part,
+        flow_part=flow_part,
+        single=single,
+        rows=rows.ravel(),
+        sizes=np.abs(taylor.reshape(len(modes), guards, n, TERMS)).sum(axis=3).ravel(),
+        bernstein=_bernstein_of_taylor().ravel(),
+    )
 
 
 def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
@@ -93,7 +112,8 @@ def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
 
 
 def _bernstein_rows(rows: Array, slopes: Array, deviations: Long) -> Long:
-    """Bernstein rows of every guard over the intervals between nodes 0, 1, ... (`deviations`), ``(n, G * (3 * intervals + 1))``."""
+    """Bernstein rows of every guard over the intervals between nodes 0, 1, ... (`deviations`), ``(n, G * (3 * intervals
+    + 1))``."""
     nodes = len(deviations) + 1
     values = np.empty((len(rows), 3 * nodes - 2, rows.shape[1]), dtype=np.longdouble)
     for node in range(nodes):

@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.kernel import (
@@ -111,12 +112,22 @@ class Trajectory:
         self._at[2] = 0
         while True:
             status = follow_schedule(
-                self.tables, self.state, self._place, self._at, steps, fractions, values, modes, self.record, self._scratch
+                self.tables,
+                self.state,
+                self._place,
+                self._at,
+                steps,
+                fractions,
+                values,
+                modes,
+                self.record,
+                self._scratch,
             )
             if status == ZENO:
                 name = self.automaton.modes[int(self.record.event_mode[self.record.size[1] - 1])].name
                 raise ZenoError(
-                    f"mode changes without end at t = {self.time:.9g} s, last from mode {name!r}: the automaton is Zeno or slides"
+                    f"mode changes without end at t = {self.time:.9g} s, last from mode {name!r}: "
+                    "the automaton is Zeno or slides"
                 )
             if status != FULL:
                 break
@@ -131,34 +142,33 @@ class Trajectory:
             self._at[1] = self.mode = mode_map[self.mode]
         self._at[3] = 1
 
-    def sampled(self, rows: ArrayLike, out: Array | None = None) -> Array:
-        """One linear output at every sample so far.
+    def sampled(self, rows: ArrayLike, first: int = 0, last: int | None = None, out: Array | None = None) -> Array:
+        """One linear output at samples first .. last - 1 (all so far by default).
 
         Parameters
         ----------
         rows : (n,) or (M, n) array
             The output ``rows[mode] @ x``; one row serves all modes.
-        out : (samples,) array, optional
+        first, last : int
+            Within 0 .. `samples`.
+        out : (last - first,) array, optional
             Buffer to fill.
-        """
-        table = self._output_table(rows)
-        result = np.empty(self.samples) if out is None else out
-        r, size = self.record, int(self.record.size[0])
-        sample_segments(size, r.step, r.fraction, r.mode, r.state, table, self.divisor, result)
-        return result
 
-    def between(self, rows: ArrayLike, first: int, last: int) -> Array:
-        """The same output at samples first .. last - 1, bit for bit, without evaluating the rest."""
-        table, r, size = self._output_table(rows), self.record, int(self.record.size[0])
-        step, stride = r.step[:size], self.divisor
-        begin = int(np.searchsorted(step, first * stride - _BLOCK))
-        end = min(size, int(np.searchsorted(step, last * stride)) + 1)
-        start = min(first, int(step[begin]) // stride)
-        result = np.empty(max(last, int(step[end - 1]) // stride + 1) - start + 1)
-        part = slice(begin, end)
-        moved = step[part] - start * stride
-        sample_segments(end - begin, moved, r.fraction[part], r.mode[part], r.state[part], table, stride, result)
-        return result[first - start : last - start]
+        Returns
+        -------
+        (last - first,) array
+        """
+        stop = self.samples if last is None else last
+        if not 0 <= first <= stop <= self.samples:
+            raise InvalidInput(f"samples {first} .. {stop} are outside 0 .. {self.samples}")
+        table = self._output_table(rows)
+        result = np.empty(stop - first) if out is None else out
+        if result.shape != (stop - first,):
+            raise InvalidInput(f"out has shape {result.shape}; it must be ({stop - first},)")
+        r, size = self.record, int(self.record.size[0])
+        begin = max(int(np.searchsorted(r.step[:size], first * self.divisor, side="left")) - 1, 0)
+        sample_segments(begin, size, r.step, r.fraction, r.mode, r.state, table, self.divisor, first, result)
+        return result
 
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
         """The same output at any times within the run, right-continuous; ``(len(times),)``."""
@@ -168,7 +178,17 @@ class Trajectory:
         segments = np.maximum(np.searchsorted(starts, places, side="right") - 1, 0)
         rows = np.broadcast_to(np.asarray(rows, dtype=float), (len(self.automaton.modes), len(self.state)))
         result = np.empty(len(places))
-        evaluate(self.tables, segments, places - starts[segments], r.mode, r.state, rows, result, np.empty(len(self.state)), self._scratch)
+        evaluate(
+            self.tables,
+            segments,
+            places - starts[segments],
+            r.mode,
+            r.state,
+            rows,
+            result,
+            np.empty(len(self.state)),
+            self._scratch,
+        )
         return result
 
     def _output_table(self, rows: ArrayLike) -> Array:
@@ -194,7 +214,8 @@ class Trajectory:
 def schedule_of(
     jumps: Sequence[Jump], step: float, automaton: Automaton, end: int
 ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64]]:
-    """Jumps as the kernel's arrays: step, fraction, states to set (NaN keeps) and mode map, with a last row for the end."""
+    """Jumps as the kernel's arrays: step, fraction, states to set (NaN keeps) and mode map, with a last row for the
+    end."""
     times = np.array([jump.time / step for jump in jumps] + [float(end)])
     whole = np.rint(times)
     near = np.abs(times - whole) <= _ON_GRID
@@ -243,7 +264,7 @@ def new_scratch(tables: Tables) -> Scratch:
 
 def _output_table(tables: Tables, rows: Array) -> Array:
     """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat ``(M, n, 128)``."""
-    n, modes = tables.states, len(tables.count)
+    n, modes = tables.states, len(tables.guard_count)
     # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
     fine = tables.jump_fine.reshape(modes, NODES_FINE, n, n)
     coarse = tables.jump_coarse.reshape(modes, NODES_COARSE, n, n)
@@ -256,6 +277,7 @@ def _output_table(tables: Tables, rows: Array) -> Array:
 
 @bare
 def sample_segments(
+    begin: int,
     size: int,
     step: NDArray[np.int64],
     fraction: Array,
@@ -263,38 +285,40 @@ def sample_segments(
     state: Array,
     table: Array,
     stride: int,
+    first: int,
     out: Array,
 ) -> None:
-    """Write the output at every `stride`-th search step that a segment starting on the grid covers."""
-    n = state.shape[1]
+    """Write the output at samples `first` on, one every `stride` search steps, from the segments that start on the
+    grid."""
+    n, last = state.shape[1], first + len(out)
     block = np.uint64(_BLOCK)
-    for s in range(size):
+    for s in range(begin, size):
         if fraction[s] > 0.0:
             continue
-        begin = step[s]
-        end = begin + 1
+        end = step[s] + 1
         if s + 1 < size:
             end = step[s + 1] + (1 if fraction[s + 1] > 0.0 else 0)
-        if end <= begin:
+        low, high = max(first, -(-step[s] // stride)), min(last, -(-end // stride))
+        if high <= low:
+            if low >= last:
+                break
             continue
-        at = np.uint64(mode[s] * n * _BLOCK)
+        at = np.uint64(mode[s] * n * _BLOCK + low * stride - step[s])
+        length, base = np.uint64(high - low), np.uint64(low - first)
+        for j in range(length):
+            out[base + j] = 0.0
         if stride == 1:
-            length, base = np.uint64(end - begin), np.uint64(begin)
-            factor = state[s, 0]
-            for j in range(length):
-                out[base + j] = table[at + j] * factor
-            for i in range(1, n):
-                at += block
+            for i in range(n):
                 factor = state[s, i]
                 for j in range(length):
                     out[base + j] += table[at + j] * factor
+                at += block
         else:
-            for sample in range(-(-begin // stride), -(-end // stride)):
-                j = np.uint64(sample * stride - begin)
-                total = 0.0
-                for i in range(n):
-                    total += table[at + np.uint64(i) * block + j] * state[s, i]
-                out[sample] = total
+            every = np.uint64(stride)
+            for i in range(n):
+                for j in range(length):
+                    out[base + j] += table[at + j * every] * state[s, i]
+                at += block
 
 
 @bare

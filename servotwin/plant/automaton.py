@@ -1,7 +1,7 @@
 """The servo as a piecewise-affine automaton: backlash {-, open, +} times controller zone, inputs as exosystem states.
 
-With a continuous controller the zones are dead zone {-, inside, +} times optional saturation {low, linear, high}; with a sampled one there is
-a single zone and the voltage is a state that the tick sets.
+With a continuous controller the zones are dead zone {-, inside, +} times optional saturation {low, linear, high}; with
+a sampled one there is a single zone and the voltage is a state that the tick sets.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Shape:
 
 @dataclass(frozen=True)
 class _Zone:
-    """One linear piece of the controller: rows of the voltage and of its states' derivatives, and guards (row, target zone, label, side)."""
+    """One linear piece of the controller: rows of the voltage and of its states' derivatives, and guards (row, target
+    zone, label, side)."""
 
     name: str
     voltage: Array
@@ -156,7 +157,8 @@ def _positions(servo: Servo, basis: _Basis) -> Array:
 
 
 def _screw_rate(basis: _Basis, side: int) -> Array:
-    """theta_d' of the play operator: with the motor, less the half gap's own rate, in contact; zero in the gap (facts E3, E4)."""
+    """theta_d' of the play operator: with the motor, less the half gap's own rate, in contact; zero in the gap (facts
+    E3, E4)."""
     if side == 0:
         return np.zeros(len(basis.names))
     return basis.row("speed") - 0.5 * side * basis.row("gap'")
@@ -216,7 +218,8 @@ def _mode(servo: Servo, basis: _Basis, flow: Array, side: int, zone: _Zone, zone
 
 
 def _zones(controller: Controller, shape: Shape, basis: _Basis, error: Array) -> tuple[_Zone, ...]:
-    """The controller's linear pieces: Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (facts E16)."""
+    """The controller's linear pieces: Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (facts
+    E16)."""
     zero = np.zeros(len(basis.names))
     slope = error - basis.row("derivative")
     wanted = controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope

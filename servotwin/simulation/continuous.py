@@ -30,7 +30,8 @@ class ContinuousEngine:
         if self.controller.rate_limit is not None:
             raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
         signals = {name: self._signal(name) for name in INPUTS}
-        shape = Shape(*(degree(pieces) for pieces in signals.values()), dead_zone=self.inputs.tolerance is not None)
+        reference, gap, tolerance = (degree(pieces) for pieces in signals.values())
+        shape = Shape(reference, gap, tolerance, dead_zone=self.inputs.tolerance is not None)
         self.loop = continuous_loop(self.servo, self.controller, shape)
         state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
         for name, pieces in signals.items():
@@ -66,9 +67,9 @@ class ContinuousEngine:
         opening: set[float] = set()
         for name in INPUTS:
             pieces = self._signal(name)
-            for time, coefficients in zip(pieces.times, pieces.coeffs, strict=True):
-                if begin < time <= end and time > 0.0:
-                    knots.setdefault(float(time), {}).update(self.loop.input_values(name, coefficients))
+            inside = slice(*np.searchsorted(pieces.times, (begin, end), side="right"))
+            for time, coefficients in zip(pieces.times[inside].tolist(), pieces.coeffs[inside], strict=True):
+                knots.setdefault(time, {}).update(self.loop.input_values(name, coefficients))
             if name == "gap":
                 opening = {float(time) for time in pieces.jumps}
         jumps = [Jump(t, knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
@@ -78,17 +79,11 @@ class ContinuousEngine:
         """A constant tolerance from now on."""
         self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
 
-    def channel(self, name: str) -> Array:
-        """A channel at every sample so far."""
-        if name == "measured_position":
-            return quantised(self.channel("position"), self.servo.position_resolution)
-        return self.trajectory.sampled(self.loop.rows[name])
-
-    def part(self, name: str, first: int, last: int) -> Array:
+    def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1."""
         if name == "measured_position":
-            return quantised(self.part("position", first, last), self.servo.position_resolution)
-        return self.trajectory.between(self.loop.rows[name], first, last)
+            return quantised(self.channel("position", first, last), self.servo.position_resolution)
+        return self.trajectory.sampled(self.loop.rows[name], first, last)
 
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Time, kind, side, and whether the state (not a jump) triggered it."""

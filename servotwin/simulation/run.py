@@ -57,7 +57,7 @@ class Run:
     servo: Servo
     inputs: Inputs
     samples: int
-    channel: Callable[[str], Array] = field(repr=False)
+    channel: Callable[[str, int, int], Array] = field(repr=False)
     list_events: Callable[[], list[tuple[float, str, int, bool]]] = field(repr=False)
     _kept: dict[str, Array] = field(default_factory=dict, repr=False)
 
@@ -131,8 +131,8 @@ class Run:
     def events(self) -> np.recarray[tuple[int], np.dtype[np.void]]:
         """Table of (time s, kind, side, state_triggered), in time order.
 
-        Kinds: contact and release of the backlash, enter and leave of the dead zone, saturate (side 0: ends), reference and parameter
-        (jumps of the inputs). `state_triggered` is false for those two and for what they flip at once.
+        Kinds: contact and release of the backlash, enter and leave of the dead zone, saturate (side 0: ends), reference
+        and parameter (jumps of the inputs). `state_triggered` is false for those two and for what they flip at once.
         """
         end = (self.samples - 1) / self.sample_rate
         jumps = [(time, kind, 0, False) for time, kind in self.inputs.jumps(end)]
@@ -141,11 +141,9 @@ class Run:
 
     def measured(self, name: str) -> Array:
         """A channel as its sensor gave it: theta_m, position, voltage or reference."""
-        if name == "position":
-            return self.measured_position
         if name == "theta_m":
             return quantised(self.theta_m, self.servo.encoder_resolution)
-        return self.voltage if name == "voltage" else self.reference
+        return {"position": self.measured_position, "voltage": self.voltage, "reference": self.reference}[name]
 
     def _column(self, name: str) -> Array:
-        return self._get(name, lambda: self.channel(name))
+        return self._get(name, lambda: self.channel(name, 0, self.samples))

@@ -1,4 +1,5 @@
-"""The sampled loop (the deployed one): the edge's tick, compiled, on the exact plant; gap contacts inside a sample are located."""
+"""The sampled loop (the deployed one): the edge's tick, compiled, on the exact plant; gap contacts inside a sample are
+located."""
 
 from __future__ import annotations
 
@@ -8,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.simulation.continuous import at_zero, plant_start
 from servotwin.control import law
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, LawState
@@ -31,6 +31,7 @@ from servotwin.hybrid.trajectory import Jump, ZenoError, grown, new_record, new_
 from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
+from servotwin.simulation.continuous import at_zero, plant_start
 from servotwin.simulation.run import Inputs, quantised
 
 tick = verbatim(law.tick)
@@ -129,7 +130,8 @@ def run_ticks(
     record: Record,
     scratch: Scratch,
 ) -> tuple[int, int, int, LawState]:
-    """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when `record` is full."""
+    """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when
+    `record` is full."""
     i, row = (base - 1) // port.tick_every + 1, (base - 1) // port.record_every + 1
     to_tick, to_record = i * port.tick_every - base, row * port.record_every - base
     search = base * port.searches
@@ -243,7 +245,7 @@ class SampledEngine:
     def _drive(self, first: int, last: int) -> Drive:
         """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
-        times = np.arange(first, first + count) / self.controller.sample_rate
+        times = np.arange(first, first + count) / self.tick_rate
         if self.inputs.tolerance is None:
             enter = leave = np.full(count, -1.0)
         else:
@@ -300,30 +302,25 @@ class SampledEngine:
     def set_tolerance(self, _tolerance: float) -> None:
         """Nothing to do: the ticks to come read the inputs."""
 
-    def channel(self, name: str) -> Array:
-        """A channel at every sample so far; at the present one, before its tick, the voltage is still the last."""
+    def channel(self, name: str, first: int, last: int) -> Array:
+        """A channel at samples first .. last - 1; at the present one, before its tick, the voltage is still the
+        last."""
         if name == "measured_position":
-            return self._measured()
-        row = self.plant.rows[name][0]
-        now = sum(row[state] * self.state[state] for state in self.port.recorded if row[state] != 0.0)
-        return np.append(self.part(name, 0, self.index), now)
-
-    def part(self, name: str, first: int, last: int) -> Array:
-        """A channel at samples first .. last - 1, all of them before the present one."""
-        if name == "measured_position":
-            return self.output.measured[np.arange(first, last) * self.record_every // self.tick_every]
+            return self._measured(first, last)
         row = self.plant.rows[name][0]
         out = np.zeros(last - first)
         for j, state in enumerate(self.port.recorded):
             if row[state] != 0.0:
                 out += row[state] * self.output.states[j, first:last]
+        if last > self.index and not self.finished:
+            out[-1] = row @ self.state
         return out
 
-    def _measured(self) -> Array:
-        ticks = np.arange(self.index + 1) * self.record_every // self.tick_every
-        out = self.output.measured[ticks]
-        if not self.finished:
-            out[-1] = quantised(self.channel("position")[-1:], self.servo.position_resolution)[0]
+    def _measured(self, first: int, last: int) -> Array:
+        out = self.output.measured[np.arange(first, last) * self.record_every // self.tick_every]
+        if last > self.index and not self.finished:
+            present = self.channel("position", self.index, self.index + 1)
+            out[-1] = quantised(present, self.servo.position_resolution)[0]
         return out
 
     def events(self) -> list[tuple[float, str, int, bool]]:
@@ -364,6 +361,7 @@ def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
     whole = round(ratio)
     if abs(ratio - whole) > 1e-9 * ratio:
         raise InvalidInput(
-            f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: one must be a whole multiple of the other"
+            f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: "
+            "one must be a whole multiple of the other"
         )
     return (1, whole) if tick_rate >= sample_rate else (whole, 1)

@@ -1,4 +1,5 @@
-"""Simulating a servo exactly: continuous (plant and law in one automaton) or sampled (the edge's own tick, compiled, on the exact plant)."""
+"""Simulating a servo exactly: continuous (plant and law in one automaton) or sampled (the edge's own tick, compiled, on
+the exact plant)."""
 
 from __future__ import annotations
 
@@ -6,13 +7,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_nonnegative, as_pieces
+from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.run import Inputs, Run, quantised
 from servotwin.simulation.sampled import SampledEngine
 
@@ -26,8 +27,7 @@ class Engine(Protocol):
     def index(self) -> int: ...
     def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
-    def channel(self, name: str) -> Array: ...
-    def part(self, name: str, first: int, last: int) -> Array: ...
+    def channel(self, name: str, first: int, last: int) -> Array: ...
     def events(self) -> list[tuple[float, str, int, bool]]: ...
 
 
@@ -88,7 +88,9 @@ class Simulation:
         self.engine: Engine
         if self.controller.sample_rate is None:
             if noise is not None:
-                raise InvalidInput("noise needs a sampled controller: set the controller's sample_rate, for example to 5000 Hz")
+                raise InvalidInput(
+                    "noise needs a sampled controller: set the controller's sample_rate, for example to 5000 Hz"
+                )
             self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0)
         else:
             rng = np.random.default_rng(seed)
@@ -107,7 +109,9 @@ class Simulation:
     def advance(self, index: int) -> None:
         """Go on to a sample index, at most the last one of the horizon."""
         if not self.index <= index < self.samples:
-            raise InvalidInput(f"sample {index} is outside {self.index} .. {self.samples - 1}, where this simulation can go")
+            raise InvalidInput(
+                f"sample {index} is outside {self.index} .. {self.samples - 1}, where this simulation can go"
+            )
         if index > self.index:
             self.engine.advance(index)
 
@@ -121,13 +125,26 @@ class Simulation:
         self.engine.set_tolerance(tolerance)
 
     def measured(self, name: str, first: int, last: int) -> Array:
-        """What a sensor or the law gave at samples first .. last - 1: theta_m, position, voltage or reference; ``(last - first,)``.
+        """What a sensor or the law gave at samples first .. last - 1.
 
-        All of them lie before the present one, whose voltage is not decided yet.
+        Parameters
+        ----------
+        name : str
+            theta_m, position, voltage or reference.
+        first, last : int
+            Samples before the present one, whose tick is still to come.
+
+        Returns
+        -------
+        (last - first,) array
         """
+        if not 0 <= first <= last <= self.index + 1:
+            raise InvalidInput(
+                f"samples {first} .. {last} are outside 0 .. {self.index + 1}, what was simulated so far"
+            )
         if name == "reference":
             return self.inputs.reference.value(self.inputs.times(first, last))
-        values = self.engine.part("measured_position" if name == "position" else name, first, last)
+        values = self.engine.channel("measured_position" if name == "position" else name, first, last)
         return quantised(values, self.servo.encoder_resolution) if name == "theta_m" else values
 
     def run(self) -> Run:
@@ -153,6 +170,3 @@ def _check_times(duration: float, sample_rate: float) -> None:
         raise InvalidInput(f"duration = {duration} s: must be positive and finite")
     if not (np.isfinite(sample_rate) and sample_rate > 0.0):
         raise InvalidInput(f"sample_rate = {sample_rate} Hz: must be positive and finite")
-
-
-__all__ = ["Noise", "PiecewiseCubic", "Run", "Simulation", "quantised", "simulate"]
