@@ -26,6 +26,9 @@ from servotwin.twin.settings import TwinSettings
 MM = 1e-3
 DEG = math.pi / 180.0
 
+Reader = tuple[str, Callable[[Table, str], Any]]
+"""The name that a key sets, and how the key is read."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -99,6 +102,13 @@ def _read(table: Table, key: str, read: Callable[[Table], Any]) -> Any:
     return value
 
 
+def _given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
+    """What a table gives of these keys, by the names they set."""
+    for key in readers.keys() - table.values.keys():
+        table.number(key, None)
+    return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
+
+
 def _servo(table: Table, folder: Path) -> Servo:
     name = table.text("servo")
     if name not in PRESETS and not (folder / name).is_file():
@@ -158,10 +168,7 @@ def _gap(table: Table) -> SignalLike:
 
 def _controller(table: Table, controller: Controller) -> Controller | None:
     """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
-    keys = {key.name: key for key in servofile.CONTROLLER}
-    changes = {key.symbol: key.read(table, name) for name, key in keys.items() if name in table.values}
-    for name in keys.keys() - table.values.keys():
-        table.number(name, None)
+    changes = _given(table, {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER})
     return controller.replace(**changes) if changes else None
 
 
@@ -248,16 +255,27 @@ def _twin(table: Table) -> TwinSettings:
     )
 
 
+def _degrees(table: Table, key: str) -> float:
+    return table.number(key) * DEG
+
+
+_ESTIMATOR: Mapping[str, Reader] = {
+    "alpha_rad_per_s": ("alpha", Table.number),
+    "settle_s": ("settle_s", Table.number),
+    "lowpass_hz": ("lowpass_hz", Table.number),
+    "lowpass_order": ("lowpass_order", Table.integer),
+    "padding": ("padding", Table.text),
+    "padding_samples": ("padding_samples", Table.integer),
+    "iterations": ("iterations", Table.integer),
+    "origin": ("origin", Table.text),
+    "reversals": ("reversals", Table.integer),
+    "rest_speed_rad_per_s": ("rest_speed", Table.number),
+    "contact_travel_deg": ("contact_travel", _degrees),
+    "method_error_deg": ("method_error", _degrees),
+    "largest_std_deg": ("largest_std", _degrees),
+    "unexplained": ("unexplained", Table.number),
+}
+
+
 def _estimator(table: Table) -> paper.Settings:
-    default = paper.Settings()
-    return paper.Settings(
-        alpha=table.number("alpha_rad_per_s", default.alpha, positive=True),
-        settle_s=table.number("settle_s", default.settle_s, minimum=0.0),
-        lowpass_hz=table.number("lowpass_hz", default.lowpass_hz, positive=True),
-        lowpass_order=table.integer("lowpass_order", default.lowpass_order, minimum=1),
-        reversals=table.integer("reversals", default.reversals, minimum=0),
-        rest_speed=table.number("rest_speed_rad_per_s", default.rest_speed, minimum=0.0),
-        contact_travel=table.number("contact_travel_deg", default.contact_travel / DEG, minimum=0.0) * DEG,
-        method_error=table.number("method_error_deg", default.method_error / DEG, minimum=0.0) * DEG,
-        unexplained=table.number("unexplained", default.unexplained, minimum=0.0),
-    )
+    return paper.Settings(**_given(table, _ESTIMATOR))

@@ -1,9 +1,11 @@
 """Scenarios: the packaged ones, TOML with units, and one sentence for every kind of bad input."""
 
+import dataclasses
 import math
 
 import pytest
 
+from servotwin import scenariofile
 from servotwin.errors import InvalidInput
 from servotwin.identify import paper
 from servotwin.link.simulated import LinkSettings
@@ -202,6 +204,8 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ("[gap]", "[[link.outages]]\nfrom_s = 3\nto_s = 2\n[gap]", "link outage from 3.0 s to 2.0 s"),
         ("[gap]", "[twin]\nmethod = 'best'\n[gap]", "twin.method = 'best' is not allowed; give one of paper"),
         ("[gap]", "[twin]\nattempts = 0\n[gap]", "twin.attempts = 0 is not allowed"),
+        ("[gap]", "[twin.estimator]\nalpha = 2\n[gap]", "unknown key 'twin.estimator.alpha'"),
+        ("[gap]", "[twin.estimator]\nalpha_rad_per_s = -2\n[gap]", "[twin.estimator]: estimator alpha = -2"),
         ("[gap]", "[twin.estimator]\nsettle_s = 2\n[gap]", "too short for the observer: must be at least 2.0032 s"),
     ],
 )
@@ -226,3 +230,20 @@ def test_named_seeds_differ_and_stay():
     seeds |= {scenario.replace(seed=1).seed_of("noise"), scenario.replace(name="other").seed_of("noise")}
     assert len(seeds) == 5
     assert scenario.seed_of("noise") == scenario.replace(duration=100.0).seed_of("noise") == 7790430383776639416
+
+
+def test_every_setting_has_its_key():
+    assert {name for name, _ in scenariofile._ESTIMATOR.values()} == {
+        f.name for f in dataclasses.fields(paper.Settings)
+    }
+
+
+def test_every_estimator_key_is_read(tmp_path):
+    lines = ["padding = 'even'", "origin = 'first'", "lowpass_order = 4", "padding_samples = 9", "iterations = 7"]
+    lines += ["reversals = 2", "rest_speed_rad_per_s = 0.2", "contact_travel_deg = 1", "method_error_deg = 2"]
+    lines += ["largest_std_deg = 3", "unexplained = 0.3", "alpha_rad_per_s = 80", "settle_s = 0.1", "lowpass_hz = 30"]
+    text = SHORT.replace("[gap]", "\n".join(["[twin.estimator]", *lines, "[gap]"]))
+    one, two, three = (math.radians(x) for x in (1.0, 2.0, 3.0))
+    assert load(tmp_path, text).twin.estimator == paper.Settings(
+        80.0, 0.1, 30.0, 4, "even", 9, 7, "first", 2, 0.2, one, two, three, 0.3
+    )
