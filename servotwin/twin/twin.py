@@ -62,8 +62,7 @@ class Twin:
     ) -> Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs."""
         policy = PaperPolicy(settings.k_dz, settings.smoothing)
-        own = estimator or partial(_estimate, servo, settings)
-        return cls(name, own, partial(policy.redesign, servo), store, settings)
+        return cls(name, estimator or estimator_of(servo, settings), partial(policy.redesign, servo), store, settings)
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """What to send after a message that arrived at `now` (s, any steady clock of the twin's own).
@@ -154,8 +153,13 @@ class Twin:
         return [] if pending is None else [pending]
 
 
-def _estimate(servo: Servo, settings: TwinSettings, window: Window, previous: float) -> GapEstimate:
-    return estimate_gap(window, servo, settings.method, previous, settings.estimator)
+def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
+    """The estimator that `settings` name, with a servo as its model."""
+
+    def estimate(window: Window, previous: float) -> GapEstimate:
+        return estimate_gap(window, servo, settings.method, previous, settings.estimator)
+
+    return estimate
 
 
 def _nothing(message: WindowMessage, reason: str) -> GapEstimate:
