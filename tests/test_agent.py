@@ -121,6 +121,15 @@ def test_windows_are_repeated_until_acknowledged() -> None:
     assert agent.dropped == {}
 
 
+def test_the_deadline_always_lies_ahead() -> None:
+    """1.6 s + 0.1 s is more than 1.7 s: a retry must not be awaited at a sample at which it is not due yet."""
+    agent = Agent(settings(retry=Retry(0.1, 1.0)))
+    for k in range(40):
+        agent.absorb(0.0 if k < 6 else 1e-3, 0.0, 0.0, 0.0)
+        assert agent.deadline is None or agent.deadline > agent.samples
+    assert agent.windows_cut == 1
+
+
 def test_updates_are_applied_through_the_guard_and_answered() -> None:
     agent = Agent(settings(limits=Limits(maximum=2e-4)))
     feed(agent, [1e-3] * 30)

@@ -69,8 +69,10 @@ class StubTwin:
 
 @dataclass
 class CarelessTwin:
-    """Takes windows as they come, old and repeated ones too, guesses bases, uses versions twice, repeats what it said and
-    listens to no receipt: the guard alone has to keep order."""
+    """Takes windows as they come, guesses bases, uses versions twice, repeats what it said, listens to no receipt.
+
+    So the guard alone has to keep order.
+    """
 
     lifetime_s: float
     version: int = 1
@@ -100,6 +102,7 @@ class Loop:
         self.agent, self.twin = Agent(edge, self.outbox), twin
         self.link = SimulatedLink("axis-1", self.clock, self._at_twin, self._at_edge, link, seed)
         self.history: list[Parameters] = []
+        self.swaps: list[tuple[int, int]] = []
         self.receipts: list[Receipt] = []
         self.acknowledged: set[int] = set()
 
@@ -122,7 +125,9 @@ class Loop:
             self.acknowledged.add(message.sequence)
         self._up(self.agent.receive(message))
         if self.agent.parameters is not before:
+            assert isinstance(message, Update)
             self.history.append(self.agent.parameters)
+            self.swaps.append((message.base_version, before.version))
 
     def _up(self, sent: list[Outgoing]) -> None:
         for out in sent:
@@ -152,7 +157,8 @@ LIFETIMES = st.sampled_from([1.0, 3.0, 1e6])
 
 
 def check_parameters(loop: Loop) -> None:
-    """No update applied twice, none older than the last applied."""
+    """No update applied twice, none older than the last applied, none on a base that was not in force."""
+    assert all(base == in_force for base, in_force in loop.swaps)
     versions = [parameters.version for parameters in loop.history]
     assert versions == sorted(set(versions))
     times = [parameters.data_time for parameters in loop.history]

@@ -113,6 +113,14 @@ def test_rate_limit_bounds_every_change() -> None:
     assert max(changes) <= 0.02 * (1 + 1e-12)
 
 
+def test_a_voltage_that_ramps_down_inside_the_dead_zone_leaves_the_integral_alone() -> None:
+    law = PAPER.replace(rate_limit=100.0, tracking_time=0.01).law(1e-3)
+    before = run(law, [3e-3] * 100)[-1]
+    inside = run(law, [0.5e-3] * 50, before)
+    assert 0.0 < inside[-1].voltage < before.voltage
+    assert {state.integral for state in inside} == {before.integral}
+
+
 def test_without_limits_nothing_is_corrected() -> None:
     errors = [1e-3, -2e-3, 0.5e-3] * 50
     fast = run(PAPER.replace(tracking_time=1e-3).law(), errors)
