@@ -71,8 +71,8 @@ def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arra
         for r in range(count):
             out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
         at = d + step
-    for j in range(fours * np.uint64(4), n):
-        factor = x[j]
+    for rest in range(fours * np.uint64(4), n):
+        factor = x[rest]
         for r in range(count):
             out[r] += table[at + r] * factor
         at += step
