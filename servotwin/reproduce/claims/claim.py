@@ -58,7 +58,18 @@ class Result:
 
 
 Measure = Callable[[Runs, Square], Finding]
-_MEASURES: dict[str, tuple[Measure, bool]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class _Measurement:
+    """How a claim is measured, where that is written, and whether it is measured for both readings of the reference."""
+
+    module: str
+    function: Measure
+    both: bool
+
+
+_MEASURES: dict[str, _Measurement] = {}
 
 
 def claims() -> tuple[Claim, ...]:
@@ -71,7 +82,7 @@ def measures(claim_id: str) -> Callable[[Callable[[Runs], Finding]], Callable[[R
     """Register the measuring function of a claim that does not depend on the square wave."""
 
     def register(function: Callable[[Runs], Finding]) -> Callable[[Runs], Finding]:
-        _MEASURES[claim_id] = (lambda runs, _square: function(runs)), False
+        _register(claim_id, function.__module__, lambda runs, _square: function(runs), both=False)
         return function
 
     return register
@@ -81,10 +92,21 @@ def measures_both(claim_id: str) -> Callable[[Measure], Measure]:
     """Register the measuring function of a claim that is also measured with the 0/1 mm square wave."""
 
     def register(function: Measure) -> Measure:
-        _MEASURES[claim_id] = function, True
+        _register(claim_id, function.__module__, function, both=True)
         return function
 
     return register
+
+
+def _register(claim_id: str, module: str, function: Measure, *, both: bool) -> None:
+    if claim_id in _MEASURES:
+        raise ValueError(f"two measuring functions for claim {claim_id!r}")
+    _MEASURES[claim_id] = _Measurement(module, function, both)
+
+
+def group(claim: Claim) -> str:
+    """Claims of one group share runs; the groups are measured apart."""
+    return _MEASURES[claim.id].module
 
 
 def measured_ids() -> frozenset[str]:
@@ -94,9 +116,9 @@ def measured_ids() -> frozenset[str]:
 
 def measure(claim: Claim, runs: Runs) -> Result:
     """Run the code and decide."""
-    function, both = _MEASURES[claim.id]
-    other = function(runs, UNIPOLAR) if both else None
-    return Result(claim, runs.preset, function(runs, BIPOLAR), other)
+    how = _MEASURES[claim.id]
+    other = how.function(runs, UNIPOLAR) if how.both else None
+    return Result(claim, runs.preset, how.function(runs, BIPOLAR), other)
 
 
 def decided(reproduced: bool, why: str, *values: tuple[str, float] | tuple[str, float, str]) -> Finding:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.plant.linear import LinearSystem
+from servotwin.plant.linear import LinearSystem, pidf
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 from servotwin.reproduce import measures as measure
@@ -36,7 +36,8 @@ def phase_margin(runs: Runs) -> Finding:
     margins = runs.servo.margins()
     smallest = smallest_margin_deg(margins)
     filtered = smallest_margin_deg(runs.servo.margins(with_loop_filter(runs.servo)))
-    why = f"the smallest margin over {len(margins.gain_crossovers)} crossovers is {smallest:.4g} deg"
+    count = len(margins.gain_crossovers)
+    why = f"the smallest margin over {count} crossover{'s' if count > 1 else ''} is {smallest:.4g} deg"
     return decided(
         margins.stable and smallest >= MARGIN_DEG,
         why,
@@ -134,9 +135,7 @@ def pd_margin_deg(servo: Servo, law: Controller) -> float:
 @measures("pd-disturbances")
 def pd_disturbances(runs: Runs) -> Finding:
     """Static position error per volt of disturbance at the motor's input."""
-    with_integral, without = (
-        _static_sensitivity(runs.servo, law) for law in (runs.servo.controller, without_integral(runs.servo))
-    )
+    with_integral, without = (_static_sensitivity(law) for law in (runs.servo.controller, without_integral(runs.servo)))
     peaks = [runs.servo.margins(law).Ms for law in (runs.servo.controller, without_integral(runs.servo))]
     why = (
         f"a constant volt at the motor moves the position by {without * 1e3:.3g} mm without and"
@@ -153,11 +152,10 @@ def pd_disturbances(runs: Runs) -> Finding:
     )
 
 
-def _static_sensitivity(servo: Servo, law: Controller) -> float:
-    """Limit of G / (1 + C G) for low frequencies, m/V: taken at 1e-6 rad/s."""
-    omega = 1e-6
-    plant = servo.plant().response(omega)
-    return float(np.abs(plant / (1.0 + servo.loop(law).response(omega))))
+def _static_sensitivity(law: Controller) -> float:
+    """Limit of G / (1 + C G) for low frequencies, m/V: 1 / C(0), because G has an integrator."""
+    controller = pidf(law)
+    return float(controller.denominator[0] / controller.numerator[0])
 
 
 @measures("two-resonances")

@@ -93,13 +93,7 @@ def larger_dead_zone(runs: Runs, square: Square) -> Finding:
     """Late steps against steps 4 and 5."""
     found = deviations(noisy(runs, square))
     early, late = float(found[3:5].mean()), float(found[7:10].mean())
-    why = (
-        f"the mean standard deviation falls from {early * MM:.2g} mm (steps 4, 5) to {late * MM:.2g} mm (steps 8 to 10)"
-    )
-    if late >= early:
-        why = (
-            f"the mean standard deviation is {early * MM:.2g} mm in steps 4, 5 and {late * MM:.2g} mm in steps 8 to 10"
-        )
+    why = f"the mean standard deviation is {early * MM:.2g} mm in steps 4 and 5 and {late * MM:.2g} mm in steps 8 to 10"
     return decided(late < early, why, *_each(found))
 
 
@@ -107,7 +101,9 @@ def larger_dead_zone(runs: Runs, square: Square) -> Finding:
 def larger_gain(runs: Runs, square: Square) -> Finding:
     """k_DZ = 2 against 1 in steps 4 and 5."""
     once, twice = (float(deviations(noisy(runs, square, k_dz))[3:5].mean()) for k_dz in (1.0, 2.0))
-    why = f"in steps 4 and 5 the mean standard deviation is {twice * MM:.2g} mm with k_DZ = 2 and {once * MM:.2g} mm with 1"
+    why = (
+        f"the mean standard deviation of steps 4, 5 is {twice * MM:.2g} mm with k_DZ = 2 and {once * MM:.2g} mm with 1"
+    )
     return decided(twice < once, why, ("k_DZ = 1", once * MM, "mm"), ("k_DZ = 2", twice * MM, "mm"))
 
 
@@ -126,19 +122,19 @@ def bias_from_noise(runs: Runs, square: Square) -> Finding:
     (mean, error), (without, error_without) = (_bias(each) for each in (noisy(runs, square), [quiet(runs, square)]))
     joint = math.hypot(error, error_without)
     reproduced = abs(mean) - abs(without) > 2.0 * joint
-    why = f"with noise the mean error is {mean:.2g} deg and without it {without:.2g} deg, their difference known to {joint:.1g}"
-    return decided(
-        reproduced, why, ("with noise", mean, "deg"), ("without", without, "deg"), ("joint error", joint, "deg")
-    )
+    why = f"the mean error is {mean:.2g} deg with noise and {without:.2g} deg without (difference known to {joint:.1g})"
+    values = (("with noise", mean, "deg"), ("without", without, "deg"), ("joint standard error", joint, "deg"))
+    return decided(reproduced, why, *values)
 
 
 @measures_both("noise-copes")
 def copes(runs: Runs, square: Square) -> Finding:
     """Largest swing at the end of any step."""
     found = [[step.amplitude for step in record.trace.steps] for record in noisy(runs, square)]
-    worst = float(np.max(found))
+    worst, count = float(np.max(found)), np.size(found)
     loud = int(np.count_nonzero(np.array(found) >= 0.1 * AMPLITUDE))
-    why = f"the position swings by at most {100 * worst / AMPLITUDE:.3g} % of 1 mm at the end of a step; {loud} of {np.size(found)} steps exceed 10 %"
+    percent = 100.0 * worst / AMPLITUDE
+    why = f"at the end of a step the position swings by up to {percent:.3g} % of 1 mm; {loud} of {count} exceed 10 %"
     return decided(loud == 0, why, ("largest amplitude", worst * MM, "mm"), ("steps over 10 %", loud))
 
 

@@ -39,21 +39,21 @@ def matrix(runs: Runs) -> Finding:
     gains, (a3, a2) = one.L, one.denominator[-2:-4:-1]
     printed = one.A.copy()
     printed[1, 0] = -(a3 + gains[1])
-    wanted, found = np.poly(one.A), np.poly(printed)
+    wanted, found = _coefficients(one.A), _coefficients(printed)
     error = float(np.abs(found / wanted - 1.0).max())
     why = (
         f"with a3 in the second row the polynomial's s² coefficient is {found[2]:.5g} instead of {wanted[2]:.5g};"
         f" with a2 ({a2:.5g}) it is right"
     )
-    return decided(error < 1e-9, why, ("largest relative error of a coefficient", error), *_poles(np.roots(found)))
+    return decided(error < 1e-9, why, ("largest relative error of a coefficient", error), *_poles(_roots(found)))
 
 
 @measures("observer-gains")
 def gains(runs: Runs) -> Finding:
     """Poles from A.9 as printed and as corrected."""
     one = observer(runs.servo, ALPHA)
-    printed = np.roots(_characteristic([comb(4, 4 - i) * ALPHA**i for i in range(4)]))
-    corrected = np.roots(_characteristic([comb(4, 4 - i) * ALPHA ** (4 - i) for i in range(4)]))
+    printed = _roots(_characteristic([comb(4, 4 - i) * ALPHA**i for i in range(4)]))
+    corrected = _roots(_characteristic([comb(4, 4 - i) * ALPHA ** (4 - i) for i in range(4)]))
     spread = float(np.abs(corrected / -ALPHA - 1.0).max())
     why = (
         f"as printed, the poles lie between {printed.real.min():.3g} and {printed.real.max():.3g} 1/s; with α^(4-i) all"
@@ -69,6 +69,15 @@ def gains(runs: Runs) -> Finding:
 def _characteristic(sums: list[float]) -> Array:
     """s^4 + ... with a_i + l_i as coefficients, i = 3 .. 0 (Eq A.8), highest power first."""
     return np.array([1.0, *sums[::-1]])
+
+
+def _coefficients(matrix: Array) -> Array:
+    """Characteristic polynomial, highest power first."""
+    return np.asarray(np.poly(matrix), dtype=float)
+
+
+def _roots(coefficients: Array) -> Complex:
+    return np.asarray(np.roots(coefficients), dtype=complex)
 
 
 def _poles(poles: Complex) -> list[tuple[str, float, str]]:

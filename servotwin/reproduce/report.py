@@ -1,0 +1,143 @@
+"""report.html: verdicts, figures and errata on one self-contained page."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from importlib import resources
+
+import servotwin as st
+from servotwin.reproduce import page
+from servotwin.reproduce.claims import Claim, Finding, Result, Value, Verdict
+from servotwin.reproduce.document import DEFINITIONS, PAPER, by_claim
+from servotwin.reproduce.tasks import Drawn, plate
+
+Row = Mapping[str, Result]
+TITLE = "servotwin: the paper, claim by claim"
+
+
+def report(results: Sequence[Result], drawn: Sequence[Drawn], preset: str) -> str:
+    """The page as HTML; sections without content are left out."""
+    rows = by_claim(results)
+    body = [*_head(rows, drawn)]
+    if rows:
+        body += _claims(rows)
+    if drawn:
+        body += _figures(drawn, preset)
+    body += [*_errata(), *_how()]
+    return page.page(TITLE, body)
+
+
+def errata() -> list[dict[str, str]]:
+    """The errata in our own words: id, where, problem, decision."""
+    text = resources.files("servotwin.reproduce").joinpath("errata.toml").read_text(encoding="utf-8")
+    return list(tomllib.loads(text)["erratum"])
+
+
+def _head(rows: Mapping[Claim, Row], drawn: Sequence[Drawn]) -> Iterator[str]:
+    yield f"<h1>{escape(TITLE)}</h1>"
+    yield f"<p>What {escape(PAPER)} says, beside what this package measures by running the code.</p>"
+    links = [
+        ("claims", "Claims", rows),
+        ("figures", "Figures", drawn),
+        ("errata", "Errata", True),
+        ("how", "How", True),
+    ]
+    yield "<nav>" + "".join(f'<a href="#{name}">{text}</a>' for name, text, there in links if there) + "</nav>"
+
+
+def _claims(rows: Mapping[Claim, Row]) -> Iterator[str]:
+    presets = list(next(iter(rows.values())))
+    yield '<h2 id="claims">Verdicts</h2>'
+    yield _summary(rows, presets)
+    yield (
+        "<p>The printed gains and the printed table do not belong together (erratum E1), so every claim is measured in"
+        " three presets: <code>paper</code> has the pitch doubled, <code>table1</code> is as printed,"
+        " <code>paper-gain2</code> has the gains doubled. Open a row for the criterion and the numbers.</p>"
+    )
+    heads = "".join(f"<span>{escape(preset)}</span>" for preset in presets)
+    yield f'<div class="claims"><div class="row head"><span>Claim</span>{heads}</div>'
+    yield from (_row(claim, row) for claim, row in rows.items())
+    yield "</div>"
+
+
+def _summary(rows: Mapping[Claim, Row], presets: Sequence[str]) -> str:
+    cards = "".join(_card(preset, [row[preset].finding.verdict for row in rows.values()]) for preset in presets)
+    return f'<div class="sum">{cards}</div>'
+
+
+def _card(preset: str, verdicts: Sequence[Verdict]) -> str:
+    counts = Counter(verdicts)
+    total = f"<strong>{counts[Verdict.REPRODUCED]} of {len(verdicts)}</strong> reproduced"
+    rest = ", ".join(f"{counts[v]} {v.value}" for v in list(Verdict)[1:] if counts[v])
+    return f'<div><code>{escape(preset)}</code><br>{total}<br><span class="soft small">{escape(rest)}</span></div>'
+
+
+def _row(claim: Claim, row: Row) -> str:
+    badges = "".join(
+        f'<span><span class="preset">{escape(preset)}</span>{page.badge(result.finding.verdict.value)}</span>'
+        for preset, result in row.items()
+    )
+    sentence = f"“{escape(claim.sentence)}” <span class='soft small'>{escape(claim.where)}</span>"
+    summary = f'<summary><div class="row"><span>{sentence}</span>{badges}</div></summary>'
+    return f'<details id="{escape(claim.id)}">{summary}<div class="inside">{_inside(claim, row)}</div></details>'
+
+
+def _inside(claim: Claim, row: Row) -> str:
+    whys = "".join(_why(preset, result.finding) for preset, result in row.items())
+    others = "".join(_why(f"{preset}, 0/1 mm", r.unipolar) for preset, r in row.items() if r.unipolar)
+    texts = f"<p><span class='soft'>Reproduced if</span> {escape(claim.criterion)}.</p><ul>{whys}{others}</ul>"
+    findings = {preset: result.finding for preset, result in row.items()}
+    findings |= {f"{preset}, 0/1 mm": r.unipolar for preset, r in row.items() if r.unipolar}
+    return texts + _numbers(findings)
+
+
+def _why(name: str, finding: Finding) -> str:
+    verdict = page.badge(finding.verdict.value)
+    return f"<li><code>{escape(name)}</code> {verdict}: {escape(finding.why)}.</li>"
+
+
+def _numbers(findings: Mapping[str, Finding]) -> str:
+    """All values, one row each, one column per finding."""
+    columns = {name: {(v.name, v.unit): v for v in finding.values} for name, finding in findings.items()}
+    keys = list(dict.fromkeys(key for column in columns.values() for key in column))
+    if not keys:
+        return ""
+    head = ["measured", *columns]
+    return page.table(head, [[_name(*key), *(shown(c.get(key)) for c in columns.values())] for key in keys])
+
+
+def _name(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name
+
+
+def shown(value: Value | None) -> str:
+    """A number for people: four digits; a dash where there is none."""
+    if value is None or not math.isfinite(value.number):
+        return "–"
+    return f"{value.number:.4g}"
+
+
+def _figures(drawn: Sequence[Drawn], preset: str) -> Iterator[str]:
+    yield '<h2 id="figures">Figures</h2>'
+    yield f"<p>Drawn with the preset <code>{escape(preset)}</code>.</p>"
+    for one in drawn:
+        shape = plate(one.name)
+        yield page.figure(one.vector, shape.title, shape.caption)
+
+
+def _errata() -> Iterator[str]:
+    yield '<h2 id="errata">Errata and decisions</h2>'
+    names = ("id", "where", "problem", "decision")
+    rows = [[erratum[name] for name in names] for erratum in errata()]
+    yield page.table(["", "Where", "What is wrong or open", "What we do"], rows, stack=True)
+
+
+def _how() -> Iterator[str]:
+    yield '<h2 id="how">How it was measured</h2>'
+    yield "<p>The list of claims and their criteria were fixed before anything was measured.</p>"
+    yield page.table(["Word", "Meaning"], [[word, text] for word, text in DEFINITIONS.items()], stack=True)
+    yield f'<p class="soft small">servotwin {escape(st.__version__)}</p>'

@@ -1,0 +1,90 @@
+"""The work of a reproduction as independent tasks, done here or by a pool of processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from servotwin.reproduce import figures
+from servotwin.reproduce.claims import Claim, Result, measure
+from servotwin.reproduce.figures import Plate, style
+from servotwin.reproduce.runs import Runs
+
+_R = TypeVar("_R", covariant=True)
+
+
+class Task(Protocol[_R]):
+    """A picklable piece of work."""
+
+    def run(self) -> _R: ...
+
+
+@cache
+def runs_of(preset: str) -> Runs:
+    """This process's runs of a preset: tasks that follow one another share them."""
+    return Runs(preset)
+
+
+@dataclass(frozen=True)
+class ClaimsTask:
+    """Measure some claims in one preset."""
+
+    preset: str
+    claims: tuple[Claim, ...]
+
+    def run(self) -> tuple[Result, ...]:
+        """Their results."""
+        return tuple(measure(claim, runs_of(self.preset)) for claim in self.claims)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure as drawn: its name and the vector image."""
+
+    name: str
+    vector: bytes
+
+
+@dataclass(frozen=True)
+class FigureTask:
+    """Draw one figure for one preset and write its files."""
+
+    preset: str
+    name: str
+    directory: Path
+
+    def run(self) -> Drawn:
+        """The vector image, which is also in NAME.svg, beside NAME.png."""
+        path = style.save(plate(self.name).draw(runs_of(self.preset)), self.directory, self.name)
+        return Drawn(self.name, path.read_bytes())
+
+
+def plate(name: str) -> Plate[object]:
+    """The figure of that name."""
+    return next(one for one in figures.PLATES if one.name == name)
+
+
+def perform(tasks: Sequence[Task[_R]], workers: int) -> Iterator[_R]:
+    """Results as they come. With one worker everything happens in this process.
+
+    An interrupt ends the workers; what they had not finished is lost, and no file is left half written.
+    """
+    if workers == 1 or len(tasks) < 2:
+        yield from (task.run() for task in tasks)
+        return
+    with multiprocessing.get_context("spawn").Pool(min(workers, len(tasks)), _ignore_interrupts) as pool:
+        yield from pool.imap_unordered(_run, tasks)
+
+
+def _run(task: Task[_R]) -> _R:
+    return task.run()
+
+
+def _ignore_interrupts() -> None:
+    """Leave an interrupt to the process that started the pool."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
