@@ -223,7 +223,7 @@ def test_fig_15_with_the_papers_own_estimates():
     assert -0.35 < np.mean(errors[2:]) < -0.25  # facts E8: what the observer has not forgotten at 0.25 s
     settled = [step.settled for step in steps_of(loop)]
     assert not settled[1]
-    # Which others settle hangs on 0.001 deg of an estimate (erratum E17): over 20 amplitudes within 1 %, 0 to 1 more move.
+    # The others hang on 0.001 deg of an estimate (erratum E17): over 20 amplitudes within 1 %, at most one more moves.
     assert sum(settled) >= 8
 
 
