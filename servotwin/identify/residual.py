@@ -36,6 +36,8 @@ class PlayResidual:
         rad: the range of the motor's angle.
     unit : float
         m: what a residual of one means.
+    variation : float
+        Standard deviation of the position over `unit`.
     """
 
     theta_m: Array
@@ -44,6 +46,7 @@ class PlayResidual:
     skip: int
     scale: float
     unit: float
+    variation: float
     _scratch: list[Array] = field(default_factory=list, repr=False)
 
     @classmethod
@@ -55,7 +58,8 @@ class PlayResidual:
         unit = pitch * scale
         screw = plant.screw_filter(sample_rate)
         base = plant.position_filter(sample_rate).respond(position / unit)
-        return cls(theta_m / scale, base, LagFilter(screw.decay, screw.taps / pitch), skip, scale, unit)
+        lags = LagFilter(screw.decay, screw.taps / pitch)
+        return cls(theta_m / scale, base, lags, skip, scale, unit, float(np.std(position)) / unit)
 
     def values(self, point: Array) -> Array:
         """(n - skip,) residual at (gap, theta_d0) over `scale`.
@@ -104,19 +108,21 @@ class PlayResidual:
         return np.array([_DIFFERENCE, 0.0]), np.array([0.0, inwards])
 
     def unexplained(self, cost: float) -> float:
-        """Residual over the filtered position's own variation (rms both): near 1 when the model explains nothing."""
-        variation = float(np.std(self.base[self.skip :]))
-        return math.sqrt(cost) / variation if variation > 0.0 else math.inf
+        """Residual over the position's own variation (rms both): near 1 when the model explains nothing."""
+        return math.sqrt(cost) / self.variation if self.variation > 0.0 else math.inf
 
     def first_screw_angle(self, gap: float, point: Array) -> float:
-        """Screw angle (rad) at the first sample: that of `point`, clamped into the gap (rad); NaN when that is unknown."""
+        """Screw angle (rad) at the first sample: that of `point`, clamped into the gap (rad); NaN if that is."""
         angle, first = self.scale * float(point[1]), self.scale * float(self.theta_m[0])
         return math.nan if math.isnan(gap) else min(max(angle, first - 0.5 * gap), first + 0.5 * gap)
 
     def screw_motion(self, point: Array) -> tuple[float, float, float]:
-        """How far (rad) the motor pushed the screw forwards and backwards, and how far it moved without pushing."""
+        """How far (rad) the motor pushed the screw forwards and backwards, and how far it moved without pushing.
+
+        All of it where the cost counts, after k_s.
+        """
         half, start = 0.5 * max(0.0, float(point[0])), float(point[1])
-        forwards, backwards, free = screw_motion(self.theta_m, half, start)
+        forwards, backwards, free = screw_motion(self.theta_m, half, start, self.skip)
         return self.scale * forwards, self.scale * backwards, self.scale * free
 
 
@@ -130,16 +136,17 @@ def mean_square(values: Array, skip: int) -> float:
 
 
 @compiled
-def screw_motion(theta_m: Array, half: float, start: float) -> tuple[float, float, float]:
-    """Upward and downward travel of the play operator's output, and the range of its input's lead over it."""
+def screw_motion(theta_m: Array, half: float, start: float, skip: int) -> tuple[float, float, float]:
+    """After sample `skip`: travel of the play operator's output up and down, and the range of its input's lead."""
     w = play_step(start, theta_m[0], half)
     upward = downward = 0.0
-    lowest = highest = theta_m[0] - w
+    lowest, highest = math.inf, -math.inf
     for i in range(1, theta_m.size):
         new = play_step(w, theta_m[i], half)
-        upward += max(0.0, new - w)
-        downward += max(0.0, w - new)
+        if i > skip:
+            upward += max(0.0, new - w)
+            downward += max(0.0, w - new)
+            lowest = min(lowest, theta_m[i] - new)
+            highest = max(highest, theta_m[i] - new)
         w = new
-        lowest = min(lowest, theta_m[i] - w)
-        highest = max(highest, theta_m[i] - w)
-    return upward, downward, highest - lowest
+    return upward, downward, max(0.0, highest - lowest)

@@ -29,7 +29,7 @@ class Settings:
         How a window goes on beyond its ends for the low-pass: turned about its last sample, or mirrored.
     padding_samples : int, optional
         For how long; None: three times the order, as MATLAB's filtfilt does. Even padding of one period of the cut-off
-        (250 samples at 5 kHz) lowers the scatter in the paper's noise from 0.2 to 0.05 deg: tests/test_paper_noise.py.
+        (250 samples at 5 kHz) lowers the scatter in the paper's noise from 0.2 to 0.05 deg: tests/test_paper_loop.py.
     iterations : int
         At most as many.
     origin : "absolute" or "first"
@@ -48,7 +48,7 @@ class Settings:
     largest_std : float
         rad: estimates with a larger statistical spread are refused.
     unexplained : float
-        Residual over variation of the filtered position above which the model does not belong to the window.
+        Residual over variation of the position (rms both) above which the model does not belong to the window.
     """
 
     alpha: float = 40.0

@@ -35,9 +35,10 @@ def judge(residual: PlayResidual, found: Minimum, std: float, settings: Settings
     objection = _objection(residual, found, std, settings)
     if objection is not None:
         return objection
-    if fitted < 0.0:
+    verdict = _by_contacts(residual, found, max(0.0, fitted), settings.contact_travel)
+    if fitted < 0.0 and verdict.status is GapStatus.OK:
         return _negative(fitted, math.hypot(std, settings.method_error))
-    return _by_contacts(residual, found, fitted, settings.contact_travel)
+    return verdict
 
 
 def _objection(residual: PlayResidual, found: Minimum, std: float, settings: Settings) -> Verdict | None:

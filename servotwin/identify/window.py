@@ -22,6 +22,8 @@ class RunLike(Protocol):
 
     @property
     def time(self) -> Array: ...
+    @property
+    def sample_rate(self) -> float: ...
     def measured(self, name: str) -> Array: ...
 
 
@@ -93,23 +95,17 @@ class Window:
         InvalidInput
             The run does not cover the window.
         """
-        seen: dict[str, Any] = {name: run.measured(name) for name in CHANNELS}
-        whole = cls(**seen, time=run.time)
-        return whole.slice(start, duration)
+        begin, rate = float(run.time[0]), run.sample_rate
+        part = _samples("run: ", begin, rate, run.time.size, start, duration)
+        channels: dict[str, Any] = {name: run.measured(name)[part] for name in CHANNELS}
+        return cls(**channels, sample_rate=rate, start=begin + part.start / rate)
 
     def slice(self, start: float, duration: float) -> Window:
         """The part of `duration` (s) that begins at the sample nearest to `start` (s, on the window's own clock)."""
-        first = round((start - self.start) * self.sample_rate)
-        last = first + round(duration * self.sample_rate)
-        if not 0 <= first < last <= self.position.size:
-            raise InvalidInput(
-                f"{self.where}a window of {duration!r} s from {start!r} s does not lie within the measurements, "
-                f"which last from {self.start!r} s to {self.start + self.duration!r} s"
-            )
-        parts: dict[str, Any] = {name: value[first:last] for name, value in self.channels.items()}
-        return Window(
-            **parts, sample_rate=self.sample_rate, start=self.start + first / self.sample_rate, source=self.source
-        )
+        rate = self.sample_rate
+        part = _samples(self.where, self.start, rate, self.position.size, start, duration)
+        channels: dict[str, Any] = {name: value[part] for name, value in self.channels.items()}
+        return Window(**channels, sample_rate=rate, start=self.start + part.start / rate, source=self.source)
 
     def replace(self, **channels: ArrayLike) -> Window:
         """A copy with other samples in some channels, validated again."""
@@ -140,6 +136,18 @@ class Window:
     def where(self) -> str:
         """What a message about this window begins with."""
         return f"{self.source}: " if self.source else ""
+
+
+def _samples(where: str, begin: float, rate: float, size: int, start: float, duration: float) -> slice:
+    """Which of `size` samples at `rate` (Hz), the first at `begin` (s), lie in `duration` (s) from `start` (s) on."""
+    first = round((_number(where, "start", "s", start) - begin) * rate)
+    last = first + round(_number(where, "duration", "s", duration) * rate)
+    if not 0 <= first < last <= size:
+        raise InvalidInput(
+            f"{where}a window of {duration:.9g} s from {start:.9g} s does not lie within the measurements, "
+            f"which last from {begin:.9g} s to {begin + size / rate:.9g} s"
+        )
+    return slice(first, last)
 
 
 def _channel(where: str, name: str, values: ArrayLike) -> Array:
@@ -201,11 +209,9 @@ def _uniform(where: str, size: int, time: ArrayLike, start: float) -> tuple[floa
     if times.shape != (size,):
         raise InvalidInput(f"{where}time has shape {times.shape} and position ({size},): must be equal")
     interval = (times[-1] - times[0]) / (size - 1)
-    grid = times[0] + interval * np.arange(size)
-    wrong = np.flatnonzero(~(np.abs(times - grid) <= _JITTER * interval))
-    if wrong.size or not interval > 0.0:
-        index = int(wrong[0]) if wrong.size else size - 1
-        raise InvalidInput(
-            f"{where}time[{index}] = {times[index]} s: times must be finite, increasing and uniformly spaced"
-        )
+    off_grid = ~(np.abs(times - (times[0] + interval * np.arange(size))) < _JITTER * interval)
+    wrong = np.flatnonzero(off_grid if np.all(np.isfinite(times)) else ~np.isfinite(times))
+    if wrong.size:
+        index = int(wrong[0])
+        raise InvalidInput(f"{where}time[{index}] = {times[index]} s: must be finite, increasing, uniformly spaced")
     return 1.0 / interval, float(times[0])
