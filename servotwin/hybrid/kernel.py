@@ -181,6 +181,14 @@ def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
 def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
     not."""
+    value, change = 0.0, 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
+    for i in range(np.uint64(t.states)):
+        value += t.rows[base + i] * x[i]
+        change += t.changes[base + i] * abs(x[i])
+    if value + change < 0.0:
+        # Not even with every term of the series at its worst.
+        return np.inf
     c = scratch.series
     first = series(t, mode, guard, x, c)
     if first == TERMS:

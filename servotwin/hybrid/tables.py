@@ -45,6 +45,7 @@ class Tables(NamedTuple):
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside the first interval's rows of fine
     rows: Array  # M * G * n
     sizes: Array  # M * G * n: sum over the orders of abs(taylor)
+    changes: Array  # M * G * n: the same without order 0, with a margin for rounding
     bernstein: Array  # TERMS * 16: Taylor coefficients on [0, 1] to Bernstein rows over 5 intervals
 
 
@@ -71,6 +72,7 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
     parts = zip(*(_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))), strict=True)
     flat = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in parts]
     coarse, fine, taylor, jump_coarse, jump_fine, jump_part, flow_part, single = flat
+    orders = np.abs(taylor.reshape(len(modes), guards, n, TERMS))
     return Tables(
         states=n,
         guards=guards,
@@ -87,7 +89,8 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
         flow_part=flow_part,
         single=single,
         rows=rows.ravel(),
-        sizes=np.abs(taylor.reshape(len(modes), guards, n, TERMS)).sum(axis=3).ravel(),
+        sizes=orders.sum(axis=3).ravel(),
+        changes=(orders[..., 1:].sum(axis=3) + 1e-12 * orders[..., 0]).ravel(),
         bernstein=_bernstein_of_taylor().ravel(),
     )
 

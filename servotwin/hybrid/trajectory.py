@@ -195,7 +195,7 @@ class Trajectory:
         full = np.ascontiguousarray(np.broadcast_to(rows, (len(self.automaton.modes), len(self.state))), dtype=float)
         key = full.tobytes()
         if key not in self._rows:
-            self._rows[key] = _output_table(self.tables, full)
+            self._rows[key] = output_table(self.tables, full)
         return self._rows[key]
 
     @cached_property
@@ -262,7 +262,7 @@ def new_scratch(tables: Tables) -> Scratch:
     return Scratch(*(np.zeros(size) for size in sizes))
 
 
-def _output_table(tables: Tables, rows: Array) -> Array:
+def output_table(tables: Tables, rows: Array) -> Array:
     """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat ``(M, n, 128)``."""
     n, modes = tables.states, len(tables.guard_count)
     # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.

@@ -41,19 +41,14 @@ class ContinuousEngine:
             state[self.loop.automaton.index("voltage limit")] = self.controller.voltage_limit
         if self.controller.loop_filter_hz is not None:
             state[self.loop.automaton.index("filtered")] = self.loop.rows["position"][0] @ state
-        mode = self.loop.mode(self._zone(float(self.loop.rows["error"][0] @ state), signals["tolerance"]))
+        enter = self.controller.enter * float(signals["tolerance"].value(0.0))
+        error = float(self.loop.rows["error"][0] @ state)
+        mode = self.loop.mode(start_zone(error, enter) if shape.dead_zone else "on")
         self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
 
     def _signal(self, name: str) -> PiecewiseCubic:
         pieces: PiecewiseCubic | None = getattr(self.inputs, name)
         return PiecewiseCubic.constant(0.0) if pieces is None else pieces
-
-    def _zone(self, error: float, tolerance: PiecewiseCubic) -> str:
-        if self.inputs.tolerance is None:
-            return "on"
-        if abs(error) <= self.controller.enter * float(tolerance.value(0.0)):
-            return "inside"
-        return "+" if error > 0.0 else "-"
 
     @property
     def index(self) -> int:
@@ -88,6 +83,13 @@ class ContinuousEngine:
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Time, kind, side, and whether the state (not a jump) triggered it."""
         return [(time, kind, side, not forced) for time, kind, side, forced in self.trajectory.events()]
+
+
+def start_zone(error: float, enter: float) -> str:
+    """The dead zone's mode at the start: closed, unless the error is already small enough to open the loop."""
+    if abs(error) <= enter:
+        return "inside"
+    return "+" if error > 0.0 else "-"
 
 
 def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:

@@ -1,0 +1,136 @@
+"""Many runs of one automaton from many starts, on several threads: one set of tables serves all."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, Record, Scratch, flow_until, settle
+from servotwin.hybrid.tables import Tables, search_step
+from servotwin.hybrid.trajectory import (
+    ZenoError,
+    grown,
+    new_record,
+    new_scratch,
+    output_table,
+    sample_segments,
+    tables_for,
+)
+
+
+@bare
+def run_members(
+    t: Tables,
+    states: Array,
+    modes: NDArray[np.int64],
+    first: int,
+    steps: int,
+    stride: int,
+    table: Array,
+    out: Array,
+    events: NDArray[np.int64],
+    record: Record,
+    scratch: Scratch,
+) -> tuple[int, int]:
+    """Run members `first` on until all are done; return the status and the member it concerns."""
+    for k in range(first, len(states)):
+        x = states[k]
+        record.size[0] = record.size[1] = 0
+        mode = settle(t, modes[k], x, 0, 0.0, True, record, scratch)
+        if mode < 0:
+            return mode, k
+        status, _, _, mode = flow_until(t, x, mode, 0, 0.0, steps, 0.0, record, scratch)
+        if status != DONE:
+            return status, k
+        modes[k] = mode
+        events[k] = record.size[1]
+        size = record.size[0]
+        sample_segments(0, size, record.step, record.fraction, record.mode, record.state, table, stride, 0, out[k])
+    return DONE, len(states)
+
+
+def run_ensemble(
+    automaton: Automaton,
+    states: ArrayLike,
+    modes: ArrayLike,
+    sample_step: float,
+    samples: int,
+    rows: ArrayLike,
+    threads: int | None = None,
+) -> tuple[Array, NDArray[np.int64]]:
+    """One output of every member at every sample.
+
+    Parameters
+    ----------
+    automaton : Automaton
+    states : (K, n) array
+        Starts at time 0.
+    modes : (K,) array
+        Modes at time 0.
+    sample_step : float
+        s.
+    samples : int
+        Samples per member, that of time 0 included.
+    rows : (n,) or (M, n) array
+        The output ``rows[mode] @ x``.
+    threads : int, optional
+        As many as there are processors by default.
+
+    Returns
+    -------
+    output : (K, samples) array
+    events : (K,) array
+        Events of each member.
+
+    Raises
+    ------
+    ZenoError
+        Naming the member.
+    """
+    starts, first_modes = np.array(states, dtype=float, ndmin=2), np.array(modes, dtype=np.int64, ndmin=1)
+    if starts.shape != (len(first_modes), len(automaton.names)):
+        raise InvalidInput(f"{starts.shape} states for {len(first_modes)} modes of {len(automaton.names)} states each")
+    step, divisor = search_step(automaton, sample_step)
+    tables = tables_for(automaton, step)
+    table = output_table(tables, np.ascontiguousarray(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float))
+    out, events = np.empty((len(starts), samples)), np.zeros(len(starts), dtype=np.int64)
+    workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
+    # Neighbours cost alike, so each worker takes every `workers`-th member.
+    parts = [np.arange(worker, len(starts), workers) for worker in range(workers)]
+
+    def work(part: NDArray[np.int64]) -> None:
+        x, m, y, count = starts[part], first_modes[part], np.empty((len(part), samples)), np.zeros(len(part), np.int64)
+        _run_part(tables, x, m, (samples - 1) * divisor, divisor, table, y, count)
+        out[part], events[part] = y, count
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(work, parts))
+    return out, events
+
+
+def _run_part(
+    tables: Tables,
+    states: Array,
+    modes: NDArray[np.int64],
+    steps: int,
+    stride: int,
+    table: Array,
+    out: Array,
+    events: NDArray[np.int64],
+) -> None:
+    record = new_record(states.shape[1], 4 * EVENTS_PER_STEP, 4 * EVENTS_PER_STEP)
+    scratch, kept, member = new_scratch(tables), states.copy(), 0
+    while True:
+        status, member = run_members(tables, states, modes, member, steps, stride, table, out, events, record, scratch)
+        if status == DONE:
+            return
+        if status != FULL:
+            raise ZenoError(f"member {member} changes mode without end: the automaton is Zeno or slides")
+        record = grown(record)
+        states[member] = kept[member]
