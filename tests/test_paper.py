@@ -20,6 +20,10 @@ PATIENT = Settings(settle_s=0.5)
 T = np.arange(10000) / RATE
 
 
+def trembling(t):
+    return math.radians(0.4) * np.sin(2.0 * np.pi * 3.0 * t)
+
+
 def slow(t):
     """A motor that turns round once and comes back by 4 deg only."""
     return np.interp(t, [0.0, 1.7, 1.9, 3.0], [0.0, 6.0, 5.93, 5.93])
@@ -118,6 +122,14 @@ def test_one_contact_gives_a_lower_bound(gap_deg):
     assert estimate.interval[0] <= estimate.gap < math.radians(gap_deg)
     assert estimate.interval[1] == math.inf
     assert "needed both ways" in estimate.reasons[0]
+
+
+def test_a_motion_smaller_than_the_spread_shows_no_gap():
+    """0.8 deg to and fro within a gap of 3 deg, or in contact without any: too little to tell."""
+    estimate = estimate_gap(measured(0.0, motor=trembling), SERVO)
+    assert estimate.status is GapStatus.UNIDENTIFIABLE
+    assert "the motor moved by 0.8 deg, less than the" in estimate.reasons[0]
+    assert not estimate_gap(measured(math.radians(3.0), motor=trembling), SERVO).ok
 
 
 def spoiled(window, **channels):

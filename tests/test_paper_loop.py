@@ -115,6 +115,23 @@ def test_in_the_papers_noise(settings, bias, scatter, gap_deg):
     assert scatter[0] < np.std(found) < scatter[1]
 
 
+def test_windows_at_any_time_are_refused_or_right():
+    """Random gaps, steps, dead zones, calm loops, window times: quiet, straddling a step, one contact."""
+    rng = np.random.default_rng(7)
+    accepted = 0
+    for preset in ("paper", "table1") * 10:
+        servo, gap, amplitude = Servo.preset(preset), math.radians(rng.uniform(0.0, 25.0)), rng.uniform(0.3e-3, 1.5e-3)
+        controller = servo.controller.replace(Ki=servo.controller.Ki * rng.choice([0.0, 1.0, 1.0, 1.0]))
+        tolerance = rng.choice([None, servo.tolerance_for(gap, rng.uniform(0.5, 1.5))])
+        reference = SquareWave(amplitude, 16.0)
+        run = simulate(servo, 40.0, controller=controller, reference=reference, gap=gap, tolerance=tolerance)
+        for start in rng.uniform(0.0, 38.9, 12):
+            estimate = estimate_gap(Window.from_run(run, start, 1.0), servo, prior=gap * rng.choice([0.0, 1.0, 1.2]))
+            accepted += estimate.ok
+            assert estimate.interval[0] <= gap <= estimate.interval[1], (preset, gap, amplitude, start, estimate)
+    assert 80 < accepted < 200
+
+
 @pytest.mark.parametrize("gap_deg", GAPS)
 def test_the_stated_spread_covers_the_error(gap_deg):
     """`std` alone does not know the bias; `std_total` does."""

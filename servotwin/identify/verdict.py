@@ -31,14 +31,16 @@ class Verdict(NamedTuple):
 
 def judge(residual: PlayResidual, found: Minimum, std: float, settings: Settings) -> Verdict:
     """The verdict on a minimum with the statistical standard deviation `std` (rad)."""
-    fitted = float(found.point[0]) * residual.scale
     objection = _objection(residual, found, std, settings)
     if objection is not None:
         return objection
+    fitted, total = float(found.point[0]) * residual.scale, math.hypot(std, settings.method_error)
+    widest = max(0.0, fitted) + _NORMAL_95 * total
+    if residual.scale < widest:
+        moved = f"the motor moved by {math.degrees(residual.scale):.3g} deg"
+        return _unknown(f"{moved}, less than the {math.degrees(widest):.3g} deg that the gap may have")
     verdict = _by_contacts(residual, found, max(0.0, fitted), settings.contact_travel)
-    if fitted < 0.0 and verdict.status is GapStatus.OK:
-        return _negative(fitted, math.hypot(std, settings.method_error))
-    return verdict
+    return _negative(fitted, total) if fitted < 0.0 and verdict.status is GapStatus.OK else verdict
 
 
 def _objection(residual: PlayResidual, found: Minimum, std: float, settings: Settings) -> Verdict | None:
