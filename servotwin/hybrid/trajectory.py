@@ -28,7 +28,7 @@ from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, TERMS,
 
 _BLOCK = NODES_COARSE * NODES_FINE
 # Jumps this close to a search step, in steps, are taken on it.
-_ON_GRID = 1e-9
+ON_GRID = 1e-9
 
 
 class ZenoError(RuntimeError):
@@ -218,7 +218,7 @@ def schedule_of(
     end."""
     times = np.array([jump.time / step for jump in jumps] + [float(end)])
     whole = np.rint(times)
-    near = np.abs(times - whole) <= _ON_GRID
+    near = np.abs(times - whole) <= ON_GRID
     steps = np.where(near, whole, np.floor(times)).astype(np.int64)
     values = np.full((len(times), len(automaton.names)), np.nan)
     modes = np.tile(np.arange(len(automaton.modes)), (len(times), 1))

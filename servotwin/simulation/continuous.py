@@ -9,7 +9,7 @@ import numpy as np
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.trajectory import Jump, Trajectory
+from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
 from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
@@ -57,17 +57,19 @@ class ContinuousEngine:
 
     def advance(self, index: int) -> None:
         """Go on to a sample through the inputs' knots."""
-        begin, end = self.trajectory.time, index / self.inputs.sample_rate
+        end = index / self.inputs.sample_rate
+        # A knot that rounding puts behind the sample it belongs to is taken on it, in this call and not in the next.
+        span = (self.index + ON_GRID, index + ON_GRID)
         knots: dict[float, dict[int, float]] = {}
         opening: set[float] = set()
         for name in INPUTS:
             pieces = self._signal(name)
-            inside = slice(*np.searchsorted(pieces.times, (begin, end), side="right"))
+            inside = slice(*np.searchsorted(pieces.times * self.inputs.sample_rate, span, side="right"))
             for time, coefficients in zip(pieces.times[inside].tolist(), pieces.coeffs[inside], strict=True):
                 knots.setdefault(time, {}).update(self.loop.input_values(name, coefficients))
             if name == "gap":
                 opening = {float(time) for time in pieces.jumps}
-        jumps = [Jump(t, knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
+        jumps = [Jump(min(t, end), knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
         self.trajectory.advance(index, jumps)
 
     def set_tolerance(self, tolerance: float) -> None:
