@@ -23,12 +23,13 @@ INPUTS = ("reference", "gap", "tolerance")
 
 @dataclass(frozen=True)
 class Shape:
-    """What decides which states exist: the polynomial degree of each input, and whether there is a dead zone."""
+    """What decides which states exist: the polynomial degree of each input, whether there is a dead zone and noise."""
 
     reference: int = 0
     gap: int = 0
     tolerance: int = 0
     dead_zone: bool = True
+    noise: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,10 @@ def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Servo
     names = _plant_names(servo) + ["integral", "derivative"] + (["filtered"] if controller.loop_filter_hz else [])
     names += [name for key in INPUTS for name in _chain_names(key, getattr(shape, key))]
     names += ["voltage limit"] if controller.voltage_limit else []
+    names += ["noise"] if shape.noise else []
     basis = _Basis(tuple(names))
-    measured = basis.row("filtered") if controller.loop_filter_hz else _position(servo, basis)
+    sensed = _position(servo, basis) + basis.row("noise")
+    measured = basis.row("filtered") if controller.loop_filter_hz else sensed
     zones = _zones(controller, shape, basis, basis.row("reference") - measured)
     modes = []
     for side in _SIDES:
@@ -98,10 +101,11 @@ def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Servo
             flow[basis["integral"]], flow[basis["derivative"]] = zone.integral, zone.derivative
             if controller.loop_filter_hz:
                 rate = 2.0 * np.pi * controller.loop_filter_hz
-                flow[basis["filtered"]] = rate * (_position(servo, basis) - basis.row("filtered"))
+                flow[basis["filtered"]] = rate * (sensed - basis.row("filtered"))
             modes.append(_mode(servo, basis, flow, side, zone, zones))
     rows = _output_rows(servo, basis, zones)
     rows["error"] = np.tile(basis.row("reference") - measured, (len(modes), 1))
+    rows["measured_position"] = np.tile(sensed, (len(modes), 1))
     return ServoAutomaton(Automaton(tuple(modes), basis.names), rows, tuple(zone.name for zone in zones))
 
 

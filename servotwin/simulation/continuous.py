@@ -11,36 +11,42 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
 from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
+from servotwin.plant.noise import NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.run import Inputs, quantised
 
+_NOISE_BLOCK = 4096
+
 
 @dataclass
 class ContinuousEngine:
-    """Engine of a `Simulation` whose controller has no sample rate."""
+    """Engine of a `Simulation` whose controller has no sample rate; noise is held from sample to sample."""
 
     servo: Servo
     controller: Controller
     inputs: Inputs
     theta_d0: float = 0.0
     refine: int = 1
+    noise: NoiseSource | None = None
 
     def __post_init__(self) -> None:
         if self.controller.rate_limit is not None:
             raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
         signals = {name: self._signal(name) for name in INPUTS}
         reference, gap, tolerance = (degree(pieces) for pieces in signals.values())
-        shape = Shape(reference, gap, tolerance, dead_zone=self.inputs.tolerance is not None)
+        shape = Shape(reference, gap, tolerance, self.inputs.tolerance is not None, self.noise is not None)
         self.loop = continuous_loop(self.servo, self.controller, shape)
         state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
                 state[index] = value
+        if self.noise is not None:
+            state[self.loop.automaton.index("noise")] = self.noise.block(1)[0]
         if self.controller.voltage_limit is not None:
             state[self.loop.automaton.index("voltage limit")] = self.controller.voltage_limit
         if self.controller.loop_filter_hz is not None:
-            state[self.loop.automaton.index("filtered")] = self.loop.rows["position"][0] @ state
+            state[self.loop.automaton.index("filtered")] = self.loop.rows["measured_position"][0] @ state
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
         mode = self.loop.mode(start_zone(error, enter) if shape.dead_zone else "on")
@@ -57,6 +63,11 @@ class ContinuousEngine:
 
     def advance(self, index: int) -> None:
         """Go on to a sample through the inputs' knots."""
+        while self.noise is not None and index - self.index > _NOISE_BLOCK:
+            self._advance(self.index + _NOISE_BLOCK)
+        self._advance(index)
+
+    def _advance(self, index: int) -> None:
         end = index / self.inputs.sample_rate
         # A knot that rounding puts behind the sample it belongs to is taken on it, in this call and not in the next.
         span = (self.index + ON_GRID, index + ON_GRID)
@@ -69,6 +80,10 @@ class ContinuousEngine:
                 knots.setdefault(time, {}).update(self.loop.input_values(name, coefficients))
             if name == "gap":
                 opening = {float(time) for time in pieces.jumps}
+        if self.noise is not None:
+            times = self.inputs.times(self.index + 1, index + 1).tolist()
+            for time, value in zip(times, self.noise.block(len(times)).tolist(), strict=True):
+                knots.setdefault(time, {})[self.loop.automaton.index("noise")] = value
         jumps = [Jump(min(t, end), knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
         self.trajectory.advance(index, jumps)
 
@@ -79,7 +94,8 @@ class ContinuousEngine:
     def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1."""
         if name == "measured_position":
-            return quantised(self.channel("position", first, last), self.servo.position_resolution)
+            sensed = self.trajectory.sampled(self.loop.rows[name], first, last)
+            return quantised(sensed, self.servo.position_resolution)
         return self.trajectory.sampled(self.loop.rows[name], first, last)
 
     def events(self) -> list[tuple[float, str, int, bool]]:

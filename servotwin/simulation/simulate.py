@@ -52,14 +52,14 @@ class Simulation:
     sample_rate : float
         Hz, of what is recorded.
     noise : Noise, optional
-        On the measured position; needs a sampled controller.
+        On the measured position; a continuous controller sees it held from sample to sample.
     seed : int
         Of the noise.
 
     Raises
     ------
     InvalidInput
-        For a negative gap or tolerance, rates that do not divide one another, or noise without a sampled controller.
+        For a negative gap or tolerance, or rates that do not divide one another.
     """
 
     def __init__(
@@ -85,15 +85,12 @@ class Simulation:
             None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
             sample_rate,
         )
+        rng = np.random.default_rng(seed)
         self.engine: Engine
         if self.controller.sample_rate is None:
-            if noise is not None:
-                raise InvalidInput(
-                    "noise needs a sampled controller: set the controller's sample_rate, for example to 5000 Hz"
-                )
-            self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0)
+            source = None if noise is None else noise.source(sample_rate, rng)
+            self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0, noise=source)
         else:
-            rng = np.random.default_rng(seed)
             self.engine = SampledEngine(servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng)
 
     @property
