@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,7 +48,6 @@ class PlayResidual:
     scale: float
     unit: float
     variation: float
-    _scratch: list[Array] = field(default_factory=list, repr=False)
 
     @classmethod
     def of(
@@ -79,13 +79,11 @@ class PlayResidual:
         self.screw.subtract_play(self.theta_m, -0.5 * gap, mirrored, residual)
         return 2.0 * self._no_gap - residual
 
-    @property
+    @cached_property
     def _no_gap(self) -> Array:
-        if not self._scratch:
-            residual = self.base.copy()
-            self.screw.subtract_play(self.theta_m, 0.0, 0.0, residual)
-            self._scratch.append(residual)
-        return self._scratch[0]
+        residual = self.base.copy()
+        self.screw.subtract_play(self.theta_m, 0.0, 0.0, residual)
+        return residual
 
     def cost(self, point: Array) -> float:
         """Mean square of `values`."""
