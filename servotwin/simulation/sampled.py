@@ -286,10 +286,12 @@ class SampledEngine:
         )
         at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
         schedule = schedule_of(jumps, self.step, self.plant.automaton, (base + 1) * self.port.searches)
-        status = follow_schedule(self.tables, self.state, np.zeros(1), at, *schedule, self.record, self.scratch)
+        place, status = np.zeros(1), FULL
+        while status == FULL:
+            status = follow_schedule(self.tables, self.state, place, at, *schedule, self.record, self.scratch)
+            self.record.size[0] = 0
+            self._check(status)
         self.mode, self.base = int(at[1]), base + 1
-        self.record.size[0] = 0
-        self._check(status)
 
     def _check(self, status: int) -> None:
         if status == ZENO:
