@@ -88,7 +88,13 @@ class Automaton:
     @cached_property
     def fastest(self) -> float:
         """Largest eigenvalue magnitude of any mode, 1/s."""
-        return float(max(np.abs(np.linalg.eigvals(flow)).max() for flow in self.flows))
+        return float(np.abs(np.linalg.eigvals(self.flows)).max())
+
+    @cached_property
+    def fastest_lasting(self) -> float:
+        """The same among motions that last: those damped by less than 1 / sqrt(2), 1/s."""
+        values = np.linalg.eigvals(self.flows)
+        return float(np.abs(values[values.real > -np.abs(values) / np.sqrt(2.0)]).max(initial=0.0))
 
     def index(self, name: str) -> int:
         """Index of the state called `name`."""

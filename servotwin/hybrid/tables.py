@@ -24,6 +24,9 @@ PIECES = 5
 TERMS = 24
 PART_TERMS = 8
 SPECTRAL_STEP = 2.0
+# What has not died out when the coarse search begins must turn slowly enough for a cubic over 8 steps: of 100 random
+# pairs of undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
+LASTING_STEP = 0.25
 
 
 class Tables(NamedTuple):
@@ -50,8 +53,10 @@ class Tables(NamedTuple):
 
 
 def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
-    """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and k."""
-    divisor = max(1, int(np.ceil(automaton.fastest * sample_step / SPECTRAL_STEP - 0.05)))
+    """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and none whose motion lasts
+    by more than a quarter, and k."""
+    turns = max(automaton.fastest / SPECTRAL_STEP, automaton.fastest_lasting / LASTING_STEP) * sample_step
+    divisor = max(1, int(np.ceil(turns - 0.05)))
     return sample_step / divisor, divisor
 
 
