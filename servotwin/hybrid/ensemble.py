@@ -11,17 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare
-from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, Record, Scratch, flow_until, settle
+from servotwin.hybrid.flow import Scratch, new_scratch
+from servotwin.hybrid.kernel import DONE, FULL, ZENO, Record, flow_until, grown, new_record, settle
+from servotwin.hybrid.output import output_table, sample_segments
 from servotwin.hybrid.tables import Tables, search_step
-from servotwin.hybrid.trajectory import (
-    ZenoError,
-    grown,
-    new_record,
-    new_scratch,
-    output_table,
-    sample_segments,
-    tables_for,
-)
+from servotwin.hybrid.trajectory import ZenoError, tables_for
 
 
 @bare
@@ -44,7 +38,7 @@ def run_members(
         record.size[0] = record.size[1] = 0
         mode = settle(t, modes[k], x, 0, 0.0, True, record, scratch)
         if mode < 0:
-            return mode, k
+            return ZENO, k
         status, _, _, mode = flow_until(t, x, mode, 0, 0.0, steps, 0.0, record, scratch)
         if status != DONE:
             return status, k
@@ -124,7 +118,7 @@ def _run_part(
     out: Array,
     events: NDArray[np.int64],
 ) -> None:
-    record = new_record(states.shape[1], 4 * EVENTS_PER_STEP, 4 * EVENTS_PER_STEP)
+    record = new_record(states.shape[1])
     scratch, kept, member = new_scratch(tables), states.copy(), 0
     while True:
         status, member = run_members(tables, states, modes, member, steps, stride, table, out, events, record, scratch)

@@ -8,22 +8,21 @@ event.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
-from servotwin.hybrid.polynomial import first_positive
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, PARTS, PIECES, TERMS, Tables
+from servotwin.hybrid.crossing import is_leaving, next_crossing
+from servotwin.hybrid.flow import Scratch, advance, advance_clean, advance_fraction, product
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
 
 DONE, FULL, ZENO = 0, 1, 2
 # More events than this inside one search step, or mode changes at one instant, is Zeno behaviour or sliding.
 EVENTS_PER_STEP = 1000
 CHANGES_AT_ONCE = 64
-# A guard value or derivative below this part of its own terms is rounding, hence zero.
-SIGNIFICANT = 1e-13
 
 
 class Record(NamedTuple):
@@ -42,180 +41,28 @@ class Record(NamedTuple):
     event_forced: NDArray[np.bool_]
 
 
-class Scratch(NamedTuple):
-    """Working memory of one run."""
-
-    rows: Array
-    series: Array
-    change: Array
-    terms: Array
-    starts: Array
-    ends: Array
-
-
-@inlined
-def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
-    """``out[r] = sum of table[base + j * stride + r] * x[j]``: four columns at a time, so that `out` is stored less
-    often."""
-    count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
-    at: Any = np.uint64(base)
-    fours = n // np.uint64(4)
-    for r in range(count):
-        out[r] = 0.0
-    for block in range(fours):
-        j = block * np.uint64(4)
-        x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
-        b = at + step
-        c = b + step
-        d = c + step
-        for r in range(count):
-            out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
-        at = d + step
-    for rest in range(fours * np.uint64(4), n):
-        factor = x[rest]
-        for r in range(count):
-            out[r] += table[at + r] * factor
-        at += step
+def new_record(states: int, segments: int = 4 * EVENTS_PER_STEP, events: int = 4 * EVENTS_PER_STEP) -> Record:
+    """An empty record with room for so many segments and events."""
+    return Record(
+        np.zeros(2, dtype=np.int64),
+        np.empty(segments, dtype=np.int64),
+        np.empty(segments),
+        np.empty(segments, dtype=np.int64),
+        np.empty((segments, states)),
+        np.empty(events, dtype=np.int64),
+        np.empty(events),
+        np.empty(events, dtype=np.int64),
+        np.empty(events, dtype=np.int64),
+        np.empty(events, dtype=bool),
+    )
 
 
-@inlined
-def advance(table: Array, base: int, x: Array, change: Array) -> None:
-    """``x += P @ x`` with the transposed ``(n, n)`` matrix at `base`."""
-    product(table, base, x.size, x.size, x, change)
-    for i in range(np.uint64(x.size)):
-        x[i] += change[i]
-
-
-@inlined
-def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
-    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
-    n = np.uint64(t.states)
-    n2 = t.states * t.states
-    part = min(int(fraction * PARTS), PARTS - 1)
-    rest = fraction * PARTS - part
-    if part > 0:
-        advance(t.jump_part, (mode * PARTS + part) * n2, x, scratch.change)
-    terms = scratch.terms
-    product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
-    at = np.uint64(PART_TERMS * t.states)
-    change = scratch.change
-    for i in range(n):
-        change[i] = 0.0
-    for _ in range(PART_TERMS):
-        at -= n
-        for i in range(n):
-            change[i] = (change[i] + terms[at + i]) * rest
-    for i in range(n):
-        x[i] += change[i]
-
-
-@inlined
-def advance_clean(
-    t: Tables, table: Array, jumps: Array, nodes: int, wanted: int, mode: int, x: Array, scratch: Scratch
-) -> int:
-    """Advance through the first intervals of a block, at most `wanted`, in which no guard may become positive.
-
-    `table` and `jumps` are those of one scale; returns the number of intervals advanced.
-    """
-    out, guards = scratch.rows, t.guard_count[mode]
-    rows = 3 * nodes + 1
-    product(table, mode * t.states * t.guards * rows, t.guards * rows, guards * rows, x, out)
-    positive = 0
-    for r in range(np.uint64(guards * rows)):
-        positive += out[r] > 0.0
-    clean = wanted if positive == 0 else clean_intervals(out, guards, rows, wanted)
-    if clean > 0:
-        advance(jumps, (mode * nodes + clean - 1) * t.states * t.states, x, scratch.change)
-    return clean
-
-
-@inlined
-def clean_intervals(out: Array, guards: int, rows: int, wanted: int) -> int:
-    """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
-    clean = wanted
-    for g in range(guards):
-        for k in range(clean):
-            at = g * rows + 3 * k
-            if max(out[at], out[at + 1], out[at + 2], out[at + 3]) > 0.0:
-                clean = k
-                break
-    return clean
-
-
-@inlined
-def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
-    """The part of a guard's Taylor coefficients (in steps) that is rounding: of all the terms that ever enter them."""
-    size = 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        size += t.sizes[base + i] * abs(x[i])
-    return SIGNIFICANT * size
-
-
-@inlined
-def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
-    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
-    rounding."""
-    product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
-    limit = rounding(t, mode, guard, x)
-    for order in range(TERMS):
-        if abs(c[order]) > limit:
-            return order
-    return TERMS
-
-
-@inlined
-def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
-    """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
-    value = 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        value += t.rows[base + i] * x[i]
-    if abs(value) > rounding(t, mode, guard, x):
-        return value > 0.0
-    first = series(t, mode, guard, x, c)
-    return first < TERMS and c[first] > 0.0
-
-
-@inlined
-def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
-    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
-    not."""
-    value, change = 0.0, 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        value += t.rows[base + i] * x[i]
-        change += t.changes[base + i] * abs(x[i])
-    if value + change < 0.0:
-        # Not even with every term of the series at its worst.
-        return np.inf
-    c = scratch.series
-    first = series(t, mode, guard, x, c)
-    if first == TERMS:
-        return np.inf
-    if c[first] > 0.0:
-        return 0.0
-    # Leading zeros are divided out: the guard starts at zero and moves away.
-    power = 1.0
-    for k in range(TERMS - first):
-        c[k] = c[k + first] * power
-        power *= length
-    for k in range(TERMS - first, TERMS):
-        c[k] = 0.0
-    return _search_unit(t, scratch) * length
-
-
-@inlined
-def _search_unit(t: Tables, scratch: Scratch) -> float:
-    c, b = scratch.series, scratch.rows
-    product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
-    for piece in range(PIECES):
-        at = 3 * piece
-        if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
-            root = first_positive(c, piece / PIECES, (piece + 1) / PIECES, scratch.starts, scratch.ends)
-            if root < np.inf:
-                return root
-    return np.inf
+def grown(record: Record) -> Record:
+    """A copy with twice the room."""
+    larger = new_record(record.state.shape[1], 2 * len(record.step), 2 * len(record.event_step))
+    for old, new in zip(record, larger, strict=True):
+        new[: len(old)] = old
+    return larger
 
 
 @inlined

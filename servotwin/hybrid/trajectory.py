@@ -11,22 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.compiled import bare
-from servotwin.hybrid.kernel import (
-    CHANGES_AT_ONCE,
-    EVENTS_PER_STEP,
-    FULL,
-    ZENO,
-    Record,
-    Scratch,
-    advance,
-    advance_fraction,
-    follow_schedule,
-)
-from servotwin.hybrid.polynomial import DEPTH
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, TERMS, Tables, build_tables, search_step
+from servotwin.hybrid.flow import new_scratch
+from servotwin.hybrid.kernel import FULL, ZENO, Record, follow_schedule, grown, new_record
+from servotwin.hybrid.output import evaluate, output_table, sample_segments
+from servotwin.hybrid.tables import Tables, build_tables, search_step
 
-_BLOCK = NODES_COARSE * NODES_FINE
 # Jumps this close to a search step, in steps, are taken on it.
 ON_GRID = 1e-9
 
@@ -82,7 +71,7 @@ class Trajectory:
         self.step, self.divisor = step / self.refine, divisor * self.refine
         self.tables = tables_for(self.automaton, self.step)
         self.state = np.array(self.state, dtype=float)
-        self.record = new_record(len(self.state), 4 * EVENTS_PER_STEP, 4 * EVENTS_PER_STEP)
+        self.record = new_record(len(self.state))
         self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
         self._at = np.array([0, self.mode, 0, 1], dtype=np.int64)
@@ -228,129 +217,3 @@ def schedule_of(
         if jump.mode_map is not None:
             modes[j] = jump.mode_map
     return steps, np.where(near, 0.0, times - np.floor(times)), values, modes
-
-
-def new_record(n: int, segments: int, events: int) -> Record:
-    """An empty record with room for so many segments and events."""
-    return Record(
-        np.zeros(2, dtype=np.int64),
-        np.empty(segments, dtype=np.int64),
-        np.empty(segments),
-        np.empty(segments, dtype=np.int64),
-        np.empty((segments, n)),
-        np.empty(events, dtype=np.int64),
-        np.empty(events),
-        np.empty(events, dtype=np.int64),
-        np.empty(events, dtype=np.int64),
-        np.empty(events, dtype=bool),
-    )
-
-
-def grown(record: Record) -> Record:
-    """A copy with twice the room."""
-    larger = new_record(record.state.shape[1], 2 * len(record.step), 2 * len(record.event_step))
-    for old, new in zip(record, larger, strict=True):
-        new[: len(old)] = old
-    return larger
-
-
-def new_scratch(tables: Tables) -> Scratch:
-    """Working memory for one run."""
-    n = tables.states
-    rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
-    sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
-    return Scratch(*(np.zeros(size) for size in sizes))
-
-
-def output_table(tables: Tables, rows: Array) -> Array:
-    """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat ``(M, n, 128)``."""
-    n, modes = tables.states, len(tables.guard_count)
-    # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
-    fine = tables.jump_fine.reshape(modes, NODES_FINE, n, n)
-    coarse = tables.jump_coarse.reshape(modes, NODES_COARSE, n, n)
-    eights = rows[:, None] + np.einsum("mjki,mi->mjk", coarse[:, :-1], rows)
-    starts = np.concatenate([rows[:, None], eights], axis=1)
-    ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
-    table = np.concatenate([starts[:, :, None], ones], axis=2).reshape(modes, _BLOCK, n)
-    return np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
-
-
-@bare
-def sample_segments(
-    begin: int,
-    size: int,
-    step: NDArray[np.int64],
-    fraction: Array,
-    mode: NDArray[np.int64],
-    state: Array,
-    table: Array,
-    stride: int,
-    first: int,
-    out: Array,
-) -> None:
-    """Write the output at samples `first` on, one every `stride` search steps, from the segments that start on the
-    grid."""
-    n, last = state.shape[1], first + len(out)
-    block = np.uint64(_BLOCK)
-    for s in range(begin, size):
-        if fraction[s] > 0.0:
-            continue
-        end = step[s] + 1
-        if s + 1 < size:
-            end = step[s + 1] + (1 if fraction[s + 1] > 0.0 else 0)
-        low, high = max(first, -(-step[s] // stride)), min(last, -(-end // stride))
-        if high <= low:
-            if low >= last:
-                break
-            continue
-        at = np.uint64(mode[s] * n * _BLOCK + low * stride - step[s])
-        length, base = np.uint64(high - low), np.uint64(low - first)
-        for j in range(length):
-            out[base + j] = 0.0
-        if stride == 1:
-            for i in range(n):
-                factor = state[s, i]
-                for j in range(length):
-                    out[base + j] += table[at + j] * factor
-                at += block
-        else:
-            every = np.uint64(stride)
-            for i in range(n):
-                for j in range(length):
-                    out[base + j] += table[at + j * every] * state[s, i]
-                at += block
-
-
-@bare
-def evaluate(
-    t: Tables,
-    segments: NDArray[np.int64],
-    offsets: Array,
-    mode: NDArray[np.int64],
-    state: Array,
-    rows: Array,
-    out: Array,
-    x: Array,
-    scratch: Scratch,
-) -> None:
-    """Dense output: advance each segment's start by an offset in steps and apply the row of its mode."""
-    n2 = t.states * t.states
-    for k in range(len(segments)):
-        m = mode[segments[k]]
-        for i in range(t.states):
-            x[i] = state[segments[k], i]
-        whole = int(offsets[k])
-        eights, ones = min(whole // NODES_FINE, NODES_COARSE), 0
-        ones = min(whole - eights * NODES_FINE, NODES_FINE)
-        if eights > 0:
-            advance(t.jump_coarse, (m * NODES_COARSE + eights - 1) * n2, x, scratch.change)
-        if ones > 0:
-            advance(t.jump_fine, (m * NODES_FINE + ones - 1) * n2, x, scratch.change)
-        advance_fraction(t, m, x, offsets[k] - whole, scratch)
-        total = 0.0
-        for i in range(t.states):
-            total += rows[m, i] * x[i]
-        out[k] = total
-
-
-__all__ = ["CHANGES_AT_ONCE", "Jump", "Trajectory", "ZenoError"]

@@ -1,0 +1,90 @@
+"""Where one guard becomes positive within one search step: its Taylor polynomial and the first root of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import inlined
+from servotwin.hybrid.flow import Scratch, product
+from servotwin.hybrid.polynomial import first_positive
+from servotwin.hybrid.tables import PIECES, TERMS, Tables
+
+# A guard value or derivative below this part of its own terms is rounding, hence zero.
+SIGNIFICANT = 1e-13
+
+
+@inlined
+def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
+    """The part of a guard's Taylor coefficients (in steps) that is rounding: of all the terms that ever enter them."""
+    size = 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
+    for i in range(np.uint64(t.states)):
+        size += t.sizes[base + i] * abs(x[i])
+    return SIGNIFICANT * size
+
+
+@inlined
+def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
+    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
+    rounding."""
+    product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
+    limit = rounding(t, mode, guard, x)
+    for order in range(TERMS):
+        if abs(c[order]) > limit:
+            return order
+    return TERMS
+
+
+@inlined
+def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
+    """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
+    value = 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
+    for i in range(np.uint64(t.states)):
+        value += t.rows[base + i] * x[i]
+    if abs(value) > rounding(t, mode, guard, x):
+        return value > 0.0
+    first = series(t, mode, guard, x, c)
+    return first < TERMS and c[first] > 0.0
+
+
+@inlined
+def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
+    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
+    not."""
+    value, change = 0.0, 0.0
+    base = np.uint64((mode * t.guards + guard) * t.states)
+    for i in range(np.uint64(t.states)):
+        value += t.rows[base + i] * x[i]
+        change += t.changes[base + i] * abs(x[i])
+    if value + change < 0.0:
+        # Not even with every term of the series at its worst.
+        return np.inf
+    c = scratch.series
+    first = series(t, mode, guard, x, c)
+    if first == TERMS:
+        return np.inf
+    if c[first] > 0.0:
+        return 0.0
+    # Leading zeros are divided out: the guard starts at zero and moves away.
+    power = 1.0
+    for k in range(TERMS - first):
+        c[k] = c[k + first] * power
+        power *= length
+    for k in range(TERMS - first, TERMS):
+        c[k] = 0.0
+    return _search_unit(t, scratch) * length
+
+
+@inlined
+def _search_unit(t: Tables, scratch: Scratch) -> float:
+    c, b = scratch.series, scratch.rows
+    product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
+    for piece in range(PIECES):
+        at = 3 * piece
+        if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
+            root = first_positive(c, piece / PIECES, (piece + 1) / PIECES, scratch.starts, scratch.ends)
+            if root < np.inf:
+                return root
+    return np.inf

@@ -1,0 +1,120 @@
+"""Advancing a state by tables of ``exp(A t) - I``: whole steps, blocks of them, and parts of one."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import inlined
+from servotwin.hybrid.polynomial import DEPTH
+from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, Tables
+
+
+class Scratch(NamedTuple):
+    """Working memory of one run."""
+
+    rows: Array
+    series: Array
+    change: Array
+    terms: Array
+    starts: Array
+    ends: Array
+
+
+def new_scratch(tables: Tables) -> Scratch:
+    """Working memory for one run."""
+    n = tables.states
+    rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
+    sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
+    return Scratch(*(np.zeros(size) for size in sizes))
+
+
+@inlined
+def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
+    """``out[r] = sum of table[base + j * stride + r] * x[j]``: four columns at a time, so that `out` is stored less
+    often."""
+    count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
+    at: Any = np.uint64(base)
+    fours = n // np.uint64(4)
+    for r in range(count):
+        out[r] = 0.0
+    for block in range(fours):
+        j = block * np.uint64(4)
+        x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
+        b = at + step
+        c = b + step
+        d = c + step
+        for r in range(count):
+            out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
+        at = d + step
+    for rest in range(fours * np.uint64(4), n):
+        factor = x[rest]
+        for r in range(count):
+            out[r] += table[at + r] * factor
+        at += step
+
+
+@inlined
+def advance(table: Array, base: int, x: Array, change: Array) -> None:
+    """``x += P @ x`` with the transposed ``(n, n)`` matrix at `base`."""
+    product(table, base, x.size, x.size, x, change)
+    for i in range(np.uint64(x.size)):
+        x[i] += change[i]
+
+
+@inlined
+def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
+    """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
+    n = np.uint64(t.states)
+    n2 = t.states * t.states
+    part = min(int(fraction * PARTS), PARTS - 1)
+    rest = fraction * PARTS - part
+    if part > 0:
+        advance(t.jump_part, (mode * PARTS + part) * n2, x, scratch.change)
+    terms = scratch.terms
+    product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
+    at = np.uint64(PART_TERMS * t.states)
+    change = scratch.change
+    for i in range(n):
+        change[i] = 0.0
+    for _ in range(PART_TERMS):
+        at -= n
+        for i in range(n):
+            change[i] = (change[i] + terms[at + i]) * rest
+    for i in range(n):
+        x[i] += change[i]
+
+
+@inlined
+def advance_clean(
+    t: Tables, table: Array, jumps: Array, nodes: int, wanted: int, mode: int, x: Array, scratch: Scratch
+) -> int:
+    """Advance through the first intervals of a block, at most `wanted`, in which no guard may become positive.
+
+    `table` and `jumps` are those of one scale; returns the number of intervals advanced.
+    """
+    out, guards = scratch.rows, t.guard_count[mode]
+    rows = 3 * nodes + 1
+    product(table, mode * t.states * t.guards * rows, t.guards * rows, guards * rows, x, out)
+    positive = 0
+    for r in range(np.uint64(guards * rows)):
+        positive += out[r] > 0.0
+    clean = wanted if positive == 0 else clean_intervals(out, guards, rows, wanted)
+    if clean > 0:
+        advance(jumps, (mode * nodes + clean - 1) * t.states * t.states, x, scratch.change)
+    return clean
+
+
+@inlined
+def clean_intervals(out: Array, guards: int, rows: int, wanted: int) -> int:
+    """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
+    clean = wanted
+    for g in range(guards):
+        for k in range(clean):
+            at = g * rows + 3 * k
+            if max(out[at], out[at + 1], out[at + 2], out[at + 3]) > 0.0:
+                clean = k
+                break
+    return clean

@@ -1,0 +1,104 @@
+"""Outputs of a recorded run: at every sample of a grid, or at any time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.flow import Scratch, advance, advance_fraction
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
+
+_BLOCK = NODES_COARSE * NODES_FINE
+
+
+def output_table(tables: Tables, rows: Array) -> Array:
+    """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat ``(M, n, 128)``."""
+    n, modes = tables.states, len(tables.guard_count)
+    # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
+    fine = tables.jump_fine.reshape(modes, NODES_FINE, n, n)
+    coarse = tables.jump_coarse.reshape(modes, NODES_COARSE, n, n)
+    eights = rows[:, None] + np.einsum("mjki,mi->mjk", coarse[:, :-1], rows)
+    starts = np.concatenate([rows[:, None], eights], axis=1)
+    ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
+    table = np.concatenate([starts[:, :, None], ones], axis=2).reshape(modes, _BLOCK, n)
+    return np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
+
+
+@bare
+def sample_segments(
+    begin: int,
+    size: int,
+    step: NDArray[np.int64],
+    fraction: Array,
+    mode: NDArray[np.int64],
+    state: Array,
+    table: Array,
+    stride: int,
+    first: int,
+    out: Array,
+) -> None:
+    """Write the output at samples `first` on, one every `stride` search steps, from the segments that start on the
+    grid."""
+    n, last = state.shape[1], first + len(out)
+    block = np.uint64(_BLOCK)
+    for s in range(begin, size):
+        if fraction[s] > 0.0:
+            continue
+        end = step[s] + 1
+        if s + 1 < size:
+            end = step[s + 1] + (1 if fraction[s + 1] > 0.0 else 0)
+        low, high = max(first, -(-step[s] // stride)), min(last, -(-end // stride))
+        if high <= low:
+            if low >= last:
+                break
+            continue
+        at = np.uint64(mode[s] * n * _BLOCK + low * stride - step[s])
+        length, base = np.uint64(high - low), np.uint64(low - first)
+        for j in range(length):
+            out[base + j] = 0.0
+        if stride == 1:
+            for i in range(n):
+                factor = state[s, i]
+                for j in range(length):
+                    out[base + j] += table[at + j] * factor
+                at += block
+        else:
+            every = np.uint64(stride)
+            for i in range(n):
+                for j in range(length):
+                    out[base + j] += table[at + j * every] * state[s, i]
+                at += block
+
+
+@bare
+def evaluate(
+    t: Tables,
+    segments: NDArray[np.int64],
+    offsets: Array,
+    mode: NDArray[np.int64],
+    state: Array,
+    rows: Array,
+    out: Array,
+    x: Array,
+    scratch: Scratch,
+) -> None:
+    """Dense output: advance each segment's start by an offset in steps and apply the row of its mode."""
+    n2 = t.states * t.states
+    for k in range(len(segments)):
+        m = mode[segments[k]]
+        for i in range(t.states):
+            x[i] = state[segments[k], i]
+        whole = int(offsets[k])
+        eights, ones = min(whole // NODES_FINE, NODES_COARSE), 0
+        ones = min(whole - eights * NODES_FINE, NODES_FINE)
+        if eights > 0:
+            advance(t.jump_coarse, (m * NODES_COARSE + eights - 1) * n2, x, scratch.change)
+        if ones > 0:
+            advance(t.jump_fine, (m * NODES_FINE + ones - 1) * n2, x, scratch.change)
+        advance_fraction(t, m, x, offsets[k] - whole, scratch)
+        total = 0.0
+        for i in range(t.states):
+            total += rows[m, i] * x[i]
+        out[k] = total

@@ -1,0 +1,139 @@
+"""The compiled half of the sampled loop: measure, tick, record, flow."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.control import law
+from servotwin.control.law import LawParameters, LawState
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.flow import Scratch
+from servotwin.hybrid.kernel import DONE, FULL, ZENO, Record, step_once
+from servotwin.hybrid.tables import Tables
+
+tick = verbatim(law.tick)
+
+
+class Port(NamedTuple):
+    """Where the sampled loop reads and writes the plant's state, and how its steps divide."""
+
+    voltage: int
+    position: int
+    resolution: float
+    recorded: NDArray[np.int64]  # states written at every recorded step
+    tick_every: int
+    record_every: int
+    searches: int  # search steps per base step
+    room: int  # events after which the record counts as full
+
+
+class Drive(NamedTuple):
+    """What the tick is given, from tick `first` on."""
+
+    first: int
+    reference: Array
+    noise: Array
+    enter: Array
+    leave: Array
+
+
+class Output(NamedTuple):
+    """What is recorded, by absolute index."""
+
+    states: Array  # (recorded, samples)
+    measured: Array  # (ticks,)
+    active: NDArray[np.int8]  # (ticks,)
+
+
+@inlined
+def take_tick(
+    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+) -> LawState:
+    """Measure, tick, hold the voltage."""
+    k = i - drive.first
+    y = x[port.position] + drive.noise[k]
+    if port.resolution > 0.0:
+        y = np.round(y / port.resolution) * port.resolution
+    now = LawParameters(
+        parameters.Kp,
+        parameters.integral_step,
+        parameters.derivative_gain,
+        parameters.filter_step,
+        drive.enter[k],
+        drive.leave[k],
+        parameters.voltage_limit,
+        parameters.rate_step,
+        parameters.loop_step,
+        parameters.tracking_step,
+    )
+    state = tick(now, state, drive.reference[k], y)
+    x[port.voltage] = state.voltage
+    output.measured[i] = y
+    output.active[i] = 1 if state.active > 0.5 else 0
+    return state
+
+
+@inlined
+def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
+    """Record the states of one sample."""
+    for j in range(len(port.recorded)):
+        output.states[j, row] = x[port.recorded[j]]
+
+
+@bare
+def tick_and_record(
+    base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+) -> LawState:
+    """What happens at a base step before the plant flows on."""
+    if base % port.tick_every == 0:
+        state = take_tick(base // port.tick_every, x, parameters, state, port, drive, output)
+    if base % port.record_every == 0:
+        write_sample(base // port.record_every, x, port, output)
+    return state
+
+
+@bare
+def run_ticks(
+    t: Tables,
+    x: Array,
+    base: int,
+    end: int,
+    mode: int,
+    parameters: LawParameters,
+    state: LawState,
+    port: Port,
+    drive: Drive,
+    output: Output,
+    record: Record,
+    scratch: Scratch,
+) -> tuple[int, int, int, LawState]:
+    """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when
+    `record` is full."""
+    i, row = (base - 1) // port.tick_every + 1, (base - 1) // port.record_every + 1
+    to_tick, to_record = i * port.tick_every - base, row * port.record_every - base
+    search = base * port.searches
+    while base < end:
+        if record.size[1] > port.room:
+            return FULL, base, mode, state
+        if to_tick == 0:
+            state = take_tick(i, x, parameters, state, port, drive, output)
+            to_tick = port.tick_every
+            i += 1
+        if to_record == 0:
+            write_sample(row, x, port, output)
+            to_record = port.record_every
+            row += 1
+        for _ in range(port.searches):
+            mode = step_once(t, mode, x, search, record, scratch)
+            search += 1
+            record.size[0] = 0
+            if mode < 0:
+                return ZENO, base, mode, state
+        base += 1
+        to_tick -= 1
+        to_record -= 1
+    return DONE, base, mode, state
