@@ -54,7 +54,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    _wanted: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
+    version: Annotated[bool, typer.Option(callback=_version, is_eager=True, help="Show the version.")] = False,
 ) -> None:
     """Options of every command."""
 
@@ -72,7 +72,7 @@ def demo(
 
 @app.command()
 def reproduce(
-    only: Annotated[list[str] | None, typer.Option(help="Only these figures or claims, such as fig12 or crossover.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help="Only these figures and claims: fig12, crossover ...")] = None,
     out: Annotated[Path, typer.Option(help="Where figures, claims.json and report.html go.")] = Path("reproduction"),
     preset: Annotated[str, typer.Option(help="The preset of the figures; claims are measured in all three.")] = "paper",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,

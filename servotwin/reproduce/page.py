@@ -26,7 +26,7 @@ def image(vector: bytes, text: str) -> str:
 def figure(vector: bytes, title: str, caption: str) -> str:
     """An image with its title and caption."""
     text = f"<strong>{escape(title)}</strong> {escape(caption)}"
-    return f"<figure>{image(vector, title)}<figcaption>{text}</figcaption></figure>"
+    return f"<figure><div class='scroll'>{image(vector, title)}</div><figcaption>{text}</figcaption></figure>"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = False) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from servotwin.control.controller import Controller
@@ -100,7 +102,7 @@ def pd_bandwidth(runs: Runs) -> Finding:
     first = runs.servo.margins(without_integral(runs.servo)).gain_crossovers[0].omega
     laws = pd_family(runs.servo)
     stable = [law for law in laws if runs.servo.closed_loop(law).is_stable()]
-    best, law = max(((pd_margin_deg(runs.servo, law), law) for law in stable), key=lambda pair: pair[0])
+    best, law = best_pd(runs.servo, stable)
     why = (
         f"the printed Kp, Kd and Tf alone cross over at {first:.4g} rad/s; but of {len(laws)} filtered PDs scaled to 10"
         f" rad/s {len(stable)} are stable, the best with {best:.3g} deg (Kp = {law.Kp:.5g}, Kd = {law.Kd:.5g},"
@@ -109,6 +111,11 @@ def pd_bandwidth(runs: Runs) -> Finding:
     values = (("crossover of the printed PD", first, "rad/s"), ("best margin of a PD at 10 rad/s", best, "deg"))
     counts = (("filtered PDs tried", len(laws)), ("of them stable", len(stable)))
     return decided(best < MARGIN_DEG, why, *values, *counts)
+
+
+def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller]:
+    """The largest margin (deg) among stabilising controllers, and whose it is."""
+    return max(((pd_margin_deg(servo, law), law) for law in laws), key=lambda pair: pair[0])
 
 
 def pd_family(servo: Servo) -> list[Controller]:
