@@ -6,22 +6,12 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined
-from servotwin.hybrid.flow import Scratch, product
+from servotwin.hybrid.flow import Scratch, dot, dot_sizes, product
 from servotwin.hybrid.polynomial import first_positive
 from servotwin.hybrid.tables import PIECES, TERMS, Tables
 
-# A guard value or derivative below this part of its own terms is rounding, hence zero.
+# A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero.
 SIGNIFICANT = 1e-13
-
-
-@inlined
-def rounding(t: Tables, mode: int, guard: int, x: Array) -> float:
-    """The part of a guard's Taylor coefficients (in steps) that is rounding: of all the terms that ever enter them."""
-    size = 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        size += t.sizes[base + i] * abs(x[i])
-    return SIGNIFICANT * size
 
 
 @inlined
@@ -29,7 +19,7 @@ def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
     """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
     rounding."""
     product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
-    limit = rounding(t, mode, guard, x)
+    limit = SIGNIFICANT * dot_sizes(t.sizes, (mode * t.guards + guard) * t.states, x)
     for order in range(TERMS):
         if abs(c[order]) > limit:
             return order
@@ -39,11 +29,9 @@ def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
 @inlined
 def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
     """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
-    value = 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        value += t.rows[base + i] * x[i]
-    if abs(value) > rounding(t, mode, guard, x):
+    base = (mode * t.guards + guard) * t.states
+    value = dot(t.rows, base, x)
+    if abs(value) > SIGNIFICANT * dot_sizes(t.sizes, base, x):
         return value > 0.0
     first = series(t, mode, guard, x, c)
     return first < TERMS and c[first] > 0.0
@@ -53,12 +41,8 @@ def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
 def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
     not."""
-    value, change = 0.0, 0.0
-    base = np.uint64((mode * t.guards + guard) * t.states)
-    for i in range(np.uint64(t.states)):
-        value += t.rows[base + i] * x[i]
-        change += t.changes[base + i] * abs(x[i])
-    if value + change < 0.0:
+    base = (mode * t.guards + guard) * t.states
+    if dot(t.rows, base, x) + dot_sizes(t.changes, base, x) < 0.0:
         # Not even with every term of the series at its worst.
         return np.inf
     c = scratch.series

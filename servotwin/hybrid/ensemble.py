@@ -92,7 +92,7 @@ def run_ensemble(
         raise InvalidInput(f"{starts.shape} states for {len(first_modes)} modes of {len(automaton.names)} states each")
     step, divisor = search_step(automaton, sample_step)
     tables = tables_for(automaton, step)
-    table = output_table(tables, np.ascontiguousarray(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float))
+    table = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
     out, events = np.empty((len(starts), samples)), np.zeros(len(starts), dtype=np.int64)
     workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
     # Neighbours cost alike, so each worker takes every `workers`-th member.

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import inlined
+from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
-from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, Tables
+from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, padded
 
 
 class Scratch(NamedTuple):
@@ -26,7 +26,7 @@ class Scratch(NamedTuple):
 def new_scratch(tables: Tables) -> Scratch:
     """Working memory for one run."""
     n = tables.states
-    rows = max(tables.guards * (3 * NODES_COARSE + 1), n + 4 * tables.guards)
+    rows = max(padded(tables.guards * (3 * NODES_COARSE + 1)), n + 4 * tables.guards)
     sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
     return Scratch(*(np.zeros(size) for size in sizes))
 
@@ -54,6 +54,24 @@ def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arra
         for r in range(count):
             out[r] += table[at + r] * factor
         at += step
+
+
+@summed
+def dot(table: Array, base: int, x: Array) -> float:
+    """``sum of table[base + j] * x[j]``."""
+    total, at = 0.0, np.uint64(base)
+    for j in range(np.uint64(x.size)):
+        total += table[at + j] * x[j]
+    return total
+
+
+@summed
+def dot_sizes(table: Array, base: int, x: Array) -> float:
+    """``sum of table[base + j] * abs(x[j])``."""
+    total, at = 0.0, np.uint64(base)
+    for j in range(np.uint64(x.size)):
+        total += table[at + j] * abs(x[j])
+    return total
 
 
 @inlined
@@ -97,7 +115,9 @@ def advance_clean(
     """
     out, guards = scratch.rows, t.guard_count[mode]
     rows = 3 * nodes + 1
-    product(table, mode * t.states * t.guards * rows, t.guards * rows, guards * rows, x, out)
+    stride = (t.guards * rows + VECTOR - 1) // VECTOR * VECTOR
+    used = (guards * rows + VECTOR - 1) // VECTOR * VECTOR
+    product(table, mode * t.states * stride, stride, used, x, out)
     positive = 0
     for r in range(np.uint64(guards * rows)):
         positive += out[r] > 0.0

@@ -7,14 +7,15 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare
-from servotwin.hybrid.flow import Scratch, advance, advance_fraction
+from servotwin.hybrid.flow import Scratch, advance, advance_fraction, dot, product
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
 
 _BLOCK = NODES_COARSE * NODES_FINE
 
 
-def output_table(tables: Tables, rows: Array) -> Array:
-    """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat ``(M, n, 128)``."""
+def output_table(tables: Tables, rows: Array, stride: int) -> Array:
+    """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)`` for a
+    few."""
     n, modes = tables.states, len(tables.guard_count)
     # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
     fine = tables.jump_fine.reshape(modes, NODES_FINE, n, n)
@@ -23,7 +24,7 @@ def output_table(tables: Tables, rows: Array) -> Array:
     starts = np.concatenate([rows[:, None], eights], axis=1)
     ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
     table = np.concatenate([starts[:, :, None], ones], axis=2).reshape(modes, _BLOCK, n)
-    return np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
+    return table.ravel() if stride > 1 else np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
 
 
 @bare
@@ -42,7 +43,6 @@ def sample_segments(
     """Write the output at samples `first` on, one every `stride` search steps, from the segments that start on the
     grid."""
     n, last = state.shape[1], first + len(out)
-    block = np.uint64(_BLOCK)
     for s in range(begin, size):
         if fraction[s] > 0.0:
             continue
@@ -54,22 +54,12 @@ def sample_segments(
             if low >= last:
                 break
             continue
-        at = np.uint64(mode[s] * n * _BLOCK + low * stride - step[s])
-        length, base = np.uint64(high - low), np.uint64(low - first)
-        for j in range(length):
-            out[base + j] = 0.0
+        at, offset = mode[s] * n * _BLOCK, low * stride - step[s]
         if stride == 1:
-            for i in range(n):
-                factor = state[s, i]
-                for j in range(length):
-                    out[base + j] += table[at + j] * factor
-                at += block
+            product(table, at + offset, _BLOCK, high - low, state[s], out[low - first : high - first])
         else:
-            every = np.uint64(stride)
-            for i in range(n):
-                for j in range(length):
-                    out[base + j] += table[at + j * every] * state[s, i]
-                at += block
+            for sample in range(low, high):
+                out[sample - first] = dot(table, at + (sample * stride - step[s]) * n, state[s])
 
 
 @bare

@@ -20,6 +20,8 @@ NODES_COARSE = 16
 NODES_FINE = 8
 PARTS = 32
 PIECES = 5
+# Doubles in two of the widest vectors.
+VECTOR = 16
 # |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 32)**9 / 9! = 4e-17.
 TERMS = 24
 PART_TERMS = 8
@@ -38,8 +40,8 @@ class Tables(NamedTuple):
     target: NDArray[np.int64]  # (M, G)
     has_reset: NDArray[np.bool_]  # (M, G)
     reset: Array  # M * G * n * n, transposed: reset - I
-    coarse: Array  # M * n * (G * 49): Bernstein rows over 16 intervals of 8 steps
-    fine: Array  # M * n * (G * 25): the same over 8 intervals of one step
+    coarse: Array  # M * n * padded(G * 49): Bernstein rows over 16 intervals of 8 steps
+    fine: Array  # M * n * padded(G * 25): the same over 8 intervals of one step
     taylor: Array  # M * G * n * TERMS
     jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # M * 8 * n * n, transposed
@@ -53,8 +55,8 @@ class Tables(NamedTuple):
 
 
 def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
-    """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and none whose motion lasts
-    by more than a quarter, and k."""
+    """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and none whose motion
+    lasts by more than a quarter, and k."""
     turns = max(automaton.fastest / SPECTRAL_STEP, automaton.fastest_lasting / LASTING_STEP) * sample_step
     divisor = max(1, int(np.ceil(turns - 0.05)))
     return sample_step / divisor, divisor
@@ -75,7 +77,7 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
             if guard.reset is not None:
                 has_reset[m, g], reset[m, g] = True, (np.asarray(guard.reset) - np.eye(n)).T
     parts = zip(*(_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))), strict=True)
-    flat = [np.ascontiguousarray(np.array(part, dtype=float)).ravel() for part in parts]
+    flat = [_aligned(np.array(part, dtype=float).ravel()) for part in parts]
     coarse, fine, taylor, jump_coarse, jump_fine, jump_part, flow_part, single = flat
     orders = np.abs(taylor.reshape(len(modes), guards, n, TERMS))
     return Tables(
@@ -115,7 +117,7 @@ def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
         fine.transpose(0, 2, 1),
         part.transpose(0, 2, 1),
         taylor_rows(np.eye(len(flow)), flow, step / PARTS, PART_TERMS + 1)[1:].reshape(-1, len(flow)).T,
-        np.hstack([unit.T, _bernstein_rows(rows, slopes * step, fine[:1])]),
+        np.hstack([unit.T, _bernstein_rows(rows, slopes * step, fine[:1])[:, : 4 * len(rows)]]),
     )
 
 
@@ -132,7 +134,27 @@ def _bernstein_rows(rows: Array, slopes: Array, deviations: Long) -> Long:
             values[:, 3 * node + 1] = value + third
         if node:
             values[:, 3 * node - 1] = value - third
-    return np.ascontiguousarray(values.reshape(-1, rows.shape[1]).T)
+    return _padded(values.reshape(-1, rows.shape[1]).T)
+
+
+def padded(rows: int) -> int:
+    """Columns of a table of `rows` rows: products over whole vectors of the machine have no remainder."""
+    return -(-rows // VECTOR) * VECTOR
+
+
+def _padded(table: Long) -> Long:
+    result = np.zeros((len(table), padded(table.shape[1])), dtype=np.longdouble)
+    result[:, : table.shape[1]] = table
+    return result
+
+
+def _aligned(flat: Array) -> Array:
+    """A copy that starts on a cache line, so that no vector spans two."""
+    room = np.empty(len(flat) + 8)
+    start = -(room.ctypes.data // 8) % 8
+    result = room[start : start + len(flat)]
+    result[:] = flat
+    return result
 
 
 def _bernstein_of_taylor() -> Array:

@@ -184,7 +184,7 @@ class Trajectory:
         full = np.ascontiguousarray(np.broadcast_to(rows, (len(self.automaton.modes), len(self.state))), dtype=float)
         key = full.tobytes()
         if key not in self._rows:
-            self._rows[key] = output_table(self.tables, full)
+            self._rows[key] = output_table(self.tables, full, self.divisor)
         return self._rows[key]
 
     @cached_property

@@ -126,7 +126,8 @@ class _Basis:
     """Names of the states, and unit rows by name."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
-        self.names = names
+        # Spare states that never move: the kernel's products run over whole vectors of the machine.
+        self.names = (*names, *(f"spare{i}" for i in range(-len(names) % 4)))
 
     def __getitem__(self, name: str) -> int:
         return self.names.index(name)
