@@ -164,3 +164,12 @@ def test_signals_are_values() -> None:
 def test_bad_input(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InvalidInput, match=message):
         make()
+
+
+@given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=4, unique=True), st.integers(0, 40), st.floats(-2.0, 6.0))
+def test_values_on_increasing_times_are_the_values(knots: list[float], count: int, first: float) -> None:
+    knots = sorted(knots)
+    knots[0] = -abs(knots[0])
+    pieces = PiecewiseCubic(knots, [[k, 0.0, 0.5 * (k > 1.0), 0.0] for k in knots])
+    times = first + 0.1 * np.arange(count)
+    assert np.array_equal(pieces.on(times), pieces.value(times))

@@ -84,6 +84,16 @@ class PiecewiseCubic:
         c = self.coeffs[piece]
         return np.asarray(((c[..., 3] * elapsed + c[..., 2]) * elapsed + c[..., 1]) * elapsed + c[..., 0])
 
+    def on(self, times: Array) -> Array:
+        """`value` at increasing times ``(n,)``, piece by piece: quicker where there are many times in few pieces."""
+        result = np.empty(times.size)
+        bounds = np.concatenate([[0], np.searchsorted(times, self.times[1:], side="left"), [times.size]])
+        for piece in np.flatnonzero(np.diff(bounds)):
+            part = slice(bounds[piece], bounds[piece + 1])
+            varies = bool(np.any(self.coeffs[piece, 1:]))
+            result[part] = self.value(times[part]) if varies else self.coeffs[piece, 0]
+        return result
+
     @property
     def jumps(self) -> Array:
         """(K,) times at which the value is discontinuous (rounding of the cubic's end value does not count)."""

@@ -109,18 +109,18 @@ class Run:
     @property
     def reference(self) -> Array:
         """Wanted position, m."""
-        return self._get("reference", lambda: self.inputs.reference.value(self.time))
+        return self._get("reference", lambda: self.inputs.reference.on(self.time))
 
     @property
     def gap(self) -> Array:
         """Total gap, rad."""
-        return self._get("gap", lambda: self.inputs.gap.value(self.time))
+        return self._get("gap", lambda: self.inputs.gap.on(self.time))
 
     @property
     def tolerance(self) -> Array:
         """Half-width of the dead zone, m; zero without one."""
         pieces = self.inputs.tolerance
-        return self._get("tolerance", lambda: np.zeros(self.samples) if pieces is None else pieces.value(self.time))
+        return self._get("tolerance", lambda: np.zeros(self.samples) if pieces is None else pieces.on(self.time))
 
     @property
     def measured_position(self) -> Array:

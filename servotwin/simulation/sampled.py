@@ -123,12 +123,12 @@ class SampledEngine:
         if self.inputs.tolerance is None:
             enter = leave = np.full(count, -1.0)
         else:
-            tolerance = self.inputs.tolerance.value(times)
+            tolerance = self.inputs.tolerance.on(times)
             zero = tolerance == 0.0
             enter = np.where(zero, -1.0, self.controller.enter * tolerance)
             leave = np.where(zero, -1.0, self.controller.leave * tolerance)
         noise = np.zeros(count) if self.source is None else self.source.block(count)
-        return Drive(first, self.inputs.reference.value(times), noise, enter, leave)
+        return Drive(first, self.inputs.reference.on(times), noise, enter, leave)
 
     def _run(self, end: int) -> None:
         while self.base < end:

@@ -140,7 +140,7 @@ class Simulation:
                 f"samples {first} .. {last} are outside 0 .. {self.index + 1}, what was simulated so far"
             )
         if name == "reference":
-            return self.inputs.reference.value(self.inputs.times(first, last))
+            return self.inputs.reference.on(self.inputs.times(first, last))
         values = self.engine.channel("measured_position" if name == "position" else name, first, last)
         return quantised(values, self.servo.encoder_resolution) if name == "theta_m" else values
 
