@@ -10,7 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 import servotwin as st
@@ -83,19 +83,14 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
 
 def compare(scenario: st.Scenario, console: Console) -> Comparison:
     """The scenario with its twin switched off and on, under progress bars."""
-    columns = (
-        TextColumn("{task.description:<17}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    percent, note = TextColumn("{task.percentage:3.0f} %"), TextColumn("[dim]{task.fields[note]}")
+    with Progress(TextColumn("{task.description:<16}"), BarColumn(), percent, note, console=console) as progress:
 
-        def watched(name: str) -> Callable[[float], None]:
-            bar = progress.add_task(name, total=1.0)
-            return lambda share: progress.update(bar, completed=share)
+        def watched(name: str, note: str) -> Callable[[float], None]:
+            bar = progress.add_task(name, total=1.0, note=note)
+            return lambda share: progress.update(bar, completed=share, note="")
 
-        alone, twinned = watched("without the twin"), watched("with the twin")
+        alone, twinned = watched("without the twin", "the first run ever compiles"), watched("with the twin", "")
         off = scenario.replace(twin=scenario.twin.replace(enabled=False))
         return Comparison(scenario.servo, record(off, progress=alone), record(scenario, progress=twinned))
 

@@ -97,9 +97,10 @@ def select(only: Sequence[str]) -> Selection:
 
 
 def planned(selection: Selection, preset: str, directory: Path) -> list[Task[Outcome]]:
-    """Independent tasks, the long ones first."""
+    """Independent tasks, preset by preset and that of the figures last, so that neighbours can share runs."""
     groups = [tuple(group) for _, group in groupby(sorted(selection.claims, key=claims.group), key=claims.group)]
-    measuring = [ClaimsTask(each, group) for group in reversed(groups) for each in PRESETS]
+    presets = sorted(PRESETS, key=lambda each: each == preset)
+    measuring = [ClaimsTask(each, group) for each in presets for group in reversed(groups)]
     return [*measuring, *(FigureTask(preset, name, directory) for name in reversed(selection.figures))]
 
 

@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -24,9 +24,9 @@ class Task(Protocol[_R]):
     def run(self) -> _R: ...
 
 
-@cache
+@lru_cache(maxsize=1)
 def runs_of(preset: str) -> Runs:
-    """This process's runs of a preset: tasks that follow one another share them."""
+    """This process's runs of a preset: tasks of one preset that follow one another share them."""
     return Runs(preset)
 
 

@@ -24,7 +24,7 @@ def fig15(runs: Runs, square: Square = BIPOLAR, scenario: str = CONTINUOUS, exac
     return runs.get(LoopJob(runs.preset, scenario, square, exact=exact))
 
 
-@measures_both("restabilised-at-all-times")
+@measures_both("always-restabilised")
 def restabilised(runs: Runs, square: Square) -> Finding:
     """Every step settles."""
     found, sampled = (fig15(runs, square, scenario).trace.steps for scenario in (CONTINUOUS, SAMPLED))
