@@ -1,0 +1,67 @@
+"""What enters a residual linearly and is of no interest is projected out: no search over it, nothing discarded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servotwin.hybrid.compiled import bare
+from servotwin.plant.signals import Array
+
+_DEPENDENT = 1e-9  # of its length: a column of which less is left adds nothing but rounding
+
+
+def orthonormal(columns: Array, basis: Array | None = None) -> Array:
+    """(r, n) orthonormal rows that span, with those of `basis`, what the rows of `columns` (k, n) span.
+
+    Gram-Schmidt, each row twice; rows that depend on earlier ones are left out. `basis` (m, n) comes first in the
+    result and is not changed.
+    """
+    known = 0 if basis is None else len(basis)
+    rows = np.empty((known + len(columns), columns.shape[1]))
+    if basis is not None:
+        rows[:known] = basis
+    for column in columns:
+        if add_direction(rows, known, column, _DEPENDENT):
+            known += 1
+    return rows[:known]
+
+
+def project_out(basis: Array, columns: Array) -> Array:
+    """(k, n) what is left of the rows of `columns` (k, n) off the orthonormal rows of `basis` (r, n)."""
+    left = columns.copy()
+    for row in left:
+        remove(basis, len(basis), row)
+    return left
+
+
+@bare
+def add_direction(rows: Array, known: int, column: Array, dependent: float) -> bool:
+    """Put what is new in a column, normalised, into row `known`; False when nothing is."""
+    row = rows[known]
+    before = 0.0
+    for i in range(row.size):
+        row[i] = column[i]
+        before += column[i] * column[i]
+    remove(rows, known, row)
+    remove(rows, known, row)
+    after = 0.0
+    for i in range(row.size):
+        after += row[i] * row[i]
+    if not after > dependent * dependent * before:
+        return False
+    length = np.sqrt(after)
+    for i in range(row.size):
+        row[i] /= length
+    return True
+
+
+@bare
+def remove(rows: Array, known: int, column: Array) -> None:
+    """Take off a column (n,) its parts along the first `known` orthonormal rows, one after the other."""
+    for k in range(known):
+        row = rows[k]
+        share = 0.0
+        for i in range(column.size):
+            share += row[i] * column[i]
+        for i in range(column.size):
+            column[i] -= share * row[i]
