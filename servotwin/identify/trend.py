@@ -1,0 +1,324 @@
+"""How the gap grows from window to window: a Kalman filter on the gap, its wear rate and the encoder's offset.
+
+The state is frozen; `predict` and `update` return the next one. Between windows the rate performs a random walk and
+the gap integrates it (an integrated Wiener process), the offset performs a random walk of its own. Every window's
+estimate corrects the state with its `std_total`; the state gives the next window's prior.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import GapEstimate, GapStatus, Interval
+from servotwin.identify.passage import Passage, passage
+from servotwin.plant.signals import Array
+
+NORMAL_95 = 1.959963984540054
+GAP, RATE, OFFSET = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class TrendSettings:
+    """What is assumed of wear before anything was measured. `for_wear` derives all of it from two plain numbers.
+
+    Parameters
+    ----------
+    gap_std_rad, rate_std_rad_per_s, offset_std_rad : float
+        Spread, around zero, of the total gap, its rate and the encoder's offset before the first window.
+    gap_walk_rad_per_sqrt_s : float
+        Random walk of the gap itself, on top of its rate.
+    rate_walk_rad_per_s_per_sqrt_s : float
+        Random walk of the rate: how fast wear may change its pace.
+    offset_walk_rad_per_sqrt_s : float
+    shared_error_rad : float
+        Error that all windows have in common (the model's), which no number of windows averages away; it widens the
+        stated gap, not its rate.
+    outlier_std : float
+        An estimate farther from the prediction than so many standard deviations is refused.
+    restart_after : int
+        So many refusals in a row mean that the machine has changed (a new or re-adjusted screw): the gap then starts
+        afresh from the last of them.
+
+    Raises
+    ------
+    InvalidInput
+        A value is negative or not finite, or `restart_after` is not a whole number of at least 1.
+    """
+
+    gap_std_rad: float = math.radians(60.0)
+    rate_std_rad_per_s: float = math.radians(0.2)
+    offset_std_rad: float = math.radians(60.0)
+    gap_walk_rad_per_sqrt_s: float = 0.0
+    rate_walk_rad_per_s_per_sqrt_s: float = math.radians(0.015)
+    offset_walk_rad_per_sqrt_s: float = 0.0
+    shared_error_rad: float = math.radians(0.02)
+    outlier_std: float = 6.0
+    restart_after: int = 3
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+                raise InvalidInput(f"trend {item.name} = {value!r}: must be a finite number of at least 0")
+        if not isinstance(self.restart_after, int) or self.restart_after < 1:
+            raise InvalidInput(f"trend restart_after = {self.restart_after!r}: must be a whole number of at least 1")
+
+    @classmethod
+    def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
+        """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a pace that may change meanwhile.
+
+        The rate begins with a spread of gap / over and wanders by as much within `over`.
+        """
+        if not (0.0 < gap < math.inf and 0.0 < over < math.inf):
+            raise InvalidInput(f"wear of {gap!r} rad over {over!r} s: both must be finite and greater than 0")
+        rate = gap / over
+        known = {"rate_std_rad_per_s": rate, "rate_walk_rad_per_s_per_sqrt_s": rate / math.sqrt(over)}
+        return cls(**{**known, **changes})  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class OffsetReading:
+    """The encoder's offset as one window shows it: value, standard deviation (rad), covariance with the gap (rad^2)."""
+
+    offset: float
+    std: float
+    covariance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before a window: mean and standard deviation of the gap and of the encoder's offset, rad."""
+
+    gap: float
+    gap_std: float
+    offset: float
+    offset_std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Gap, wear rate and encoder offset at a time, with their covariance.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    mean : (3,) array
+        Total gap (rad), wear rate (rad/s), offset of the encoder (rad).
+    covariance : (3, 3) array
+        Of `mean`, without the error that all windows share.
+    settings : TrendSettings
+    updates : int
+        Windows that counted.
+    refused : int
+        Outliers since the last window that counted.
+    reasons : tuple of str
+        Why the last window did not count, or counted otherwise than as a plain value.
+    """
+
+    time: float
+    mean: Array
+    covariance: Array
+    settings: TrendSettings
+    updates: int = 0
+    refused: int = 0
+    reasons: tuple[str, ...] = ()
+
+    @classmethod
+    def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:
+        """Before the first window: zero, as uncertain as the settings say."""
+        given = settings or TrendSettings()
+        spread = np.array([given.gap_std_rad, given.rate_std_rad_per_s, given.offset_std_rad])
+        return cls(_time(time), np.zeros(3), np.diag(spread**2), given)
+
+    def predict(self, time: float) -> Trend:
+        """The state at a later time, s.
+
+        Raises
+        ------
+        InvalidInput
+            The time is not finite or lies before the state's.
+        """
+        step = _time(time) - self.time
+        if step < 0.0:
+            raise InvalidInput(f"trend: time {time:.9g} s lies before {self.time:.9g} s; windows must come in order")
+        flow = transition(step)
+        covariance = flow @ self.covariance @ flow.T + process_noise(step, self.settings)
+        return replace(self, time=float(time), mean=flow @ self.mean, covariance=covariance, reasons=())
+
+    def update(self, estimate: GapEstimate, offset: OffsetReading | None = None) -> Trend:
+        """The state at the estimate's time, corrected by it.
+
+        Only an OK estimate counts as a value. A lower bound counts one-sidedly: it moves the state only as far as the
+        state lies below it. Others leave the prediction as it is, and say why.
+
+        Parameters
+        ----------
+        estimate : GapEstimate
+        offset : OffsetReading, optional
+            The encoder's offset from the same window.
+        """
+        ahead = self.predict(estimate.time)
+        if estimate.ok:
+            return ahead._corrected(*_readings(estimate, offset))
+        if estimate.status is GapStatus.LOWER_BOUND and math.isfinite(estimate.gap):
+            return ahead._bounded(estimate)
+        because = "; ".join(estimate.reasons) or "no reason given"
+        return replace(ahead, reasons=(f"the window did not count, being {estimate.status.value}: {because}",))
+
+    def _corrected(self, seen: Array, select: Array, noise: Array) -> Trend:
+        """Kalman update with the values `seen` (m,) = select (m, 3) state + noise; Joseph's form keeps it definite."""
+        surprise = seen - select @ self.mean
+        spread = select @ self.covariance @ select.T + noise
+        distance = math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
+        if distance > self.settings.outlier_std:
+            return self._refused(distance, seen, select, noise)
+        return self._joseph(surprise, select, noise, spread)
+
+    def _joseph(self, surprise: Array, select: Array, noise: Array, spread: Array) -> Trend:
+        gain = np.linalg.solve(spread, select @ self.covariance).T
+        left = np.eye(3) - gain @ select
+        covariance = left @ self.covariance @ left.T + gain @ noise @ gain.T
+        mean = self.mean + gain @ surprise
+        return replace(self, mean=mean, covariance=_symmetric(covariance), updates=self.updates + 1, refused=0)
+
+    def _refused(self, distance: float, seen: Array, select: Array, noise: Array) -> Trend:
+        """The prediction with one more refusal, or a fresh gap after too many of them."""
+        count = self.refused + 1
+        if count >= self.settings.restart_after:
+            return self._restarted(seen, select, noise, count)
+        expected = f"{math.degrees(self.mean[GAP]):.4g} deg were expected"
+        limit = f"{distance:.3g} standard deviations away, and {self.settings.outlier_std:.3g} are allowed"
+        return replace(self, refused=count, reasons=(f"the window did not count: {expected}, {limit}",))
+
+    def _restarted(self, seen: Array, select: Array, noise: Array, count: int) -> Trend:
+        """Gap and offset forgotten, then corrected; the rate stays."""
+        fresh = Trend.start(self.time, self.settings).covariance
+        fresh[RATE, RATE] = self.covariance[RATE, RATE]
+        blank = replace(self, mean=np.array([0.0, self.mean[RATE], 0.0]), covariance=fresh)
+        surprise = seen - select @ blank.mean
+        again = blank._joseph(surprise, select, noise, select @ fresh @ select.T + noise)
+        return replace(
+            again, reasons=(f"{count} windows in a row disagreed: the gap starts afresh, as after a repair",)
+        )
+
+    def _bounded(self, estimate: GapEstimate) -> Trend:
+        """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
+        column = self.covariance[:, GAP]
+        spread = math.hypot(math.sqrt(column[GAP]), bound_std(estimate))
+        margin = (self.mean[GAP] - estimate.gap) / spread if spread > 0.0 else math.inf
+        pull, cut = truncation(margin)
+        gain = column / spread if spread > 0.0 else np.zeros(3)
+        covariance = _symmetric(self.covariance - np.outer(gain, gain) * cut)
+        reason = f"only a lower bound of {math.degrees(estimate.gap):.4g} deg: it counts where the trend lies below it"
+        return replace(self, mean=self.mean + gain * pull, covariance=covariance, reasons=(reason,))
+
+    @property
+    def gap(self) -> float:
+        """Total gap, rad, at least 0."""
+        return max(0.0, float(self.mean[GAP]))
+
+    @property
+    def gap_std(self) -> float:
+        """Standard deviation of the gap, the error shared by all windows included, rad."""
+        return math.hypot(math.sqrt(self.covariance[GAP, GAP]), self.settings.shared_error_rad)
+
+    @property
+    def gap_interval(self) -> Interval:
+        """95 % interval of the total gap, rad, cut at 0."""
+        middle, half = float(self.mean[GAP]), NORMAL_95 * self.gap_std
+        return max(0.0, middle - half), max(0.0, middle + half)
+
+    @property
+    def rate(self) -> float:
+        """Growth of the total gap, rad/s."""
+        return float(self.mean[RATE])
+
+    @property
+    def rate_std(self) -> float:
+        """rad/s."""
+        return math.sqrt(self.covariance[RATE, RATE])
+
+    @property
+    def rate_interval(self) -> Interval:
+        """95 % interval of the wear rate, rad/s; with both signs in it, wear is not yet established."""
+        return self.rate - NORMAL_95 * self.rate_std, self.rate + NORMAL_95 * self.rate_std
+
+    @property
+    def prior(self) -> Prior:
+        """What the next window may start from; predict to its time first."""
+        return Prior(self.gap, self.gap_std, float(self.mean[OFFSET]), math.sqrt(self.covariance[OFFSET, OFFSET]))
+
+    def time_until(self, gap: float) -> Passage:
+        """How long from now until the gap (rad, total) has grown to `gap`: see `servotwin.identify.passage`.
+
+        Raises
+        ------
+        InvalidInput
+            The gap is negative or not finite.
+        """
+        if not 0.0 <= gap < math.inf:
+            raise InvalidInput(f"trend: gap = {gap!r} rad: must be finite and at least 0")
+        covariance = self.covariance[:OFFSET, :OFFSET].copy()
+        covariance[GAP, GAP] += self.settings.shared_error_rad**2
+        walks = self.settings.gap_walk_rad_per_sqrt_s, self.settings.rate_walk_rad_per_s_per_sqrt_s
+        return passage(self.mean[:OFFSET], covariance, gap, *walks)
+
+
+def transition(step: float) -> Array:
+    """(3, 3) matrix that carries the state on by `step` seconds."""
+    flow = np.eye(3)
+    flow[GAP, RATE] = step
+    return flow
+
+
+def process_noise(step: float, settings: TrendSettings) -> Array:
+    """(3, 3) covariance that `step` seconds of the random walks add: exact, so that steps can be split at will."""
+    gap, rate = settings.gap_walk_rad_per_sqrt_s**2, settings.rate_walk_rad_per_s_per_sqrt_s**2
+    noise = np.zeros((3, 3))
+    noise[GAP, GAP] = gap * step + rate * step**3 / 3.0
+    noise[GAP, RATE] = noise[RATE, GAP] = rate * step**2 / 2.0
+    noise[RATE, RATE] = rate * step
+    noise[OFFSET, OFFSET] = settings.offset_walk_rad_per_sqrt_s**2 * step
+    return noise
+
+
+def bound_std(estimate: GapEstimate) -> float:
+    """Spread (rad) of a lower bound, from the lower end of its 95 % interval."""
+    return max(0.0, estimate.gap - estimate.interval[0]) / NORMAL_95
+
+
+def truncation(margin: float) -> tuple[float, float]:
+    """(shift, shrinkage) of a standard normal that is known to exceed -margin: its mean, one less its variance."""
+    if math.isinf(margin):
+        return 0.0, 0.0
+    pull = math.exp(-0.5 * margin * margin - 0.5 * math.log(2.0 * math.pi) - float(log_ndtr(margin)))
+    return pull, min(1.0, max(0.0, pull * (pull + margin)))
+
+
+def _readings(estimate: GapEstimate, offset: OffsetReading | None) -> tuple[Array, Array, Array]:
+    """(values, which states they are of, covariance) of a window."""
+    variance = estimate.std_total**2
+    if not 0.0 <= variance < math.inf:
+        raise InvalidInput(f"trend: the estimate's std_total = {estimate.std_total!r} rad: must be finite")
+    if offset is None:
+        return np.array([estimate.gap]), np.eye(3)[:1], np.array([[variance]])
+    noise = np.array([[variance, offset.covariance], [offset.covariance, offset.std**2]])
+    if np.any(np.linalg.eigvalsh(noise) < 0.0) or not np.all(np.isfinite(noise)):
+        raise InvalidInput(f"trend: {offset} and std_total = {estimate.std_total!r} rad make no covariance matrix")
+    return np.array([estimate.gap, offset.offset]), np.eye(3)[[GAP, OFFSET]], noise
+
+
+def _symmetric(matrix: Array) -> Array:
+    return 0.5 * (matrix + matrix.T)
+
+
+def _time(value: float) -> float:
+    if not math.isfinite(value):
+        raise InvalidInput(f"trend: time = {value!r} s: must be finite")
+    return float(value)
