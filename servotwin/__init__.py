@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from servotwin.plant.noise import Noise
     from servotwin.plant.servo import Servo
     from servotwin.plant.signals import PiecewiseCubic, Samples, SCurve, SquareWave, Step
-    from servotwin.simulation.run import Run
     from servotwin.scenario import Scenario
     from servotwin.simulation import Simulation, simulate
+    from servotwin.simulation.run import Run
 
 __all__ = [
     "Controller",
