@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import signal
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -77,12 +79,28 @@ def perform(tasks: Sequence[Task[_R]], workers: int) -> Iterator[_R]:
     if workers == 1 or len(tasks) < 2:
         yield from (task.run() for task in tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(min(workers, len(tasks)), _ignore_interrupts) as pool:
+    with _interrupts_held():
+        pool = multiprocessing.get_context("spawn").Pool(min(workers, len(tasks)), _ignore_interrupts)
+    with pool:
         yield from pool.imap_unordered(_run, tasks)
 
 
 def _run(task: Task[_R]) -> _R:
     return task.run()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let interrupts wait; what is started meanwhile never sees one, not even before `_ignore_interrupts` runs."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # its start would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _ignore_interrupts() -> None:
