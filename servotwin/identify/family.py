@@ -12,13 +12,14 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import matrix_balance
 
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
+_TERMS = 18  # of the series, for a norm below 1/4
 MOTOR = ("J", "L", "R", "k_T", "k_B")
 STRUCTURE = ("k/m", "c/m", "pitch")
 
@@ -117,10 +118,47 @@ class Sampled:
 def _held(system: Matrices, by: Matrices, interval: float, hold: Hold) -> tuple[Array, Array]:
     """exp of the system with its input's value and slope as states, over an interval, and its derivative."""
     flow, change = _flow(system, interval, hold), _flow(by, interval, hold, constant=False)
-    zero = np.zeros_like(flow)
-    step = expm(np.block([[flow, change], [zero, flow]]))
+    _, (scale, _) = matrix_balance(flow, permute=False, separate=True)
+    ratio = scale[None, :] / scale[:, None]
+    step = np.zeros((2, *flow.shape))
+    _exponential(flow * ratio, change * ratio, step)
+    return step[0] / ratio, step[1] / ratio
+
+
+@compiled
+def multiplied(one: Array, other: Array) -> Array:
+    """Product of two small square matrices."""
+    size = len(one)
+    out = np.zeros((size, size))
+    for a in range(size):
+        for k in range(size):
+            for b in range(size):
+                out[a, b] += one[a, k] * other[k, b]
+    return out
+
+
+@compiled
+def _exponential(flow: Array, change: Array, step: Array) -> None:
+    """exp(flow) into step[0], its derivative in the direction `change` into step[1]: Taylor, then squaring.
+
+    Compiled, because the libraries' threads can lose milliseconds over a small matrix on a busy machine.
+    """
     size = len(flow)
-    return step[:size, :size], step[:size, size:]
+    largest = 0.0
+    for a in range(size):
+        largest = max(largest, np.sum(np.abs(flow[a])))
+    halvings = max(0, int(np.ceil(np.log2(max(largest, 1e-300)))) + 2)
+    small, turn = flow / 2.0**halvings, change / 2.0**halvings
+    term, slope = np.eye(size), np.zeros((size, size))
+    step[0] = np.eye(size)
+    for order in range(1, _TERMS):
+        slope = (multiplied(slope, small) + multiplied(term, turn)) / order
+        term = multiplied(term, small) / order
+        step[0] += term
+        step[1] += slope
+    for _ in range(halvings):
+        step[1] = multiplied(step[0], step[1]) + multiplied(step[1], step[0])
+        step[0] = multiplied(step[0], step[0])
 
 
 def _flow(system: Matrices, interval: float, hold: Hold, constant: bool = True) -> Array:

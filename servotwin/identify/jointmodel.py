@@ -66,6 +66,11 @@ class JointModel:
         return self.window.sample_rate
 
     @property
+    def of_structure(self) -> tuple[str, ...]:
+        """The structure's free parameters."""
+        return tuple(name for name in STRUCTURE if name in self.names)
+
+    @property
     def measured(self) -> Array:
         """(1, n - 2 margin) position, counted from its first sample."""
         position = self.window.position - self.window.position[0]
@@ -115,7 +120,7 @@ class JointModel:
         theta_m, by_motor = self.motor(servo, values)
         at = self.gap_at(theta_m, values)
         seen = contacts(theta_m, at)
-        structure = structure_family(servo).sampled(self.rate)
+        structure = structure_family(servo).select(self.of_structure).sampled(self.rate)
         shift = values.get("delay", 0.0) * self.rate
         forced = self.delayed(structure.plain(seen[:1]), shift)
         rows = reduce(np.vstack([self.measured - forced, self.nuisances(structure, shift)]))
@@ -147,7 +152,10 @@ class JointModel:
         """(n,) derivatives of the position at the full rate; "delay" holds the position itself."""
         whole = structure.respond(seen[SCREW], initial)
         moved = structure.plain(np.array(list(tangents.values())))
-        return {**dict(zip(("delay", *STRUCTURE), whole, strict=True)), **dict(zip(tangents, moved, strict=True))}
+        return {
+            **dict(zip(("delay", *self.of_structure), whole, strict=True)),
+            **dict(zip(tangents, moved, strict=True)),
+        }
 
     def _row(self, row: Array, name: str, shift: float) -> Array:
         if name != "delay":

@@ -1,0 +1,113 @@
+"""Bounded Levenberg-Marquardt in any named parameters of the joint model, with what is known of them beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servotwin.identify.jointmodel import JointModel, Reduce
+from servotwin.identify.projection import orthonormal, project_out
+from servotwin.plant.signals import Array
+
+_FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9
+_SMALL_GAIN = 1e-10  # of the cost: a step that gains less is the last
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Bounds and prior of each parameter, (P,) each, in the model's order; spread inf: nothing is known."""
+
+    lowest: Array
+    highest: Array
+    mean: Array
+    spread: Array
+
+    def vague(self) -> Known:
+        """The bounds alone."""
+        return replace(self, spread=np.full_like(self.spread, np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A point, and what holds there: residual and derivatives (P, m + P) with the prior as P more samples."""
+
+    point: Array
+    residual: Array
+    jacobian: Array
+    evaluations: int = 1
+    converged: bool = False
+
+    @property
+    def cost(self) -> float:
+        """Squared length of the residual."""
+        return float(self.residual @ self.residual)
+
+    def deviations(self) -> Array:
+        """(P,) standard deviations for residuals of variance 1, all else unknown; inf where nothing is known."""
+        return np.array([_deviation(self.jacobian, index) for index in range(self.point.size)])
+
+    def covariance(self) -> Array:
+        """(P, P) covariance for residuals of variance 1; inf on the diagonal of what is not known."""
+        scale = np.linalg.norm(self.jacobian, axis=1)
+        scale[scale == 0.0] = 1.0
+        scaled = self.jacobian / scale[:, None]
+        covariance = np.linalg.pinv(scaled @ scaled.T, hermitian=True) / np.outer(scale, scale)
+        np.fill_diagonal(covariance, self.deviations() ** 2)
+        return covariance
+
+
+def _deviation(jacobian: Array, index: int) -> float:
+    """The Schur complement: one over the length of what the other rows leave of a row."""
+    row = jacobian[index : index + 1]
+    left = float(np.linalg.norm(project_out(orthonormal(np.delete(jacobian, index, axis=0)), row)))
+    return 1.0 / left if left > 1e-8 * float(np.linalg.norm(row)) else float("inf")
+
+
+def stand(model: JointModel, point: Array, known: Known, reduce: Reduce) -> Stand:
+    """Evaluate at a point."""
+    slopes = model.slopes(dict(zip(model.names, point.tolist(), strict=True)), reduce)
+    prior = (point - known.mean) / known.spread
+    jacobian = np.hstack([slopes.jacobian, np.diag(1.0 / known.spread)])
+    return Stand(point, np.concatenate([slopes.residual, prior]), jacobian)
+
+
+def descend(model: JointModel, start: Array, known: Known, reduce: Reduce, tolerance: Array, steps: int = 40) -> Stand:
+    """From a start (P,) to the nearest minimum; it ends when a step is below `tolerance` (P,) in each."""
+    here, damping = stand(model, np.clip(start, known.lowest, known.highest), known, reduce), _FIRST_DAMPING
+    for count in range(2, steps):
+        trial = np.clip(here.point + _step(here, known, damping), known.lowest, known.highest)
+        if np.all(np.abs(trial - here.point) <= tolerance):
+            return replace(here, evaluations=count, converged=True)
+        ahead = stand(model, trial, known, reduce)
+        if ahead.cost < here.cost:
+            gained, here, damping = here.cost - ahead.cost, ahead, max(0.1 * damping, _LEAST_DAMPING)
+            if gained <= _SMALL_GAIN * ahead.cost:
+                return replace(here, evaluations=count, converged=True)
+        else:
+            damping *= 8.0
+            if damping > _LARGEST_DAMPING:
+                return replace(here, evaluations=count, converged=True)
+    return replace(here, evaluations=steps)
+
+
+def _step(here: Stand, known: Known, damping: float) -> Array:
+    """The damped Gauss-Newton step of the parameters that are not held by their bounds."""
+    downhill = -here.jacobian @ here.residual
+    held = ((here.point <= known.lowest) & (downhill < 0.0)) | ((here.point >= known.highest) & (downhill > 0.0))
+    size = np.linalg.norm(here.jacobian, axis=1)
+    free = np.flatnonzero(~held & (size > 0.0))
+    step = np.zeros_like(here.point)
+    scaled = here.jacobian[free] / size[free, None]
+    damped = scaled @ scaled.T + damping * np.eye(free.size)
+    step[free] = np.linalg.solve(damped, downhill[free] / size[free]) / size[free]
+    return step
+
+
+def scan(model: JointModel, values: Mapping[str, float], gaps: Array, keep: int, reduce: Reduce) -> list[Array]:
+    """The `keep` best starts (P,) of a grid of gaps (rad) and places, the other parameters as in `values`."""
+    grid = [{**values, "gap": float(gap), "place": place} for gap in gaps for place in (-1.0, 0.0, 1.0)]
+    costs = [model.cost(one, reduce) for one in grid]
+    best = np.argsort(costs, kind="stable")[:keep]
+    return [np.array([grid[i][name] for name in model.names]) for i in best]
