@@ -45,7 +45,9 @@ def verbatim(function: _Function) -> _Function:
 
 def _compile(function: _Function, **options: Any) -> _Function:
     dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    dispatcher.stamp = _stamp(function, repr(sorted(options.items())))
+    # A set of strings is written in another order by every process.
+    told = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
+    dispatcher.stamp = _stamp(function, repr(sorted(told.items())))
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
     return cast(_Function, dispatcher)

@@ -1,0 +1,66 @@
+"""Compilation cached on disk: the key is the same in every process, and follows what a function uses."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from servotwin.hybrid.compiled import compiled
+
+LIST_STAMPS = """
+import importlib, pkgutil, servotwin.hybrid, servotwin.simulation
+for package in (servotwin.hybrid, servotwin.simulation):
+    for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+        module = importlib.import_module(found.name)
+        for name, value in sorted(vars(module).items()):
+            if hasattr(value, "stamp"):
+                print(module.__name__, name, value.stamp)
+"""
+
+
+def stamps(seed: int) -> str:
+    env = os.environ | {"PYTHONHASHSEED": str(seed), "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    done = subprocess.run([sys.executable, "-c", LIST_STAMPS], env=env, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_stamps_do_not_depend_on_the_process() -> None:
+    """Otherwise every other run would compile again."""
+    first = stamps(1)
+    assert first.count("\n") > 20
+    assert {stamps(seed) for seed in (2, 3)} == {first}
+
+
+def helper_plus_one(x: float) -> float:
+    return x + 1.0
+
+
+def helper_plus_two(x: float) -> float:
+    return x + 2.0
+
+
+helper, FACTOR = helper_plus_one, 1.0
+
+
+def caller(x: float) -> float:
+    return helper(x) * FACTOR
+
+
+@pytest.fixture
+def stamp_of(monkeypatch: pytest.MonkeyPatch):
+    def stamp(helper: object, factor: float) -> str:
+        monkeypatch.setitem(globals(), "helper", helper)
+        monkeypatch.setitem(globals(), "FACTOR", factor)
+        return compiled(caller).stamp
+
+    return stamp
+
+
+def test_stamps_follow_helpers_and_constants(stamp_of) -> None:
+    plus_one, plus_two = compiled(helper_plus_one), compiled(helper_plus_two)
+    base = stamp_of(plus_one, 2.0)
+    assert stamp_of(plus_one, 2.0) == base
+    assert stamp_of(plus_two, 2.0) != base
+    assert stamp_of(plus_one, 3.0) != base
+    assert compiled(caller).py_func(1.0) == 6.0
