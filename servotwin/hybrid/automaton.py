@@ -64,7 +64,7 @@ class Automaton:
     Raises
     ------
     InvalidInput
-        When shapes disagree, a number is not finite or a target does not exist.
+        When shapes disagree, a number is not finite, a target does not exist or a name is used twice.
     """
 
     modes: tuple[Mode, ...]
@@ -73,6 +73,10 @@ class Automaton:
 
     def __post_init__(self) -> None:
         n = len(self.names)
+        if n == 0 or not self.modes:
+            raise InvalidInput("an automaton needs at least one mode and at least one state")
+        if len(set(self.names)) < n:
+            raise InvalidInput(f"state names {self.names} must differ from one another")
         for mode in self.modes:
             _check(f"flow of mode {mode.name!r}", mode.flow, (n, n))
             for guard in mode.guards:

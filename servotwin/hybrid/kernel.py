@@ -178,6 +178,8 @@ def flow_until(
     calm = 0
     room = len(record.step) - EVENTS_PER_STEP - 4
     room_events = len(record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE - 4
+    if record.size[0] > room or record.size[1] > room_events:
+        return FULL, step, fraction, mode
     note_segment(record, step, fraction, mode, x)
     while step < end_step or fraction < end_fraction:
         if record.size[0] > room or record.size[1] > room_events:

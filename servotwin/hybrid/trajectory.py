@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -67,15 +68,20 @@ class Trajectory:
     record: Record = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if not (np.isfinite(self.sample_step) and self.sample_step > 0.0):
+            raise InvalidInput(f"sample_step = {self.sample_step} s: must be positive and finite")
+        if self.refine < 1:
+            raise InvalidInput(f"refine = {self.refine}: must be an integer of 1 or more")
+        self.state = _checked_start(self.automaton, self.state, self.mode)
         step, divisor = search_step(self.automaton, self.sample_step)
         self.step, self.divisor = step / self.refine, divisor * self.refine
         self.tables = tables_for(self.automaton, self.step)
-        self.state = np.array(self.state, dtype=float)
         self.record = new_record(len(self.state))
         self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
         self._at = np.array([0, self.mode, 0, 1], dtype=np.int64)
         self._rows: dict[bytes, Array] = {}
+        self._failure = ""
 
     @property
     def time(self) -> float:
@@ -88,16 +94,34 @@ class Trajectory:
         return int(self._at[0] // self.divisor) + 1
 
     def advance(self, sample: int, jumps: Sequence[Jump] = ()) -> None:
-        """Go on to a sample index through time-ordered `jumps`, all of them later than now and not after that sample.
+        """Go on to a sample index through time-ordered `jumps`, none of them before now or after that sample.
 
         Raises
         ------
+        InvalidInput
+            For a sample already passed, or a jump out of its place or to what does not exist.
         ZenoError
-            With the time and the mode at which no flow is admitted.
+            With the time and the mode at which no flow is admitted; the run cannot go on, its past can be read.
         """
+        if not sample >= self.samples - 1:
+            raise InvalidInput(f"sample {sample} is before sample {self.samples - 1}, which was reached already")
+        self._check_times(jumps, sample)
         self._follow(*schedule_of(jumps, self.step, self.automaton, sample * self.divisor))
 
+    def _check_times(self, jumps: Sequence[Jump], sample: int) -> None:
+        last = self._at[0] + self._place[0]
+        for jump in jumps:
+            place = jump.time / self.step
+            if not last - ON_GRID <= place <= sample * self.divisor + ON_GRID:
+                raise InvalidInput(
+                    f"jump at {jump.time} s: must be in time order, from {self.time:.9g} s, where the run stands, to "
+                    f"{sample * self.sample_step:.9g} s, where it is to go"
+                )
+            last = max(last, place)
+
     def _follow(self, steps: NDArray[np.int64], fractions: Array, values: Array, modes: NDArray[np.int64]) -> None:
+        if self._failure:
+            raise ZenoError(self._failure)
         self._at[2] = 0
         while True:
             status = follow_schedule(
@@ -114,10 +138,11 @@ class Trajectory:
             )
             if status == ZENO:
                 name = self.automaton.modes[int(self.record.event_mode[self.record.size[1] - 1])].name
-                raise ZenoError(
+                self._failure = (
                     f"mode changes without end at t = {self.time:.9g} s, last from mode {name!r}: "
                     "the automaton is Zeno or slides"
                 )
+                raise ZenoError(self._failure)
             if status != FULL:
                 break
             self.record = grown(self.record)
@@ -125,6 +150,7 @@ class Trajectory:
 
     def set(self, values: dict[int, float], mode_map: Sequence[int] | None = None) -> None:
         """Set states now; guards that this makes positive are followed at the next advance."""
+        _check_jump(self.automaton, values, mode_map)
         for index, value in values.items():
             self.state[index] = value
         if mode_map is not None:
@@ -162,6 +188,8 @@ class Trajectory:
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
         """The same output at any times within the run, right-continuous; ``(len(times),)``."""
         places = np.asarray(times, dtype=float) / self.step
+        if not np.all((places >= 0.0) & (places <= self._at[0] + self._place[0] + ON_GRID)):
+            raise InvalidInput(f"some of the times are outside 0 .. {self.time:.9g} s, the run so far")
         r, size = self.record, int(self.record.size[0])
         starts = r.step[:size] + r.fraction[:size]
         segments = np.maximum(np.searchsorted(starts, places, side="right") - 1, 0)
@@ -212,8 +240,31 @@ def schedule_of(
     values = np.full((len(times), len(automaton.names)), np.nan)
     modes = np.tile(np.arange(len(automaton.modes)), (len(times), 1))
     for j, jump in enumerate(jumps):
+        _check_jump(automaton, jump.values, jump.mode_map)
         for index, value in jump.values.items():
             values[j, index] = value
         if jump.mode_map is not None:
             modes[j] = jump.mode_map
     return steps, np.where(near, 0.0, times - np.floor(times)), values, modes
+
+
+def _checked_start(automaton: Automaton, state: ArrayLike, mode: int) -> Array:
+    start = np.array(state, dtype=float)
+    if start.shape != (len(automaton.names),):
+        raise InvalidInput(f"state has shape {start.shape}; it must be ({len(automaton.names)},)")
+    if not np.isfinite(start).all():
+        raise InvalidInput("state holds a number that is not finite")
+    if not 0 <= mode < len(automaton.modes):
+        raise InvalidInput(f"mode = {mode}: modes are 0 to {len(automaton.modes) - 1}")
+    return start
+
+
+def _check_jump(automaton: Automaton, values: dict[int, float], mode_map: Sequence[int] | None) -> None:
+    for index, value in values.items():
+        if not 0 <= index < len(automaton.names):
+            raise InvalidInput(f"a jump sets state {index}; states are 0 to {len(automaton.names) - 1}")
+        if not math.isfinite(value):
+            raise InvalidInput(f"a jump sets state {automaton.names[index]!r} to {value}; it must be finite")
+    count = len(automaton.modes)
+    if mode_map is not None and not (len(mode_map) == count and all(0 <= mode < count for mode in mode_map)):
+        raise InvalidInput(f"mode map {list(mode_map)} must give one of modes 0 to {count - 1} for each of them")
