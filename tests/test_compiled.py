@@ -27,9 +27,9 @@ def stamps(seed: int) -> str:
 
 def test_stamps_do_not_depend_on_the_process() -> None:
     """Otherwise every other run would compile again."""
-    first = stamps(1)
+    first = stamps(0)  # seeds 0 and 4 order a set of two words differently
     assert first.count("\n") > 20
-    assert {stamps(seed) for seed in (2, 3)} == {first}
+    assert {stamps(seed) for seed in (1, 4)} == {first}
 
 
 def helper_plus_one(x: float) -> float:
