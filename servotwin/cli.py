@@ -6,6 +6,7 @@ A new command is a function with ``@app.command()`` that imports what it needs i
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,10 @@ from typer.core import TyperGroup
 from servotwin.errors import InvalidInput
 
 INVALID, INTERRUPTED = 2, 130
+
+# Before numpy is loaded: matrices are small here, and OpenBLAS's threads only wait for one another. On two busy cores
+# some thousand exponentials of 4 x 4 matrices took 24 s of processor time with two threads and 0.03 s with one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 class _Commands(TyperGroup):
@@ -92,6 +97,25 @@ def simulate(
     from servotwin.record import record
 
     record(scenario, output)
+
+
+@app.command()
+def bench(
+    workloads: Annotated[list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start; all by default.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small workloads, to see that all works.")] = False,
+    slow: Annotated[bool, typer.Option("--slow", help="Also what takes many seconds a run: scipy, compiling.")] = False,
+    reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
+) -> None:
+    """Speed and accuracy beside what one would use instead, side by side."""
+    from datetime import UTC, datetime
+
+    from servotwin.bench.catalogue import Options
+    from servotwin.bench.command import bench as run
+
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ Schema ``servotwin-claims/1``::
     presets      {name: {"model": version of the preset's plant numbers}}
     claims       a list, in the paper's order, of
         id, sentence, where, criterion      texts, fixed before measuring
+        amended                             why the criterion was changed after a measurement; "" where it was not
         results  {preset: {
             verdict   "reproduced" | "not as stated" | "cannot be checked"
             why       one sentence
@@ -74,7 +75,7 @@ def by_claim(results: Iterable[Result]) -> dict[Claim, dict[str, Result]]:
 
 
 def _claim(claim: Claim, row: Mapping[str, Result]) -> dict[str, Any]:
-    texts = {name: getattr(claim, name) for name in ("id", "sentence", "where", "criterion")}
+    texts = {name: getattr(claim, name) for name in ("id", "sentence", "where", "criterion", "amended")}
     return {**texts, "results": {preset: _result(result) for preset, result in row.items()}}
 
 

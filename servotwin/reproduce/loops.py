@@ -11,6 +11,7 @@ from servotwin import messages
 from servotwin.cosim import Loop
 from servotwin.identify.window import Window
 from servotwin.plant.signals import as_pieces
+from servotwin.reproduce.measures import Step
 from servotwin.reproduce.runs import BIPOLAR, Square, Trace
 from servotwin.twin.known import known_gap
 
@@ -89,6 +90,20 @@ class LoopJob:
     def run(self) -> Record:
         """Co-simulate and keep what is needed."""
         return record(self.described(), exact=self.exact)
+
+
+@dataclass(frozen=True, slots=True)
+class FamilyJob:
+    """The steps of Fig 15's continuous run for a family of squares."""
+
+    preset: str
+    square: Square = BIPOLAR
+    exact: bool = False
+
+    def run(self) -> tuple[tuple[Step, ...], ...]:
+        """One row of steps per member."""
+        jobs = (LoopJob(self.preset, CONTINUOUS, member, exact=self.exact) for member in self.square.family)
+        return tuple(job.run().trace.steps for job in jobs)
 
 
 def record(scenario: st.Scenario, exact: bool = False, progress: Progress | None = None) -> Record:

@@ -98,10 +98,15 @@ def _badge(preset: str, result: Result) -> str:
 def _inside(claim: Claim, row: Row) -> str:
     whys = "".join(_why(preset, result.finding) for preset, result in row.items())
     others = "".join(_why(f"{preset}, 0/1 mm", r.unipolar) for preset, r in row.items() if r.unipolar)
-    texts = f"<p><span class='soft'>Reproduced if</span> {escape(claim.criterion)}.</p><ul>{whys}{others}</ul>"
+    criterion = f"<span class='soft'>Reproduced if</span> {escape(claim.criterion)}.{_amended(claim)}"
+    texts = f"<p>{criterion}</p><ul>{whys}{others}</ul>"
     findings = {preset: result.finding for preset, result in row.items()}
     findings |= {f"{preset}, 0/1 mm": r.unipolar for preset, r in row.items() if r.unipolar}
     return texts + _numbers(findings)
+
+
+def _amended(claim: Claim) -> str:
+    return f" <span class='soft'>(Amended: {escape(claim.amended)}.)</span>" if claim.amended else ""
 
 
 def _why(name: str, finding: Finding) -> str:
@@ -148,9 +153,8 @@ def _errata() -> Iterator[str]:
 def _how() -> Iterator[str]:
     yield '<h2 id="how">How it was measured</h2>'
     yield (
-        "<p>The claims and their criteria were fixed before anything was measured. One criterion"
-        " (<code>dead-zone-trade-off</code>) had to be amended afterwards: at half the tolerance nothing settles, so"
-        " that there is no bias to compare with.</p>"
+        "<p>The claims and their criteria were fixed before anything was measured. The few criteria that were changed"
+        " after a first measurement say so, and why.</p>"
     )
     yield page.table(["Word", "Meaning"], [[word, text] for word, text in DEFINITIONS.items()], stack=True)
     yield f'<p class="soft small">servotwin {escape(st.__version__)}</p>'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
@@ -38,6 +38,15 @@ class Square:
     def signal(self) -> SquareWave:
         """The reference."""
         return SquareWave(self.amplitude, PERIOD, self.offset)
+
+    def scaled(self, factor: float) -> Square:
+        """The same with another amplitude."""
+        return replace(self, amplitude=self.amplitude * factor, offset=self.offset * factor)
+
+    @property
+    def family(self) -> tuple[Square, ...]:
+        """Nine of them, 0.1 % apart in amplitude: runs that no machine could tell apart beforehand (erratum E17)."""
+        return tuple(self.scaled(1.0 + 1e-3 * k) for k in range(-4, 5))
 
 
 BIPOLAR = Square("±1 mm", AMPLITUDE, 0.0)
@@ -151,6 +160,18 @@ class WearJob:
             sample_rate=RATE,
         )
         return Trace.of(run)
+
+
+@dataclass(frozen=True, slots=True)
+class FixedFamilyJob:
+    """The steps of Fig 12's run for a family of squares."""
+
+    preset: str
+    square: Square = BIPOLAR
+
+    def run(self) -> tuple[tuple[Step, ...], ...]:
+        """One row of steps per member."""
+        return tuple(WearJob(self.preset, member).run().steps for member in self.square.family)
 
 
 def wear(to_deg: float) -> SCurve:

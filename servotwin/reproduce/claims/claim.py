@@ -21,12 +21,16 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A sentence of the paper, where it stands, and what must be measured to call it reproduced."""
+    """A sentence of the paper, where it stands, and what must be measured to call it reproduced.
+
+    `amended` says why the criterion is not the one fixed before measuring, where that is so.
+    """
 
     id: str
     sentence: str
     where: str
     criterion: str
+    amended: str = ""
 
 
 @dataclass(frozen=True, slots=True)
