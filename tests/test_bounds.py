@@ -1,0 +1,63 @@
+"""Compiled code does not check its indices; here it does, once, over everything that the kernel does."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RUNS = """
+import math
+import numpy as np
+from servotwin.hybrid.compiled import bare
+
+@bare
+def beyond(x, k):
+    return x[k]
+
+try:
+    beyond(np.zeros(3), 3)
+except IndexError:
+    pass
+else:
+    raise SystemExit("indices are not checked: this test would prove nothing")
+
+import test_hybrid_automaton, test_hybrid_ball, test_hybrid_random
+test_hybrid_ball.test_zeno_point_to_rounding_when_bounces_die_quickly()
+test_hybrid_random.test_record_grows()
+test_hybrid_random.test_standing_still_for_ever_is_safe()
+test_hybrid_random.test_after_zeno_a_run_stays_refused_and_its_past_readable()
+test_hybrid_automaton.test_jumps_at_one_instant_apply_in_order()
+test_hybrid_automaton.test_any_part_of_the_samples()
+test_hybrid_automaton.test_set_between_advances()
+
+import servotwin as st
+from servotwin.simulation.ensemble import simulate_ensemble
+servo = st.Servo.preset("table1")
+worn = st.PiecewiseCubic([0.0, 0.2001, 0.20013, 0.3], [[0.1, 0.2, 0, 0], [0.2, 0, 0, 0], [0.05, 0, 0, 0], [0, 0, 1, 1]])
+wave, tolerance = st.SquareWave(1e-3, 0.25), servo.tolerance_for(math.radians(1.0))
+limited = servo.controller.replace(voltage_limit=0.5, loop_filter_hz=20.0)
+sampled = [limited.replace(sample_rate=1000.0), servo.controller.replace(sample_rate=5000.0)]
+for law in (servo.controller, limited, *sampled):
+    run = st.simulate(servo, 0.5, controller=law, reference=wave, gap=worn, tolerance=tolerance, noise=st.Noise(1e-5))
+    assert len(run.events) > 5 and np.isfinite(run.q).all() and np.isfinite(run.voltage).all()
+assert simulate_ensemble(servo, 0.5, 1e-3, gap=[0.0, 0.1, 0.2], tolerance=[0.0, tolerance, tolerance]).shape == (3, 51)
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_no_index_is_out_of_bounds(tmp_path: Path) -> None:
+    folders = [str(Path(__file__).parent), *(path for path in sys.path if path)]
+    env = os.environ | {
+        "NUMBA_BOUNDSCHECK": "1",
+        "NUMBA_OPT": "0",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join(folders),
+    }
+    script = tmp_path / "runs.py"
+    script.write_text(RUNS, encoding="utf-8")
+    done = subprocess.run([sys.executable, script], env=env, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert done.stdout == "done\n"
