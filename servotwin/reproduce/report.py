@@ -56,7 +56,8 @@ def _claims(rows: Mapping[Claim, Row]) -> Iterator[str]:
     yield (
         "<p>The printed gains and the printed table do not belong together (erratum E1), so every claim is measured in"
         " three presets: <code>paper</code> has the pitch doubled, <code>table1</code> is as printed,"
-        " <code>paper-gain2</code> has the gains doubled. Open a row for the criterion and the numbers.</p>"
+        " <code>paper-gain2</code> has the gains doubled. The sentences are the paper's, some"
+        " of them shortened. Open a row for the criterion and the numbers.</p>"
     )
     heads = "".join(f"<span>{escape(preset)}</span>" for preset in presets)
     yield f'<div class="claims"><div class="row head"><span>Claim</span>{heads}</div>'
@@ -84,7 +85,7 @@ def _row(claim: Claim, row: Row) -> str:
 
 
 def _place(claim: Claim) -> str:
-    return f"§ {claim.where}" if claim.where[0].isdigit() else claim.where
+    return f"§\u00a0{claim.where}" if claim.where[0].isdigit() else claim.where
 
 
 def _badge(preset: str, result: Result) -> str:
