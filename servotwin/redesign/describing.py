@@ -1,0 +1,167 @@
+"""Describing function of the backlash and the limit cycles it predicts, beside the exact ones of `cycle`."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.polynomial import polynomial as poly
+from scipy.optimize import brentq
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.plant.linear import LinearSystem
+from servotwin.plant.margins import level_crossings
+from servotwin.plant.polynomials import mirrored, on_axis, positive_roots, times
+from servotwin.plant.servo import Servo
+
+# Looks within each band of frequencies in which a prediction is possible.
+_LOOKS = 500
+# From an amplitude of 1e12 gaps to one that exceeds half the gap by 2.5e-9 of it, where N is 3e-9.
+_ANGLES = (1e-6, math.pi - 1e-4)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A solution of N(A) L(j omega) = -1.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz.
+    motor_amplitude : float
+        rad, of the first harmonic of the motor's angle, A: the input of the backlash.
+    amplitude : float
+        m, of the first harmonic of the position: A abs(N(A) G2(j omega)).
+    stable : bool
+        Whether a larger amplitude would decay and a smaller one grow, as far as the describing function sees.
+    """
+
+    frequency: float
+    motor_amplitude: float
+    amplitude: float
+    stable: bool
+
+
+def play_function(amplitude: float, gap: float) -> complex:
+    """N(A) of the play operator: first harmonic of theta_d per that of theta_m.
+
+    Parameters
+    ----------
+    amplitude : float
+        rad, A.
+    gap : float
+        rad, TOTAL gap; up to half of it (A <= gap / 2) nothing moves and N = 0.
+    """
+    if 2.0 * amplitude <= gap:
+        return 0j
+    return _play(math.acos(1.0 - gap / amplitude))
+
+
+def predictions(servo: Servo, gap: float, controller: Controller | None = None) -> tuple[Prediction, ...]:
+    """All limit cycles that the describing function predicts for a constant gap, by frequency.
+
+    Solutions lie where abs(L) >= 1 and the phase of L is between -180 and -90 deg, since N shrinks and lags by up to
+    90 deg; the ends of these bands are roots of polynomials. In them the phase gives gap / A, and the modulus one
+    equation.
+
+    Raises
+    ------
+    InvalidInput
+        The screw is elastic (its load on the motor is no function of theta_d alone), the controller is sampled or
+        saturates, or the gap is not a number above 0.
+    """
+    law = servo.controller if controller is None else controller
+    _check(servo, law, gap)
+    loop = servo.loop(law)
+    found = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
+    return tuple(_prediction(servo, loop, gap, omega) for omega in found)
+
+
+def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
+    """rad/s, ascending, within one band: looked for on a grid that is dense at its ends, in every decade from 0."""
+    ends = [low, high] if low > 0.0 else [0.0, *(high * 10.0**k for k in range(-5, 1))]
+    part = 0.5 * (1.0 - np.cos(np.pi * np.arange(_LOOKS + 1) / _LOOKS))
+    grid = np.unique([a + (b - a) * part for a, b in pairwise(ends)])[1:-1].tolist()
+    values = [_mismatch(loop, w) for w in grid]
+    places = [i for i in range(len(grid) - 1) if values[i] * values[i + 1] < 0.0]
+    return [float(brentq(lambda w: _mismatch(loop, w), grid[i], grid[i + 1], xtol=1e-14 * grid[i])) for i in places]
+
+
+def _check(servo: Servo, law: Controller, gap: float) -> None:
+    if not servo.rigid:
+        raise InvalidInput(
+            f"servo k_d = {servo.k_d:g} N/m: the describing function needs a rigid screw (k_d = inf), "
+            "since a load that acts back on the motor only in contact is no function of the screw's angle"
+        )
+    if law.voltage_limit is not None:
+        raise InvalidInput(
+            f"controller voltage_limit = {law.voltage_limit:g} V: the describing function knows no limit"
+        )
+    if law.sample_rate is not None:
+        raise InvalidInput(
+            f"controller sample_rate = {law.sample_rate:g} Hz: the describing function is that of the law"
+            " in continuous time; give sample_rate = None"
+        )
+    if not (math.isfinite(gap) and gap > 0.0):
+        raise InvalidInput(f"gap = {gap!r} rad: must be finite and greater than 0")
+
+
+def _play(angle: float) -> complex:
+    """N where 1 - gap / A = cos(angle), angle within (0, pi)."""
+    return complex(1.0 - (angle - math.sin(angle) * math.cos(angle)) / math.pi, -(math.sin(angle) ** 2) / math.pi)
+
+
+def _angle(phase: float) -> float:
+    """The angle at which N has a phase (rad) of its range; the phase falls all the way."""
+    return float(brentq(lambda angle: _play_phase(angle) - phase, *_ANGLES, xtol=1e-15))
+
+
+def _mismatch(loop: LinearSystem, omega: float) -> float:
+    """log abs(-1 / L) - log abs(N) at the amplitude whose N has the phase of -1 / L; NaN where none has."""
+    wanted = -1.0 / complex(loop.response(omega))
+    if not _play_phase(_ANGLES[1]) < cmath.phase(wanted) < _play_phase(_ANGLES[0]):
+        return math.nan
+    return math.log(abs(wanted) / abs(_play(_angle(cmath.phase(wanted)))))
+
+
+def _play_phase(angle: float) -> float:
+    return cmath.phase(_play(angle))
+
+
+def _bands(loop: LinearSystem) -> list[tuple[float, float]]:
+    """Bands of rad/s in which abs(L) >= 1, Re L < 0 and Im L < 0."""
+    real, imaginary = on_axis(times(loop.numerator, mirrored(loop.denominator)))
+    phases = [np.sqrt(positive_roots(part)) for part in (real, imaginary)]
+    edges = np.sort(np.concatenate([*phases, level_crossings(loop.numerator, loop.denominator, 1.0)]))
+    edges = np.concatenate([[0.0], edges])
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    values = loop.response(middles)
+    inside = (np.abs(values) >= 1.0) & (values.real < 0.0) & (values.imag < 0.0)
+    return [(float(a), float(b)) for a, b, good in zip(edges[:-1], edges[1:], inside, strict=True) if good]
+
+
+def _prediction(servo: Servo, loop: LinearSystem, gap: float, omega: float) -> Prediction:
+    value = complex(loop.response(omega))
+    angle = _angle(cmath.phase(-1.0 / value))
+    # 1 - cos(angle), without cancellation.
+    amplitude = gap / (2.0 * math.sin(0.5 * angle) ** 2)
+    position = amplitude * abs(_play(angle) * complex(servo.G2().response(omega)))
+    return Prediction(omega / (2.0 * math.pi), amplitude, position, _attracts(loop, omega, angle))
+
+
+def _attracts(loop: LinearSystem, omega: float, angle: float) -> bool:
+    """A larger amplitude moves s = j omega by -(N_A / N) (L / L_s) dA: to the left? The angle falls as A grows."""
+    sine, cosine = math.sin(angle), math.cos(angle)
+    by_angle = complex(-2.0 * sine**2, -2.0 * sine * cosine) / (math.pi * _play(angle))
+    s = 1j * omega
+    slope = _relative_slope(loop.numerator, s) - _relative_slope(loop.denominator, s)
+    return bool((by_angle / slope).real < 0.0)
+
+
+def _relative_slope(p: Array, s: complex) -> complex:
+    return complex(poly.polyval(s, poly.polyder(p)) / poly.polyval(s, p))
