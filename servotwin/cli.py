@@ -118,6 +118,22 @@ def bench(
     run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
 
 
+@app.command("limit-cycle")
+def limit_cycle(
+    servo: Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")] = "paper",
+    gap_deg: Annotated[float, typer.Option(help="Total gap, deg.")] = 10.0,
+    tolerance_mm: Annotated[float | None, typer.Option(help="Half-width of the dead zone; none by default.")] = None,
+    step_mm: Annotated[float, typer.Option(help="Reference step from rest; where the loop ends may hang on it.")] = 1.0,
+    enter: Annotated[float | None, typer.Option(help="The loop opens at so many tolerances.")] = None,
+    leave: Annotated[float | None, typer.Option(help="The loop closes again above so many tolerances.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+) -> None:
+    """The exact limit cycle, stable or not, beside the describing function's prediction."""
+    from servotwin.redesign.cycletable import tell
+
+    tell(servo, gap_deg, tolerance_mm, step_mm, enter, leave, json)
+
+
 def main() -> None:
     """Entry point of the `servotwin` command."""
     app()
