@@ -1,6 +1,7 @@
 """The paper's estimator on prescribed windows: what it finds, what it refuses, and what it says of bad input."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,11 +10,13 @@ from hypothesis import strategies as st
 from measured_windows import RATE, measured
 
 from servotwin.errors import InvalidInput
+from servotwin.identify import gap as entry
 from servotwin.identify.estimate import GapEstimate, GapStatus
-from servotwin.identify.gap import estimate_gap
 from servotwin.identify.paper import Settings
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
+
+estimate_gap = partial(entry.estimate_gap, method="paper")
 
 SERVO = Servo.preset("paper")
 PATIENT = Settings(settle_s=0.5)
@@ -179,7 +182,7 @@ def test_a_number_is_never_confident_without_evidence(seed):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"method": "magic"}, "method 'magic' does not exist: allowed are paper"),
+        ({"method": "magic"}, "method 'magic' does not exist: allowed are whitened, paper"),
         ({"prior": -0.1}, "prior = -0.1 rad: must be a finite total gap of at least 0"),
         ({"prior": math.nan}, "prior = nan rad"),
         ({"settings": {"alpha": 40.0}}, "do not belong to method 'paper'"),

@@ -5,18 +5,20 @@ dead zone for the true gap, windows of 1 s after each step, started 2 deg below 
 """
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
 
-from servotwin.identify.gap import estimate_gap
+from servotwin.identify import gap as entry
 from servotwin.identify.paper import Settings
 from servotwin.identify.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import Run, simulate
+
+estimate_gap = partial(entry.estimate_gap, method="paper")
 
 GAPS = [3.0, 10.0, 18.0]
 NOISE = Noise(0.22e-3)

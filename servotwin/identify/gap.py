@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TypeAlias
+from typing import Any, NamedTuple
 
 from servotwin.errors import InvalidInput
-from servotwin.identify import paper
+from servotwin.identify import paper, whitened
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 
-Method: TypeAlias = Callable[[Window, Servo, float | None, paper.Settings | None], GapEstimate]
-METHODS: Mapping[str, Method] = {paper.METHOD: paper.estimate}
+
+class Method(NamedTuple):
+    """An estimator, and the class of its settings."""
+
+    estimate: Callable[..., GapEstimate]
+    settings: type
+
+
+METHODS: Mapping[str, Method] = {
+    whitened.METHOD: Method(whitened.estimate, whitened.Settings),
+    paper.METHOD: Method(paper.estimate, paper.Settings),
+}
 
 
 def estimate_gap(
     window: Window,
     servo: Servo,
-    method: str = paper.METHOD,
+    method: str = whitened.METHOD,
     prior: float | GapEstimate | None = None,
-    settings: paper.Settings | None = None,
+    settings: Any = None,
 ) -> GapEstimate:
     """The total gap that a window of measurements shows, with its spread, and whether it may be believed.
 
@@ -31,11 +41,12 @@ def estimate_gap(
     servo : Servo
         The model; its controller does not matter.
     method : str
-        "paper", the published one: `servotwin.identify.paper`.
+        "whitened", the default: `servotwin.identify.whitened`; "paper", the published one: `servotwin.identify.paper`.
     prior : float or GapEstimate, optional
-        What was known before, rad, total gap; an estimate that is not OK counts as nothing.
-    settings : Settings, optional
-        The method's own.
+        What was known before, rad, total gap; an estimate that is not OK counts as nothing. The search starts there,
+        among other places; "whitened" also gives it back when the window says nothing.
+    settings : optional
+        The method's own `Settings`.
 
     Raises
     ------
@@ -45,15 +56,20 @@ def estimate_gap(
     """
     if method not in METHODS:
         raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(METHODS)}")
-    if settings is not None and not isinstance(settings, paper.Settings):
-        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give identify.paper.Settings")
-    return METHODS[method](window, servo, _gap_of(prior), settings)
+    chosen = METHODS[method]
+    if settings is not None and not isinstance(settings, chosen.settings):
+        wanted = f"{chosen.settings.__module__.removeprefix('servotwin.')}.{chosen.settings.__name__}"
+        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {wanted}")
+    known = _believed(prior)
+    if method == paper.METHOD and isinstance(known, GapEstimate):
+        known = known.gap
+    return chosen.estimate(window, servo, known, settings)
 
 
-def _gap_of(prior: float | GapEstimate | None) -> float | None:
-    """The prior as a total gap, rad."""
+def _believed(prior: float | GapEstimate | None) -> float | GapEstimate | None:
+    """The prior, if it is one."""
     if isinstance(prior, GapEstimate):
-        return prior.gap if prior.ok else None
+        return prior if prior.ok else None
     if prior is not None and not (math.isfinite(prior) and prior >= 0.0):
         raise InvalidInput(f"prior = {prior!r} rad: must be a finite total gap of at least 0")
     return prior

@@ -52,6 +52,8 @@ class Response:
     position, velocity : Readout
     interval : float
         T, s.
+    static_gain : float
+        m/rad, position over angle at rest.
     """
 
     poles: Complex
@@ -59,6 +61,7 @@ class Response:
     position: Readout
     velocity: Readout
     interval: float
+    static_gain: float
 
     def respond(self, inputs: Array) -> Array:
         """(k, n) positions (m) for angles (k, n) (rad), from rest at zero one sample before the first.
@@ -101,6 +104,7 @@ def response(servo: Servo, sample_rate: float) -> Response:
         _readout(poles, weight, interval, direct),
         _readout(poles, weight * poles, interval, float(np.sum(weight).real)),
         interval,
+        direct - float(np.sum(weight / poles).real),
     )
 
 

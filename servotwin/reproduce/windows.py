@@ -43,5 +43,7 @@ def _errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float]:
     starts = np.arange(STEPS) * PERIOD / 2.0
     windows = [st.Window.from_run(run, float(start), 1.0) for start in starts]
     settings = Settings(settle_s=settle)
-    found = [st.estimate_gap(window, servo, prior=gap * 2.0 / 3.0, settings=settings) for window in windows]
+    found = [
+        st.estimate_gap(window, servo, method="paper", prior=gap * 2.0 / 3.0, settings=settings) for window in windows
+    ]
     return [math.degrees(one.gap - gap) for one in found if one.ok]

@@ -1,0 +1,103 @@
+"""The fit of a window whose channels may be delayed against each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.identify.normal import least_squares
+from servotwin.identify.passes import Found, coarse_fit, refine
+from servotwin.identify.reduction import CONSTANT, RESIDUAL, Prior, Reduction
+from servotwin.identify.response import response
+from servotwin.identify.whitened_settings import Settings
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+PRECISION = 1e-9  # of the motor's range: how closely a minimum is approached
+_ALIGNMENTS = 3
+_FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """A fit, and what it says of the channels.
+
+    Attributes
+    ----------
+    found : Found
+    delay : float
+        s, by which the position is late.
+    span : float
+        rad, range of the motor's angle.
+    first : float
+        rad, the motor's first angle of those that were used.
+    """
+
+    found: Found
+    delay: float
+    span: float
+    first: float
+
+    @property
+    def largest(self) -> float:
+        """rad, up to where gaps were searched."""
+        return _FREE * self.span
+
+    @property
+    def tolerance(self) -> float:
+        """rad, of a search."""
+        return PRECISION * self.span
+
+
+def align_and_fit(
+    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: Settings
+) -> Aligned:
+    """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz); `prior` (rad) is one of the starts.
+
+    A delay of more than half a sample is taken off in whole samples, and the fit repeated: what is left of it is small
+    enough to be linear.
+    """
+    shift, gap = 0, prior
+    for attempt in range(_ALIGNMENTS):
+        ahead, behind = max(-shift, 0), max(shift, 0)
+        angle = theta_m[ahead : theta_m.size - behind]
+        seen = position[behind : position.size - ahead]
+        fitted = _fit(angle, seen, rate, servo, gap, settings, coarse=attempt == 0)
+        late = _delay(fitted.found) * rate if settings.skew else 0.0
+        if abs(late) <= 0.5 or abs(shift + late) > settings.largest_skew * rate or attempt == _ALIGNMENTS - 1:
+            break
+        shift, gap = shift + round(late), fitted.found.point.gap
+    return Aligned(fitted.found, (shift + late) / rate, fitted.span, fitted.first)
+
+
+def _fit(
+    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: Settings, coarse: bool
+) -> Aligned:
+    span = float(np.ptp(theta_m))
+    largest, tolerance = _FREE * span, PRECISION * span
+    model = response(servo, rate)
+    growth = Prior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
+    offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
+    reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
+    starts = [*np.linspace(0.0, span, settings.starts), min(prior, largest)]
+    near = starts if coarse else [prior]
+    first = coarse_fit(reduction, near, largest, tolerance, settings.kept)
+    found = refine(reduction, first, starts, largest, tolerance, settings.passes, settings.order)
+    return Aligned(found, 0.0, span, float(theta_m[0]))
+
+
+def _offset(settings: Settings, gain: float, angle: float, position: float) -> Prior | None:
+    """What is known of the constant in the position (m), which is the encoder's offset and where counting began."""
+    if settings.offset is None:
+        return None
+    mean, std = settings.offset
+    return Prior(gain * (angle + mean) - position, abs(gain) * std)
+
+
+def _delay(found: Found) -> float:
+    """s by which the position is late."""
+    nuisances = least_squares(found.rows[CONSTANT:], found.rows[RESIDUAL]).coefficients
+    fixed = len(found.reduction.fixed())
+    moving = nuisances[fixed:]
+    return -float(moving[-1])

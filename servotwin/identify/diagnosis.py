@@ -1,0 +1,58 @@
+"""When the model does not fit: which common fault of the channels would make it fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from servotwin.identify.normal import least_squares
+from servotwin.identify.passes import coarse_fit
+from servotwin.identify.reduction import CONSTANT, RESIDUAL, Reduction
+from servotwin.identify.response import response
+from servotwin.identify.unexplained import slow
+from servotwin.identify.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+_EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the channels as given leave
+_POSITION_UNITS = {"mm": 1e-3, "micrometres": 1e-6, "units of 1000 m": 1e3}
+_ANGLE_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi, "units of 57.3 rad": 180.0 / math.pi}
+_RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
+
+
+def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float) -> tuple[str, ...]:
+    """The first fault that, undone, lets the model explain the window; nothing when none does, or none is needed."""
+    if unexplained <= _EXPLAINS:
+        return ()
+    for sentence, angle, position, rate in _candidates(window, theta_m):
+        if _share_left(angle, position, rate, servo) < min(_EXPLAINS, _BETTER * unexplained):
+            return (sentence,)
+    return ()
+
+
+def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Array, float]]:
+    """What may be wrong, and angle, position and rate if that is undone."""
+    position, rate = window.position, window.sample_rate
+    yield "position and theta_m seem to be swapped", position, theta_m, rate
+    yield "position or theta_m seems to have the wrong sign", theta_m, -position, rate
+    for unit, factor in _POSITION_UNITS.items():
+        yield f"position seems to be in {unit}, not in m", theta_m, factor * position, rate
+    for unit, factor in _ANGLE_UNITS.items():
+        yield f"theta_m seems to be in {unit}, not in rad", factor * theta_m, position, rate
+    for factor in _RATES:
+        wrong = f"the sample rate seems to be {factor * rate:.6g} Hz, not {rate:.6g} Hz"
+        yield wrong, theta_m, position, factor * rate
+
+
+def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> float:
+    """Slow part of what a plain fit leaves, over that of the position."""
+    reduction = Reduction.of(theta_m, position, response(servo, rate), skew=False)
+    span = float(np.ptp(theta_m))
+    fit = coarse_fit(reduction, list(np.linspace(0.0, span, 9)), span, 1e-4 * span, 1)
+    table = reduction.table(fit.point)
+    left = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
+    interval = reduction.response.interval * reduction.decimation.factor
+    slow_left, slow_moved = slow(left, interval), slow(reduction.position, interval)
+    return float(np.sqrt(np.mean(slow_left**2)) / np.std(slow_moved))

@@ -1,0 +1,113 @@
+"""From a coarse fit to one in the noise that the window really has: fit, look at what is left, whiten, fit again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.identify.misfit import Misfit, Point
+from servotwin.identify.normal import least_squares
+from servotwin.identify.projection import orthonormal, project_out
+from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
+from servotwin.identify.search import Fit, descend, scan
+from servotwin.identify.whitening import Autoregression, burg
+from servotwin.plant.signals import Array
+
+_PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
+_SINGULAR = 1e-7  # of the derivative's length: what is left of it below this is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A fit with the noise in which it was made.
+
+    Attributes
+    ----------
+    reduction : Reduction
+    misfit : Misfit
+    fit : Fit
+    noise : Autoregression
+    rows : (k, m) array
+        Table of the reduction at the fit, whitened.
+    evaluations : int
+    """
+
+    reduction: Reduction
+    misfit: Misfit
+    fit: Fit
+    noise: Autoregression
+    rows: Array
+    evaluations: int
+
+    @property
+    def point(self) -> Point:
+        """The fit's gap and place."""
+        return self.fit.point
+
+    @property
+    def variance(self) -> float:
+        """Of the whitened residual; 1 where the noise was well described."""
+        return self.fit.slopes.cost / max(1, self.rows.shape[1] - len(self.misfit.basis) - 2)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the gap from the Schur complement of the information, rad; inf where there is none.
+
+        The Schur complement is the squared length of what is left of the derivative by the gap off all others.
+        """
+        return spread(self.rows[GAP], self.rows[PLACE:])
+
+
+def spread(derivative: Array, others: Array) -> float:
+    """Standard deviation of a parameter in white noise of variance 1, `others` (k, m) being estimated beside it."""
+    left = project_out(orthonormal(others), derivative[None])[0]
+    size = math.sqrt(float(left @ left))
+    return 1.0 / size if size > _SINGULAR * math.sqrt(float(derivative @ derivative)) else math.inf
+
+
+def coarse_fit(reduction: Reduction, starts: Sequence[float], largest: float, tolerance: float, keep: int) -> Fit:
+    """The best fit in white noise, from the best few of a grid of gaps (rad)."""
+    misfit = reduction.coarse()
+    fits = [descend(misfit, point, largest, tolerance) for point in scan(misfit, starts, keep)]
+    return min(fits, key=lambda fit: fit.slopes.cost)
+
+
+def refine(
+    reduction: Reduction, fit: Fit, starts: Sequence[float], largest: float, tolerance: float, passes: int, order: int
+) -> Found:
+    """The fit in the noise that it leaves itself, after some passes with autoregressions of at most `order`.
+
+    The last pass looks at the gaps of `starts` (rad) again: in the right noise another minimum may lie lower.
+    """
+    noise, evaluations = Autoregression.white(1.0), 0
+    for number in range(passes):
+        noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
+        misfit = reduction.misfit(noise, fit.point)
+        points = [fit.point, *(scan(misfit, starts, 1) if number == passes - 1 else [])]
+        fits = [descend(misfit, point, largest, tolerance) for point in points]
+        fit = min(fits, key=lambda fit: fit.slopes.cost)
+        evaluations += sum(fit.evaluations for fit in fits)
+    rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
+    return Found(reduction, misfit, fit, noise, rows, evaluations)
+
+
+def noise_left(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:
+    """The noise in the residual of a fit that was made with a first idea of it.
+
+    A fit takes noise away with every parameter, and most where the gap shows. What it may have taken is put back, as
+    as many equally likely series: one standard deviation up and down along every direction of the parameters.
+    """
+    table = reduction.table(point)
+    rows = reduction.prepared(noise, table, CONSTANT)
+    shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
+    left = table[RESIDUAL] - shares @ table[CONSTANT:]
+    if not np.any(left):
+        return Autoregression.white(1.0)
+    if not put:
+        return burg(left[None], order)
+    root = least_squares(rows[GAP:], rows[RESIDUAL]).root
+    taken = math.sqrt(len(root)) * (root @ table[GAP:])
+    return burg(np.vstack([left + taken, left - taken]), order)

@@ -1,0 +1,64 @@
+"""The profile-likelihood interval: every gap that the window does not contradict, whatever the screw's start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from servotwin.identify.estimate import Interval
+from servotwin.identify.misfit import Point
+from servotwin.identify.passes import Found
+from servotwin.identify.search import PLACES, descend
+
+_CHI_SQUARED_95 = 3.841458820694124
+_CLOSE, _TRIALS = 0.1, 12
+
+
+def profile_interval(found: Found, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
+    """95 % interval of the gap, rad; 0 or inf where the likelihood has no end on that side.
+
+    Parameters
+    ----------
+    found : Found
+    std : float
+        rad: where to look first; inf is allowed.
+    calibration : float
+        Of the standard deviation.
+    largest : float
+        rad: gaps above this are not told from each other.
+    tolerance : float
+        rad, of the search for the screw's start.
+    """
+    allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
+
+    def rise(gap: float) -> float:
+        """How much worse the best fit with this gap is, in units of what is allowed."""
+        places = {found.point.place} if abs(gap - found.point.gap) < 3.0 * std else {found.point.place, *PLACES}
+        fits = [descend(found.misfit, Point(gap, place), largest, tolerance, 12, held=True) for place in places]
+        return (min(fit.slopes.cost for fit in fits) - found.fit.slopes.cost) / allowed
+
+    first = min(1.96 * std, 0.5 * largest)
+    return _end(rise, found.point.gap, -first, 0.0), _end(rise, found.point.gap, first, largest)
+
+
+def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
+    """Where `rise` reaches 1 on one side, between what is known to be below and above; the far limit as 0 or inf."""
+    beyond = math.inf if limit > 0.0 else 0.0
+    room = abs(limit - middle)
+    inside, outside, size = 0.0, math.inf, abs(step)
+    for _ in range(_TRIALS):
+        at_limit = size >= room
+        size = min(size, room)
+        level = max(0.0, rise(middle + math.copysign(size, step)))
+        if abs(level - 1.0) < _CLOSE:
+            break
+        if level < 1.0:
+            if at_limit:
+                return beyond
+            inside = size
+        else:
+            outside = size
+        size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), 3.0)
+        if not inside < size < outside:
+            size = 0.5 * (inside + outside)
+    return middle + math.copysign(size, step)

@@ -1,0 +1,164 @@
+"""The default estimator: play operator and exact structure at the full rate, nuisances projected out, noise whitened.
+
+The residual and its derivatives are filtered, never the motor's angle: a filter commutes with the structure, not with
+the play operator. docs/estimator.md explains it and says how well it does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.aligned import Aligned, align_and_fit
+from servotwin.identify.channels import faults, motor_angle
+from servotwin.identify.contacts import travel
+from servotwin.identify.diagnosis import likely_fault
+from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus, Interval
+from servotwin.identify.gate import Evidence, judge
+from servotwin.identify.lostmotion import static_lost_motion
+from servotwin.identify.modelcheck import Shift, model_shift, observer_shift
+from servotwin.identify.profile import profile_interval
+from servotwin.identify.unexplained import noise_left, slow_share
+from servotwin.identify.whitened_settings import Settings
+from servotwin.identify.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+__all__ = ["METHOD", "Settings", "estimate"]
+
+METHOD = "whitened"
+_NORMAL_95 = 1.959963984540054
+_SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
+
+
+def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> GapEstimate:
+    """The total gap (rad) that a window with theta_m and position shows.
+
+    Parameters
+    ----------
+    window : Window
+    servo : Servo
+        The model; that it fits the window is checked.
+    prior : float or GapEstimate, optional
+        Total gap, rad: one of the starts, and what is given back when the window says nothing.
+    settings : Settings, optional
+
+    Raises
+    ------
+    InvalidInput
+        No theta_m, a window too short, a low-pass above half the sample rate.
+    """
+    settings = settings or Settings()
+    _check(window)
+    assert window.theta_m is not None
+    blank = _nothing(window, servo, prior)
+    broken = faults(window)
+    if broken:
+        dead = any("constant" in sentence for sentence in broken)
+        return replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
+    angle = motor_angle(window, servo.encoder_resolution, settings)
+    aligned = align_and_fit(angle, window.position, window.sample_rate, servo, _start(prior), settings)
+    seen = _evidence(aligned, window, angle, servo, settings)
+    status, reasons = judge(seen, settings)
+    if status is GapStatus.MODEL_MISMATCH:
+        reasons = (*likely_fault(window, angle, servo, seen.unexplained), *reasons)
+    return _stated(blank, seen, status, reasons, prior, settings)
+
+
+def _check(window: Window) -> None:
+    if window.theta_m is None:
+        raise InvalidInput(f"{window.where}the window has no theta_m: method 'whitened' needs the motor's angle in rad")
+    if window.position.size < _SHORTEST:
+        size = window.position.size
+        raise InvalidInput(f"{window.where}the window has {size} samples: method 'whitened' needs at least {_SHORTEST}")
+
+
+def _start(prior: float | GapEstimate | None) -> float:
+    value = prior.gap if isinstance(prior, GapEstimate) else prior
+    return 0.0 if value is None or not math.isfinite(value) else value
+
+
+def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, settings: Settings) -> Evidence:
+    found = aligned.found
+    std = settings.calibration * found.std * math.sqrt(max(1.0, found.variance))
+    gain = found.reduction.response.static_gain
+    identifiable = math.isfinite(found.std)
+    return Evidence(
+        aligned,
+        std,
+        profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
+        travel(found.reduction.theta_m, found.point.screw(0.0)),
+        model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, ""),
+        observer_shift(found, servo) if identifiable else (0.0, math.inf),
+        static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
+        slow_share(found),
+    )
+
+
+def _stated(
+    blank: GapEstimate,
+    seen: Evidence,
+    status: GapStatus,
+    reasons: tuple[str, ...],
+    prior: float | GapEstimate | None,
+    settings: Settings,
+) -> GapEstimate:
+    """The estimate that the evidence makes of a blank one."""
+    found = seen.aligned.found
+    half_window = 0.5 * found.reduction.theta_m.size * found.reduction.response.interval
+    systematic = math.hypot(settings.model_error, seen.shift.gap, settings.gap_rate * half_window)
+    result = replace(
+        blank,
+        status=status,
+        reasons=reasons,
+        rms=float(np.sqrt(np.mean(noise_left(found) ** 2))),
+        evaluations=found.evaluations,
+    )
+    if status is GapStatus.LOWER_BOUND:
+        bound = seen.interval[0]
+        return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
+    if status is not GapStatus.OK:
+        return result
+    total = math.hypot(seen.std, systematic)
+    first = seen.aligned.first + 0.5 * found.point.gap * found.point.place
+    result = replace(result, gap=found.point.gap, std=seen.std, std_total=total, theta_d0=first)
+    result = replace(result, interval=_widened(found.point.gap, seen.interval, systematic))
+    return _combined(result, prior) if settings.combine and isinstance(prior, GapEstimate) else result
+
+
+def _widened(gap: float, interval: Interval, systematic: float) -> Interval:
+    """A statistical interval with a systematic standard deviation (rad) added on both sides."""
+    extra = _NORMAL_95 * systematic
+    return max(0.0, gap - math.hypot(gap - interval[0], extra)), gap + math.hypot(interval[1] - gap, extra)
+
+
+def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
+    """The mean of two estimates, weighted by their total variances."""
+    if not (math.isfinite(prior.gap) and math.isfinite(prior.std_total) and prior.std_total > 0.0):
+        return estimate
+    share = estimate.std_total**2 / (estimate.std_total**2 + prior.std_total**2)
+    gap = estimate.gap + share * (prior.gap - estimate.gap)
+    total = math.sqrt(1.0 - share) * estimate.std_total
+    interval = max(0.0, gap - _NORMAL_95 * total), gap + _NORMAL_95 * total
+    std = math.hypot((1.0 - share) * estimate.std, share * prior.std)
+    return replace(estimate, gap=gap, std=std, std_total=total, interval=interval)
+
+
+def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
+    """What is known without the window: the prior."""
+    blank = GapEstimate(
+        gap=math.nan,
+        std=math.inf,
+        std_total=math.inf,
+        interval=NOTHING_KNOWN,
+        status=GapStatus.UNIDENTIFIABLE,
+        time=window.mid_time,
+        model_version=servo.version,
+        method=METHOD,
+    )
+    if isinstance(prior, GapEstimate):
+        return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)
+    return blank if prior is None else replace(blank, gap=prior)

@@ -1,0 +1,137 @@
+"""Noise as an autoregression, found by Burg's method, and the filter that makes it white.
+
+Burg's needs no window at the ends of the data; the autocorrelation method (Yule-Walker) has one, whose leakage hides
+the deep low-frequency notch of high-passed noise, exactly where the gap shows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from servotwin.hybrid.compiled import bare, compiled
+from servotwin.plant.signals import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Autoregression:
+    """Predictors of every order up to p, for a series of which less than p samples are known too.
+
+    Attributes
+    ----------
+    predictors : (p + 1, p + 1) array
+        Row k: prediction error filter of order k, 1 first.
+    spread : (p + 1,) array
+        Standard deviation of the prediction error of order k.
+    """
+
+    predictors: Array
+    spread: Array
+
+    @classmethod
+    def white(cls, std: float) -> Autoregression:
+        """No memory."""
+        return cls(np.ones((1, 1)), np.array([std]))
+
+    @property
+    def order(self) -> int:
+        """p."""
+        return self.spread.size - 1
+
+    def whiten(self, columns: Array) -> Array:
+        """(k, n) rows as errors of prediction over their standard deviation, from the first sample on.
+
+        Sample i is predicted from all i before it, at most from p. Noise of the model comes out white, of variance 1.
+        """
+        out = np.empty_like(columns)
+        whiten(columns, self.predictors, self.spread, out)
+        return out
+
+    def colour_back(self, weights: Array) -> Array:
+        """(n,) weights of the white innovations in a weighted sum (n,) of the noise, whose variance is their square.
+
+        The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
+        """
+        poles = self.predictors[-1]
+        return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])
+
+
+def burg(series: Array, most: int) -> Autoregression:
+    """The autoregression of equally likely series (s, n), its order chosen by the corrected Akaike criterion.
+
+    The order is at most `most`, and counted as if there were one series: the others say nothing new, they only state
+    what is not known of it.
+    """
+    predictors, power = recursion(series, most)
+    best = min(range(most + 1), key=lambda order: _criterion(float(power[order]), order, series.shape[1]))
+    return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
+
+
+def _criterion(power: float, order: int, size: int) -> float:
+    """AICc of a Gaussian autoregression; the power itself is one more parameter."""
+    count = order + 1
+    return size * math.log(max(power, 1e-300)) + 2.0 * count * size / max(1, size - count - 1)
+
+
+@compiled
+def recursion(series: Array, most: int) -> tuple[Array, Array]:
+    """Burg's recursion: prediction error filters (most + 1, most + 1) and powers (most + 1,) of all orders."""
+    count, size = series.shape
+    predictors, power = np.zeros((most + 1, most + 1)), np.zeros(most + 1)
+    predictors[0, 0] = 1.0
+    power[0] = np.sum(series * series) / (count * size)
+    forward, backward = series.copy(), series.copy()
+    for order in range(1, most + 1):
+        across = square = 0.0
+        for k in range(count):
+            one, two = correlation(forward[k], backward[k], order)
+            across += one
+            square += two
+        reflection = -2.0 * across / square if square > 0.0 else 0.0
+        for k in range(count):
+            reflect(forward[k], backward[k], order, reflection)
+        for i in range(order + 1):
+            last = predictors[order - 1, order - i] if i > 0 else 0.0
+            predictors[order, i] = predictors[order - 1, i] + reflection * last
+        power[order] = power[order - 1] * (1.0 - reflection * reflection)
+    return predictors, power
+
+
+@bare
+def correlation(forward: Array, backward: Array, order: int) -> tuple[float, float]:
+    """Sums of the products of both errors, and of their squares, the backward one a sample earlier."""
+    across = square = 0.0
+    for i in range(order, forward.size):
+        across += forward[i] * backward[i - 1]
+        square += forward[i] * forward[i] + backward[i - 1] * backward[i - 1]
+    return across, square
+
+
+@bare
+def reflect(forward: Array, backward: Array, order: int, reflection: float) -> None:
+    """One stage of the lattice, in place."""
+    for i in range(forward.size - 1, order - 1, -1):
+        ahead, behind = forward[i], backward[i - 1]
+        forward[i] = ahead + reflection * behind
+        backward[i] = behind + reflection * ahead
+
+
+@bare
+def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None:
+    """`Autoregression.whiten` into `out`: the first samples one by one, the others one coefficient at a time."""
+    most, size = spread.size - 1, columns.shape[1]
+    for k in range(len(columns)):
+        for i in range(min(most, size)):
+            total = 0.0
+            for j in range(i + 1):
+                total += predictors[i, j] * columns[k, i - j]
+            out[k, i] = total / spread[i]
+        for i in range(most, size):
+            out[k, i] = columns[k, i] / spread[most]
+        for j in range(1, most + 1):
+            share = predictors[most, j] / spread[most]
+            for i in range(most, size):
+                out[k, i] += share * columns[k, i - j]
