@@ -15,7 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.identify.decimation import Decimation, decimation
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.family import Hold
-from servotwin.identify.jointmodel import MOTOR_START, JointModel, margin_for
+from servotwin.identify.jointmodel import JUMP, MOTOR_START, JointModel, jumps, margin_for
 from servotwin.identify.jointsearch import Known, Stand, descend, scan, stand
 from servotwin.identify.jointsettings import SPREADS, JointSettings
 from servotwin.identify.jointverdict import JointEstimate, Parameter, stated
@@ -28,7 +28,7 @@ from servotwin.plant.signals import Array
 WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _STARTS, _APART, _RIVAL = 3, math.radians(0.3), 12.0  # minima closer than this are one; a rival's cost is as near
-_SAMPLES_HZ = 500.0  # what is kept: the structure answers up to some 20 Hz
+_SAMPLES_HZ = 250.0  # what is kept: the structure answers up to some 20 Hz
 
 
 __all__ = ["JointEstimate", "JointSettings", "Parameter", "Prior", "estimate_jointly"]
@@ -98,7 +98,9 @@ def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointS
     if window.position.size < 200 + 2 * margin:
         raise InvalidInput(f"{window.where}the window has {window.position.size} samples: at least {200 + 2 * margin}")
     hold = settings.hold or (Hold.LINEAR if servo.controller.sample_rate is None else Hold.CONSTANT)
-    return JointModel(window, servo, ("gap", "place", *delay, *free, *motor), hold, margin)
+    unsure = jumps(window.voltage) if motor and hold is Hold.LINEAR and window.voltage is not None else ()
+    names = ("gap", "place", *delay, *free, *motor, *(f"{JUMP}{index}" for index in unsure))
+    return JointModel(window, servo, names, hold, margin, unsure)
 
 
 def _known(model: JointModel, prior: float | GapEstimate | Prior | None, settings: JointSettings) -> Known:
@@ -113,6 +115,9 @@ def _known(model: JointModel, prior: float | GapEstimate | Prior | None, setting
         speed, current = size / model.servo.k_B, size / model.servo.R
         rows["speed0"] = (-4.0 * speed, 4.0 * speed, float(model.window.voltage[0]) / model.servo.k_B, speed)
         rows["current0"] = (-4.0 * current, 4.0 * current, 0.0, current)
+        for index in model.jumps:
+            area = 0.5 * abs(float(np.diff(model.window.voltage)[index])) / model.rate
+            rows[f"{JUMP}{index}"] = (-area, area, 0.0, area / math.sqrt(3.0))
     return Known(*(np.array(column) for column in zip(*(rows[name] for name in model.names), strict=True)))
 
 
@@ -147,8 +152,9 @@ def _search(
     values = dict(zip(model.names, start.tolist(), strict=True))
     gaps = np.unique(np.append(_GRID[settings.largest_gap_rad >= _GRID], values["gap"]))
     tolerance = _tolerance(model)
+    first = known.vague(np.array([name not in MOTOR_START and not name.startswith(JUMP) for name in model.names]))
     coarse = [
-        descend(model, begin, known.vague(), reduce.rows, 30.0 * tolerance)
+        descend(model, begin, first, reduce.rows, 30.0 * tolerance)
         for begin in scan(model, values, gaps, _STARTS, reduce.rows)
     ]
     minima = _distinct(sorted(coarse, key=lambda one: one.cost))
@@ -162,9 +168,10 @@ def _search(
 
 
 def _tolerance(model: JointModel) -> Array:
-    """(P,) steps that do not matter: 1e-5 deg, and 1e-7 of what is a logarithm."""
-    steps = {"gap": 1e-7, "place": 1e-6, "delay": 1e-10, "gap rate": 1e-7, "speed0": 1e-4, "current0": 1e-5}
-    return np.array([steps.get(name, 1e-7) for name in model.names])
+    """(P,) steps that do not matter: 3e-5 deg, and 1e-6 of what is a logarithm."""
+    steps = {"gap": 5e-7, "place": 1e-2, "delay": 1e-8, "gap rate": 1e-6, "speed0": 1e-3, "current0": 1e-4}
+    steps.update({f"{JUMP}{index}": 1e-8 for index in model.jumps})
+    return np.array([steps.get(name, 1e-6) for name in model.names])
 
 
 def _whitened(reduce: Decimation, noise: Autoregression):  # type: ignore[no-untyped-def]

@@ -24,7 +24,10 @@ from servotwin.plant.signals import Array
 
 Reduce: TypeAlias = Callable[[Array], Array]
 MOTOR_START = ("speed0", "current0")  # rad/s and A at the first sample, when only the voltage is known
+JUMP = "jump "  # V s: what a jump of the voltage between two samples adds to the area of the line between them
 _EDGE = 2  # samples that interpolation needs beyond the shift
+_ROUNDING = 1e-9  # of a derivative: what the nuisances leave of it below this is none
+_MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,8 @@ class JointModel:
         Of the voltage; counts only where theta_m is not measured.
     margin : int
         Samples left out at either end, so that any allowed delay finds its samples.
+    jumps : tuple of int
+        Samples after which the voltage jumps at a time unknown.
     """
 
     window: Window
@@ -59,6 +64,7 @@ class JointModel:
     names: tuple[str, ...]
     hold: Hold
     margin: int
+    jumps: tuple[int, ...] = ()
 
     @property
     def rate(self) -> float:
@@ -88,10 +94,17 @@ class JointModel:
             return self.window.theta_m - self.window.theta_m[0], {}
         assert self.window.voltage is not None
         start = np.array([values.get("current0", 0.0), values.get("speed0", 0.0), 0.0])
-        sampled = motor_family(servo).select(("k_B",)).sampled(self.rate, self.hold)
+        family = motor_family(servo).select(("k_B",))
+        sampled, kick = family.sampled(self.rate, self.hold), family.sampled(2.0 * self.rate).F[0] @ family.system.B
         angle, by_k_B = sampled.respond(self.window.voltage, start)
-        by_current, by_speed, _ = sampled.free(angle.size)
-        return angle, {"k_B": by_k_B, "current0": by_current, "speed0": by_speed}
+        free = sampled.free(angle.size)
+        by = {"k_B": by_k_B, "current0": free[0], "speed0": free[1]}
+        for index in self.jumps:
+            name = f"{JUMP}{index}"
+            by[name] = np.zeros(angle.size)
+            by[name][index + 1 :] = kick @ free[:, : angle.size - index - 1]
+            angle = angle + values.get(name, 0.0) * by[name]
+        return angle, by
 
     def screw(self, values: Mapping[str, float]) -> tuple[Servo, Array, Gap]:
         """The adapted servo, the motor's angle and the gap that the screw follows it through."""
@@ -130,6 +143,7 @@ class JointModel:
         )
         moved = reduce(np.array([self._row(derivatives[name], name, shift) for name in self.names]))
         left = project_out(orthonormal(rows[1:]), np.vstack([rows[:1], -moved]))
+        left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
         return Slopes(left[0], left[1:], float(left[0] @ left[0]))
 
     def _tangents(
@@ -176,6 +190,20 @@ class JointModel:
             (weight * rows[:, first + j : first + j + size] for j, weight in enumerate(weights)),
             start=np.zeros((len(rows), size)),
         )
+
+
+def jumps(voltage: Array) -> tuple[int, ...]:
+    """Samples after which a voltage (n,) jumps: where a controller lets go, takes hold, or has its reference stepped.
+
+    A jump is a difference that stands out from those before and after it, by much of the range and of what is usual.
+    """
+    change = np.diff(voltage)
+    usual = 0.5 * (np.abs(change[:-2]) + np.abs(change[2:]))
+    excess = np.abs(change[1:-1]) - 2.0 * np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
+    telling = excess > max(_TELLING * float(np.ptp(voltage)), _USUAL * float(np.median(usual)))
+    found = np.flatnonzero(telling)
+    largest = found[np.argsort(-excess[found], kind="stable")[:_MOST_JUMPS]]
+    return tuple(int(i) + 1 for i in np.sort(largest))
 
 
 def margin_for(limit: float, rate: float) -> int:

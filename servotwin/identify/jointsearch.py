@@ -12,7 +12,7 @@ from servotwin.identify.projection import orthonormal, project_out
 from servotwin.plant.signals import Array
 
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9
-_SMALL_GAIN = 1e-10  # of the cost: a step that gains less is the last
+_SMALL_GAIN = 1e-6  # of the cost: a step that gains less is the last; whitened, far below one standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +24,10 @@ class Known:
     mean: Array
     spread: Array
 
-    def vague(self) -> Known:
-        """The bounds alone."""
-        return replace(self, spread=np.full_like(self.spread, np.inf))
+    def vague(self, kept: Array) -> Known:
+        """The bounds alone, and parameters that are not `kept` (P,) held at their means: for a first search."""
+        lowest, highest = np.where(kept, self.lowest, self.mean), np.where(kept, self.highest, self.mean)
+        return Known(lowest, highest, self.mean, np.full_like(self.spread, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
