@@ -62,6 +62,13 @@ class GapEstimate:
     rms: float = math.nan
     evaluations: int = 0
 
+    def __post_init__(self) -> None:
+        # What the numbers libraries return becomes plain: estimates go into messages and logs.
+        for name in ("gap", "std", "std_total", "time", "theta_d0", "rms"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        low, high = self.interval
+        object.__setattr__(self, "interval", (float(low), float(high)))
+
     @property
     def ok(self) -> bool:
         """Whether the value may be used to set a controller."""
