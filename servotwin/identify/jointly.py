@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.identify.channels import faults, motor_angle
 from servotwin.identify.decimation import Decimation, decimation
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.family import Hold
@@ -20,6 +21,7 @@ from servotwin.identify.jointsearch import Known, Stand, descend, scan, stand
 from servotwin.identify.jointsettings import SPREADS, JointSettings
 from servotwin.identify.jointverdict import JointEstimate, Parameter, stated
 from servotwin.identify.trend import Prior
+from servotwin.identify.whitened_settings import Settings as Whitened
 from servotwin.identify.whitening import Autoregression, burg
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
@@ -28,7 +30,7 @@ from servotwin.plant.signals import Array
 WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _STARTS, _APART, _RIVAL = 3, math.radians(0.3), 12.0  # minima closer than this are one; a rival's cost is as near
-_SAMPLES_HZ = 250.0  # what is kept: the structure answers up to some 20 Hz
+_SAMPLES_HZ = 160.0  # what is kept: the structure answers up to some 20 Hz, and short autoregressions reach far back
 
 
 __all__ = ["JointEstimate", "JointSettings", "Parameter", "Prior", "estimate_jointly"]
@@ -62,11 +64,15 @@ def estimate_jointly(
         Unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short; an elastic screw.
     """
     given = settings or JointSettings()
-    model = _model(window, servo, _free(window, free), given)
+    names, broken = _free(window, free), _faults(window)
+    if window.theta_m is not None and not broken:
+        window = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, Whitened()))
+    model = _model(window, servo, names, given)
     known, start = _known(model, prior, given), _start(model, prior)
     reduce = decimation(max(1, int(window.sample_rate / _SAMPLES_HZ)))
-    if _still(window):
-        return stated(model, stand(model, start, known, reduce.rows), given, "the window's signals do not move")
+    if broken or _still(window):
+        silence = "the voltage is constant: nothing shows how the motor moved"
+        return stated(model, stand(model, start, known, reduce.rows), given, "; ".join(broken) or silence)
     found, rival = _search(model, known, start, reduce, given)
     return stated(model, found, given, rival)
 
@@ -139,10 +145,16 @@ def _gap_of(prior: float | GapEstimate | Prior | None) -> float | None:
     return gap
 
 
+def _faults(window: Window) -> tuple[str, ...]:
+    """What is plainly wrong with the channels that are used."""
+    angle = window.position if window.theta_m is None else window.theta_m
+    sentences = faults(Window(window.position, angle, sample_rate=window.sample_rate))
+    return tuple(one for one in sentences if window.theta_m is not None or not one.startswith("theta_m"))
+
+
 def _still(window: Window) -> bool:
-    """Whether what drives the model, or what it should explain, is constant."""
-    driver = window.voltage if window.theta_m is None else window.theta_m
-    return driver is None or np.ptp(driver) == 0.0 or np.ptp(window.position) == 0.0
+    """Whether the voltage is all there is, and constant."""
+    return window.theta_m is None and window.voltage is not None and float(np.ptp(window.voltage)) == 0.0
 
 
 def _search(

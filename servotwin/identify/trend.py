@@ -254,6 +254,11 @@ class Trend:
         """What the next window may start from; predict to its time first."""
         return Prior(self.gap, self.gap_std, float(self.mean[OFFSET]), math.sqrt(self.covariance[OFFSET, OFFSET]))
 
+    def as_estimate(self) -> GapEstimate:
+        """The state as a prior for `estimate_gap`; predict to the next window's time first."""
+        std = math.sqrt(self.covariance[GAP, GAP])
+        return GapEstimate(self.gap, std, self.gap_std, self.gap_interval, GapStatus.OK, self.time, method="trend")
+
     def time_until(self, gap: float) -> Passage:
         """How long from now until the gap (rad, total) has grown to `gap`: see `servotwin.identify.passage`.
 
