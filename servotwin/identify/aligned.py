@@ -15,7 +15,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 PRECISION = 1e-9  # of the motor's range: how closely a minimum is approached
-_ALIGNMENTS = 3
+_ALIGNMENTS, _NARROWEST = 3, 0.01
 _FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
 
 
@@ -80,11 +80,16 @@ def _fit(
     growth = Prior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
     offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
     reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
-    starts = [*np.linspace(0.0, span, settings.starts), min(prior, largest)]
+    starts = [*gaps_to_try(span, settings.starts), min(prior, largest)]
     near = starts if coarse else [prior]
     first = coarse_fit(reduction, near, largest, tolerance, settings.kept)
     found = refine(reduction, first, starts, largest, tolerance, settings.passes, settings.order)
     return Aligned(found, 0.0, span, float(theta_m[0]))
+
+
+def gaps_to_try(span: float, count: int) -> list[float]:
+    """Zero and gaps from a hundredth of the motor's range (rad) to all of it, each a constant factor wider."""
+    return [0.0, *(float(gap) for gap in np.geomspace(_NARROWEST * span, span, count - 1))]
 
 
 def _offset(settings: Settings, gain: float, angle: float, position: float) -> Prior | None:

@@ -12,11 +12,12 @@ from servotwin.identify.misfit import Misfit, Point
 from servotwin.identify.normal import least_squares
 from servotwin.identify.projection import orthonormal, project_out
 from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.search import Fit, descend, scan
+from servotwin.identify.search import Fit, descend, search
 from servotwin.identify.whitening import Autoregression, burg
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
+RESTARTS = 5
 _SINGULAR = 1e-7  # of the derivative's length: what is left of it below this is rounding
 
 
@@ -71,8 +72,7 @@ def spread(derivative: Array, others: Array) -> float:
 def coarse_fit(reduction: Reduction, starts: Sequence[float], largest: float, tolerance: float, keep: int) -> Fit:
     """The best fit in white noise, from the best few of a grid of gaps (rad)."""
     misfit = reduction.coarse()
-    fits = [descend(misfit, point, largest, tolerance) for point in scan(misfit, starts, keep)]
-    return min(fits, key=lambda fit: fit.slopes.cost)
+    return min(search(misfit, starts, largest, tolerance, keep), key=lambda fit: fit.slopes.cost)
 
 
 def refine(
@@ -86,8 +86,9 @@ def refine(
     for number in range(passes):
         noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
         misfit = reduction.misfit(noise, fit.point)
-        points = [fit.point, *(scan(misfit, starts, 1) if number == passes - 1 else [])]
-        fits = [descend(misfit, point, largest, tolerance) for point in points]
+        fits = [descend(misfit, fit.point, largest, tolerance)]
+        if number == passes - 1:
+            fits += search(misfit, starts, largest, tolerance, RESTARTS)
         fit = min(fits, key=lambda fit: fit.slopes.cost)
         evaluations += sum(fit.evaluations for fit in fits)
     rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from servotwin.identify.estimate import Interval
 from servotwin.identify.misfit import Point
 from servotwin.identify.passes import Found
-from servotwin.identify.search import PLACES, descend
+from servotwin.identify.search import PLACE_ONLY, PLACES, descend
 
 _CHI_SQUARED_95 = 3.841458820694124
 _CLOSE, _TRIALS = 0.1, 12
@@ -34,7 +34,7 @@ def profile_interval(found: Found, std: float, calibration: float, largest: floa
     def rise(gap: float) -> float:
         """How much worse the best fit with this gap is, in units of what is allowed."""
         places = {found.point.place} if abs(gap - found.point.gap) < 3.0 * std else {found.point.place, *PLACES}
-        fits = [descend(found.misfit, Point(gap, place), largest, tolerance, 12, held=True) for place in places]
+        fits = [descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY) for place in places]
         return (min(fit.slopes.cost for fit in fits) - found.fit.slopes.cost) / allowed
 
     first = min(1.96 * std, 0.5 * largest)

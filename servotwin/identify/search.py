@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.identify.misfit import Misfit, Point, Slopes
 
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
-PLACES = (-1.0, 0.0, 1.0)
+
+
+class Free(NamedTuple):
+    """What a search may change."""
+
+    gap: bool
+    place: bool
+
+
+BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
+PLACES, _WITHIN = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +34,17 @@ class Fit:
     converged: bool
 
 
-def descend(misfit: Misfit, start: Point, largest: float, tolerance: float, steps: int = 60, held: bool = False) -> Fit:
-    """From a start to the nearest minimum with 0 <= gap <= largest (rad); it ends when a step moves the gap, and the
-    screw's start, by less than `tolerance` (rad). With `held`, the gap stays."""
+def descend(
+    misfit: Misfit, start: Point, largest: float, tolerance: float, steps: int = 60, free: Free = BOTH
+) -> Fit:
+    """From a start to the nearest minimum with 0 <= gap <= largest (rad).
+
+    It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises next to no
+    gain. What is not `free` keeps its value.
+    """
     point, here, damping = start, misfit.slopes(start), _FIRST_DAMPING
     for count in range(1, steps):
-        step = _step(here, point, damping, largest, held)
+        step = _step(here, point, damping, largest, free)
         trial = _bounded(point, step, largest)
         if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= _GAIN * here.cost:
             return Fit(point, here, count, True)
@@ -42,13 +58,13 @@ def descend(misfit: Misfit, start: Point, largest: float, tolerance: float, step
     return Fit(point, here, steps, False)
 
 
-def _step(here: Slopes, point: Point, damping: float, largest: float, held: bool) -> tuple[float, float]:
+def _step(here: Slopes, point: Point, damping: float, largest: float, free: Free) -> tuple[float, float]:
     """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
     J = here.jacobian
     a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
     g, h = -float(J[0] @ here.residual), -float(J[1] @ here.residual)
-    gap_free = not held and not ((point.gap <= 0.0 and g < 0.0) or (point.gap >= largest and g > 0.0))
-    place_free = not ((point.place <= -1.0 and h < 0.0) or (point.place >= 1.0 and h > 0.0)) and c > 0.0
+    gap_free = free.gap and not ((point.gap <= 0.0 and g < 0.0) or (point.gap >= largest and g > 0.0))
+    place_free = free.place and not ((point.place <= -1.0 and h < 0.0) or (point.place >= 1.0 and h > 0.0)) and c > 0.0
     a, c = a * (1.0 + damping), c * (1.0 + damping)
     if gap_free and place_free and a * c - b * b > _FLOOR * a * c:
         determinant = a * c - b * b
@@ -71,8 +87,31 @@ def _distance(one: Point, other: Point) -> float:
     return max(abs(one.gap - other.gap), 0.5 * other.gap * abs(one.place - other.place))
 
 
-def scan(misfit: Misfit, gaps: Sequence[float], keep: int) -> list[Point]:
-    """The `keep` best starts of a grid of gaps (rad) and places."""
-    points = [Point(gap, place) for gap in gaps for place in PLACES]
-    costs = np.array([misfit.cost(point) for point in points])
-    return [points[i] for i in np.argsort(costs, kind="stable")[:keep]]
+def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Fit]:
+    """Minima from several starts: for every place of the screw the best of some gaps (rad), the best `count` of those.
+
+    First the gap alone descends. From where the screw rests for long, gap and place move it alike, and nothing leads
+    back to where it does not rest: the place must not go there early.
+    """
+    best: list[tuple[float, Point]] = []
+    for place in PLACES:
+        points = [Point(gap, place) for gap in gaps]
+        costs = [misfit.cost(point) for point in points]
+        lowest = int(np.argmin(costs))
+        best.append((costs[lowest], points[lowest]))
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY) for _, point in sorted(best)[:count]]
+    return [_continued(misfit, fit, largest, tolerance) for fit in near]
+
+
+def _continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """On with both; and again from within, if the screw would have begun in contact.
+
+    There its place has no derivative, because the contact undoes it at once; that says nothing of a little further in.
+    """
+    ends = [descend(misfit, fit.point, largest, tolerance)]
+    if abs(ends[0].point.place) == 1.0:
+        starts = [ends[0].point._replace(place=share * ends[0].point.place) for share in _WITHIN]
+        ends += [descend(misfit, start, largest, tolerance) for start in starts]
+    best = min(ends, key=lambda end: end.slopes.cost)
+    evaluations = fit.evaluations + sum(end.evaluations for end in ends)
+    return Fit(best.point, best.slopes, evaluations, best.converged)
