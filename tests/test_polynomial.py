@@ -134,3 +134,9 @@ def test_random_roots(inside: list[float], outside: list[float], scale: float) -
     for k, root in enumerate(roots):
         assert first_in_pieces(c * (-1.0) ** k, low) == pytest.approx(root, abs=1e-9)
         low = root + 1e-3
+
+
+def test_two_roots_between_two_nodes() -> None:
+    """The cubic through the ends of [0.4, 0.6] stays below zero here, the quartic does not."""
+    assert first(with_roots(0.25, 0.5, 0.5625, 0.625), 0.26, 1.0) == pytest.approx(0.5, rel=1e-12)
+    assert first(with_roots(0.5, 0.5625, 0.625), 0.4, 0.6) == pytest.approx(0.5, rel=1e-12)

@@ -7,7 +7,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined
 from servotwin.hybrid.flow import Scratch, dot, dot_sizes, product
-from servotwin.hybrid.polynomial import first_positive
+from servotwin.hybrid.polynomial import CUBIC_ERROR, first_positive, fourth_derivative_bound
 from servotwin.hybrid.tables import PIECES, TERMS, Tables
 
 # A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero.
@@ -65,9 +65,10 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
 def _search_unit(t: Tables, scratch: Scratch) -> float:
     c, b = scratch.series, scratch.rows
     product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
+    error = CUBIC_ERROR * fourth_derivative_bound(c, 1.0) / PIECES**4
     for piece in range(PIECES):
         at = 3 * piece
-        if max(b[at], b[at + 1], b[at + 2], b[at + 3]) > 0.0:
+        if max(b[at], b[at + 1], b[at + 2], b[at + 3]) + error > 0.0:
             root = first_positive(c, piece / PIECES, (piece + 1) / PIECES, scratch.starts, scratch.ends)
             if root < np.inf:
                 return root

@@ -10,6 +10,10 @@ from servotwin.hybrid.compiled import inlined
 DEPTH = 40
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-9
+# A cubic with the values and slopes of f at both ends of an interval of length h differs from f by at most h**4 / 384
+# times the largest fourth derivative; its slope by sqrt(3) h**3 / 216 times that.
+CUBIC_ERROR = 1.0 / 384.0
+SLOPE_ERROR = 3.0**0.5 / 216.0
 
 
 @inlined
@@ -44,14 +48,25 @@ def bracketed_root(c: Array, low: float, high: float, at_low: float, at_high: fl
 
 
 @inlined
+def fourth_derivative_bound(c: Array, end: float) -> float:
+    """Bound of the fourth derivative's size on [0, end]."""
+    bound = 0.0
+    for k in range(len(c) - 1, 3, -1):
+        bound = bound * end + abs(c[k]) * (k * (k - 1) * (k - 2) * (k - 3))
+    return bound
+
+
+@inlined
 def first_positive(c: Array, low: float, high: float, starts: Array, ends: Array) -> float:
     """First t in (low, high] from which ``p > 0``, given ``p(low) <= 0``; inf when there is none.
 
-    Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero or rises
-    through it monotonically. `starts` and `ends` are working memory for DEPTH + 2 intervals.
+    Intervals are halved, left first, until their cubic (values and slopes at the ends) stays below zero, or rises
+    through it monotonically, by more than it can differ from the polynomial. `starts` and `ends` are working memory
+    for DEPTH + 2 intervals.
     """
     starts[0], ends[0] = low, high
     smallest = (high - low) * 0.5**DEPTH
+    fourth = fourth_derivative_bound(c, high)
     top = 1
     while top > 0:
         top -= 1
@@ -62,9 +77,11 @@ def first_positive(c: Array, low: float, high: float, starts: Array, ends: Array
         inner_a, inner_b = at_a + third * slope_a, at_b - third * slope_b
         if at_a > 0.0:
             return a
-        if max(inner_a, inner_b, at_b) <= 0.0:
+        cubed = (b - a) * (b - a) * (b - a)
+        if max(at_a, inner_a, inner_b, at_b) + CUBIC_ERROR * fourth * cubed * (b - a) <= 0.0:
             continue
-        rises = at_b > 0.0 and slope_a >= 0.0 and slope_b > 0.0 and inner_b >= inner_a
+        slope_error = SLOPE_ERROR * fourth * cubed
+        rises = at_b > 0.0 and min(slope_a, slope_b, (inner_b - inner_a) / third) >= slope_error
         if rises or b - a <= smallest:
             if at_b > 0.0:
                 return bracketed_root(c, a, b, at_a, at_b)
