@@ -134,6 +134,27 @@ def limit_cycle(
     tell(servo, gap_deg, tolerance_mm, step_mm, enter, leave, json)
 
 
+@app.command()
+def tune(
+    crossover: Annotated[float, typer.Argument(help="Wanted gain crossover, rad/s.")],
+    phase_margin_deg: Annotated[float, typer.Argument(help="Wanted phase margin there, deg.")],
+    servo: Annotated[str, typer.Option(help="A preset's name or a servo's TOML.")] = "paper",
+    kind: Annotated[str, typer.Option("--type", help="P, PI, PD, PDF, PID or PIDF.")] = "PIDF",
+    ms_max: Annotated[float, typer.Option(help="Largest sensitivity peak that is accepted.")] = float("inf"),
+    prefer: Annotated[
+        str, typer.Option(help="Ms: smallest Ms, then largest Ki; Ki: largest Ki within --ms-max.")
+    ] = "Ms",
+    delay_ms: Annotated[float, typer.Option(help="A delay in series with the plant.")] = 0.0,
+    b: Annotated[float, typer.Option(help="Setpoint weight of the proportional term.")] = 1.0,
+    c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; as b by default.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+) -> None:
+    """Gains for a crossover and a phase margin, with every crossover and Ms beside the present controller's."""
+    from servotwin.redesign.tunetable import Request, tell
+
+    tell(Request(servo, kind, crossover, phase_margin_deg, ms_max, prefer, delay_ms, b, c), json)
+
+
 def main() -> None:
     """Entry point of the `servotwin` command."""
     app()

@@ -1,0 +1,83 @@
+"""The second degree of freedom: setpoint weights, as a filter of the reference, so that the law stays what it is.
+
+With weights b and c the law would act on b r - y and c r - y in its proportional and derivative terms. On a linear loop
+that equals the unchanged law with its reference filtered by F = C_r / C,
+
+    C_r = b Kp + Ki / s + c Kd s / (Tf s + 1),
+
+which leaves margins, Ms and everything that a dead zone or a gap does at rest untouched.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.polynomial import polynomial as poly
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.linear import LinearSystem, series
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array, Samples
+
+
+def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
+    """F for setpoint weights.
+
+    Parameters
+    ----------
+    controller : Controller
+        With integral action.
+    b, c : float
+        Shares of the reference in the proportional and derivative terms, within 0 .. 1; both 1 is no filter.
+
+    Raises
+    ------
+    InvalidInput
+        A weight is outside its range, there is no integral action (F would not have gain 1 at rest), or the
+        controller's zeros are not stable (they are F's poles).
+    """
+    for name, weight in (("b", b), ("c", c)):
+        if not (math.isfinite(weight) and 0.0 <= weight <= 1.0):
+            raise InvalidInput(f"setpoint weight {name} = {weight!r}: must be within 0 and 1")
+    g = controller
+    if g.Ki == 0.0:
+        raise InvalidInput("setpoint weights need integral action: without it they would change the gain at rest")
+    above = np.array([g.Ki, b * g.Kp + g.Ki * g.Tf, b * g.Kp * g.Tf + c * g.Kd])
+    below = np.array([g.Ki, g.Kp + g.Ki * g.Tf, g.Kp * g.Tf + g.Kd])
+    # What cancels but for rounding is zero: a controller with one zero only.
+    rounding = 1e-9 * np.array([0.0, abs(g.Kp) + abs(g.Ki) * g.Tf, abs(g.Kp) * g.Tf + abs(g.Kd)])
+    above[np.abs(above) <= rounding] = below[np.abs(below) <= rounding] = 0.0
+    order = int(np.flatnonzero(below)[-1])
+    zeros = poly.polyroots(below[: order + 1])
+    if np.any(zeros.real >= 0.0):
+        raise InvalidInput(f"setpoint weights need a controller whose zeros are stable; its zeros are {zeros} 1/s")
+    if np.any(above[order + 1 :] != 0.0):
+        raise InvalidInput(f"setpoint weights b = {b:g}, c = {c:g}: Kp Tf = -Kd, so only c = b gives a proper filter")
+    return _realised(above[: order + 1], below[: order + 1])
+
+
+def shaped(controller: Controller, b: float, c: float, size: float, duration: float, rate: float) -> Samples:
+    """A reference step of a size (m) behind the prefilter, sampled at a rate (Hz) and held, for a simulation."""
+    times = np.arange(round(duration * rate) + 1) / rate
+    return Samples(times.tolist(), (size * prefilter(controller, b, c).step(times)).tolist())
+
+
+def overshoot(servo: Servo, controller: Controller, b: float = 1.0, c: float = 1.0) -> float:
+    """Overshoot of the linear loop's step response (no gap) as a part of the step, in ten turns of the slowest pole."""
+    closed = servo.closed_loop(controller)
+    system = closed if b == c == 1.0 else series(prefilter(controller, b, c), closed)
+    slowest = float(np.min(np.abs(system.poles())))
+    response = system.step(np.linspace(0.0, 20.0 * math.pi / slowest, 20_001))
+    return float(np.max(response) - 1.0)
+
+
+def _realised(above: Array, below: Array) -> LinearSystem:
+    """State space (controllable form) of a proper fraction of polynomials, ascending."""
+    order = below.size - 1
+    direct = float(above[-1] / below[-1])
+    rest = (above - direct * below)[:-1] / below[-1]
+    A = np.eye(order, k=1)
+    A[-1:] = -below[:-1] / below[-1]
+    return LinearSystem(A, np.eye(order)[-1] if order else np.zeros(0), rest, direct, above, below)
