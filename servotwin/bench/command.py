@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -90,7 +91,7 @@ def table(result: Result) -> Table:
         shown.add_column(heading, justify="right")
     shown.add_column("notes")
     for row in result.rows:
-        shown.add_row(row.name, *_numbers(result, row, workload.checks), result.note(row))
+        shown.add_row(row.name, *_numbers(result, row, workload.checks), escape(result.note(row)))
     return shown
 
 

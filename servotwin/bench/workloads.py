@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -15,6 +16,12 @@ from servotwin.plant.signals import SCurve, SquareWave
 
 UNIT = 1e-3  # m: what errors of a position are divided by
 PRESET = "table1"
+
+
+@cache
+def the_servo() -> Servo:
+    """The preset of all workloads, read once."""
+    return Servo.preset(PRESET)
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class Wear:
 
     @property
     def servo(self) -> Servo:
-        return Servo.preset(PRESET)
+        return the_servo()
 
     @property
     def tolerance(self) -> float:
@@ -103,7 +110,7 @@ class Sweep:
 
     @property
     def servo(self) -> Servo:
-        return Servo.preset(PRESET)
+        return the_servo()
 
     @property
     def members(self) -> tuple[Array, Array]:
