@@ -58,14 +58,16 @@ NAMES = ["continuous", "dead zone", "sampled", "paper's noise"]
 
 
 @pytest.mark.parametrize("loop", LOOPS, ids=NAMES)
-@pytest.mark.parametrize(("preset", "gap_deg"), [("paper", 4.0), ("paper", 18.0), ("table1", 10.0)])
-def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, loop):
-    """From k 5 %, c 20 %, pitch 1 % off: the target is 0.03 deg."""
+@pytest.mark.parametrize(
+    ("preset", "gap_deg", "limit"), [("paper", 4.0, 0.03), ("paper", 18.0, 0.03), ("table1", 10.0, 0.05)]
+)
+def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, limit, loop):
+    """From k 5 %, c 20 %, pitch 1 % off: 0.03 deg; in `table1`, whose screw moves half as far, more."""
     run = run_of(preset, gap_deg, *loop)
     for window in windows(run):
         found = estimate_jointly(window, scaled(run.servo, **WRONG))
         assert found.gap.ok, found.gap.reasons
-        assert math.degrees(found.gap.gap) == pytest.approx(gap_deg, abs=0.03)
+        assert math.degrees(found.gap.gap) == pytest.approx(gap_deg, abs=limit)
         assert found.parameters["k/m"].factor == pytest.approx(1.0 / 1.05, abs=1e-3)
         assert found.parameters["c/m"].factor == pytest.approx(1.0 / 1.2, abs=5e-3)
         assert found.parameters["pitch"].factor == pytest.approx(1.0 / 1.01, abs=5e-4)
@@ -132,7 +134,7 @@ def test_a_gap_that_grows_within_the_window():
 
 
 def test_stated_spread_is_that_of_many_fits():
-    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.2."""
+    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.4."""
     run = run_of("paper", 10.0, False, False)
     servo, rng, errors, stated = scaled(run.servo, **WRONG), np.random.default_rng(8), [], []
     clean = Window.from_run(run, 5.0, 1.0)

@@ -17,12 +17,13 @@ from servotwin.identify.decimation import Decimation, decimation
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.family import Hold
 from servotwin.identify.jointmodel import JUMP, MOTOR_START, JointModel, jumps, margin_for
+from servotwin.identify.jointnoise import noise_left
 from servotwin.identify.jointsearch import Known, Stand, descend, scan, stand
 from servotwin.identify.jointsettings import SPREADS, JointSettings
 from servotwin.identify.jointverdict import JointEstimate, Parameter, stated
 from servotwin.identify.trend import Prior
 from servotwin.identify.whitened_settings import Settings as Whitened
-from servotwin.identify.whitening import Autoregression, burg
+from servotwin.identify.whitening import Autoregression
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -30,7 +31,7 @@ from servotwin.plant.signals import Array
 WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _STARTS, _APART, _RIVAL = 3, math.radians(0.3), 12.0  # minima closer than this are one; a rival's cost is as near
-_SAMPLES_HZ = 160.0  # what is kept: the structure answers up to some 20 Hz, and short autoregressions reach far back
+_SAMPLES_HZ = 250.0  # what is kept: with fewer the noise model fits itself to the residual, spreads come out small
 
 
 __all__ = ["JointEstimate", "JointSettings", "Parameter", "Prior", "estimate_jointly"]
@@ -171,8 +172,9 @@ def _search(
     ]
     minima = _distinct(sorted(coarse, key=lambda one: one.cost))
     evaluations = sum(one.evaluations for one in coarse)
-    for _ in range(settings.whitenings):
-        noise = burg(_raw(model, minima[0], reduce)[None], settings.noise_order)
+    noise = Autoregression.white(1.0)
+    for number in range(settings.whitenings):
+        noise = noise_left(model, minima[0], reduce, noise, settings.noise_order, put=number == settings.whitenings - 1)
         refined = [descend(model, one.point, known, _whitened(reduce, noise), tolerance) for one in minima]
         evaluations += sum(one.evaluations for one in refined)
         minima = [one for one in _distinct(sorted(refined, key=lambda one: one.cost)) if _near(one, refined)]
@@ -188,11 +190,6 @@ def _tolerance(model: JointModel) -> Array:
 
 def _whitened(reduce: Decimation, noise: Autoregression):  # type: ignore[no-untyped-def]
     return lambda rows: noise.whiten(reduce.rows(rows))
-
-
-def _raw(model: JointModel, found: Stand, reduce: Decimation) -> Array:
-    """The residual of a fit before whitening."""
-    return model.slopes(dict(zip(model.names, found.point.tolist(), strict=True)), reduce.rows).residual
 
 
 def _distinct(stands: list[Stand]) -> list[Stand]:

@@ -129,6 +129,15 @@ class JointModel:
 
     def slopes(self, values: Mapping[str, float], reduce: Reduce) -> Slopes:
         """Residual and derivatives; those of the nuisances by the parameters are included."""
+        table = self.table(values, reduce)
+        split = table.shape[0] - len(self.names)
+        basis, moved = orthonormal(table[1:split]), table[split:]
+        left = project_out(basis, np.vstack([table[:1], -moved]))
+        left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
+        return Slopes(left[0], left[1:], float(left[0] @ left[0]))
+
+    def table(self, values: Mapping[str, float], reduce: Reduce) -> Array:
+        """(1 + N + 1 + P, m) measured less forced position, nuisances, derivatives of the position by `names`."""
         servo = self.adapted(values)
         theta_m, by_motor = self.motor(servo, values)
         at = self.gap_at(theta_m, values)
@@ -138,13 +147,9 @@ class JointModel:
         forced = self.delayed(structure.plain(seen[:1]), shift)
         rows = reduce(np.vstack([self.measured - forced, self.nuisances(structure, shift)]))
         weights = np.linalg.lstsq(rows[1:].T, rows[0], rcond=None)[0]
-        derivatives = self._derivatives(
-            structure, seen, weights[:-1], self._tangents(seen, theta_m, at, by_motor, values)
-        )
-        moved = reduce(np.array([self._row(derivatives[name], name, shift) for name in self.names]))
-        left = project_out(orthonormal(rows[1:]), np.vstack([rows[:1], -moved]))
-        left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
-        return Slopes(left[0], left[1:], float(left[0] @ left[0]))
+        tangents = self._tangents(seen, theta_m, at, by_motor, values)
+        derivatives = self._derivatives(structure, seen, weights[:-1], tangents)
+        return np.vstack([rows, reduce(np.array([self._row(derivatives[name], name, shift) for name in self.names]))])
 
     def _tangents(
         self, seen: Array, theta_m: Array, at: Gap, by_motor: Mapping[str, Array], values: Mapping[str, float]

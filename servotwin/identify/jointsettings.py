@@ -52,10 +52,10 @@ class JointSettings:
     largest_gap_rad: float = math.radians(60.0)
     hold: Hold | None = None
     contact_travel_rad: float = math.radians(0.5)
-    largest_std_rad: float = math.radians(0.2)
+    largest_std_rad: float = math.radians(0.25)
     model_error_rad: float = math.radians(0.02)
     unexplained: float = 0.5
-    inflation: float = 1.2
+    inflation: float = 1.4
     noise_order: int = 30
     whitenings: int = 3
 

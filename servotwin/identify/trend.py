@@ -8,7 +8,7 @@ estimate corrects the state with its `std_total`; the state gives the next windo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -16,69 +16,13 @@ from scipy.special import log_ndtr
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, GapStatus, Interval
 from servotwin.identify.passage import Passage, passage
+from servotwin.identify.trendsettings import TrendSettings
 from servotwin.plant.signals import Array
+
+__all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
 
 NORMAL_95 = 1.959963984540054
 GAP, RATE, OFFSET = 0, 1, 2
-
-
-@dataclass(frozen=True)
-class TrendSettings:
-    """What is assumed of wear before anything was measured. `for_wear` derives all of it from two plain numbers.
-
-    Parameters
-    ----------
-    gap_std_rad, rate_std_rad_per_s, offset_std_rad : float
-        Spread, around zero, of the total gap, its rate and the encoder's offset before the first window.
-    gap_walk_rad_per_sqrt_s : float
-        Random walk of the gap itself, on top of its rate.
-    rate_walk_rad_per_s_per_sqrt_s : float
-        Random walk of the rate: how fast wear may change its pace.
-    offset_walk_rad_per_sqrt_s : float
-    shared_error_rad : float
-        Error that all windows have in common (the model's), which no number of windows averages away; it widens the
-        stated gap, not its rate.
-    outlier_std : float
-        An estimate farther from the prediction than so many standard deviations is refused.
-    restart_after : int
-        So many refusals in a row mean that the machine has changed (a new or re-adjusted screw): the gap then starts
-        afresh from the last of them.
-
-    Raises
-    ------
-    InvalidInput
-        A value is negative or not finite, or `restart_after` is not a whole number of at least 1.
-    """
-
-    gap_std_rad: float = math.radians(60.0)
-    rate_std_rad_per_s: float = math.radians(0.2)
-    offset_std_rad: float = math.radians(60.0)
-    gap_walk_rad_per_sqrt_s: float = 0.0
-    rate_walk_rad_per_s_per_sqrt_s: float = math.radians(0.015)
-    offset_walk_rad_per_sqrt_s: float = 0.0
-    shared_error_rad: float = math.radians(0.02)
-    outlier_std: float = 6.0
-    restart_after: int = 3
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-                raise InvalidInput(f"trend {item.name} = {value!r}: must be a finite number of at least 0")
-        if not isinstance(self.restart_after, int) or self.restart_after < 1:
-            raise InvalidInput(f"trend restart_after = {self.restart_after!r}: must be a whole number of at least 1")
-
-    @classmethod
-    def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
-        """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a pace that may change meanwhile.
-
-        The rate begins with a spread of gap / over and wanders by as much within `over`.
-        """
-        if not (0.0 < gap < math.inf and 0.0 < over < math.inf):
-            raise InvalidInput(f"wear of {gap!r} rad over {over!r} s: both must be finite and greater than 0")
-        rate = gap / over
-        known = {"rate_std_rad_per_s": rate, "rate_walk_rad_per_s_per_sqrt_s": rate / math.sqrt(over)}
-        return cls(**{**known, **changes})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
