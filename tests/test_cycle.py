@@ -134,16 +134,19 @@ def test_the_second_half_mirrors_the_first():
     assert phases[half:] - phases[:half] == pytest.approx(0.5, abs=1e-12)
 
 
-def test_an_asymmetric_orbit_is_found_too():
-    """Two masses and a small dead zone: the orbit is off centre."""
-    rng = np.random.default_rng(1)
-    for i in range(3):
-        servo = random_servo(rng, 2)
-        gap = math.radians(5.0)
-        found = limit_cycle(servo, gap, servo.tolerance_for(gap, 0.2 + 0.1 * i))
-        if found.orbit is not None and not found.orbit.symmetric:
-            assert found.orbit.half_multipliers is None
-            assert found.orbit.residual < 1e-9
+def test_an_orbit_of_148_events_comes_as_one_of_two_mirror_images():
+    """A dead zone of 0.4 p gap: ten seconds of hunting, off centre to one side or to the other."""
+    one, other = orbit(share=0.4), orbit(share=0.4, gap=2.0 * GAP)
+    assert not one.symmetric
+    assert one.half_multipliers is None
+    assert len(one.events) == 148
+    assert other.amplitude == pytest.approx(2.0 * one.amplitude, rel=1e-9)
+    assert 2.0 * (one.centre - 1e-3) == pytest.approx(1e-3 - other.centre, rel=1e-7)
+    servo = Servo.preset("paper")
+    run = simulate(servo, 120.0, reference=1e-3, gap=GAP, tolerance=servo.tolerance_for(GAP, 0.4))
+    tail = run.position[-60_000:]
+    assert 0.5 * np.ptp(tail) == pytest.approx(one.amplitude, rel=1e-6)
+    assert 0.5 * (tail.max() + tail.min()) == pytest.approx(one.centre, rel=1e-6)
 
 
 def random_servo(rng, n):
