@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servotwin.identify.decimation import decimation
+from servotwin.identify.misfit import Point
 from servotwin.identify.normal import least_squares
-from servotwin.identify.passes import Found, coarse_fit, refine
-from servotwin.identify.reduction import CONSTANT, RESIDUAL, Prior, Reduction
+from servotwin.identify.passes import Found, candidates, refine
+from servotwin.identify.reduction import CONSTANT, RESIDUAL, Prior, Reduction, factor_for
 from servotwin.identify.response import response
 from servotwin.identify.whitened_settings import Settings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-PRECISION = 1e-9  # of the motor's range: how closely a minimum is approached
+PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
 _ALIGNMENTS, _NARROWEST = 3, 0.01
 _FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
 
@@ -58,32 +60,40 @@ def align_and_fit(
     A delay of more than half a sample is taken off in whole samples, and the fit repeated: what is left of it is small
     enough to be linear.
     """
-    shift, gap = 0, prior
+    shift, points = 0, _look_around(theta_m, position, rate, servo, prior, settings)
     for attempt in range(_ALIGNMENTS):
         ahead, behind = max(-shift, 0), max(shift, 0)
         angle = theta_m[ahead : theta_m.size - behind]
         seen = position[behind : position.size - ahead]
-        fitted = _fit(angle, seen, rate, servo, gap, settings, coarse=attempt == 0)
+        fitted = _fit(angle, seen, rate, servo, points, settings)
         late = _delay(fitted.found) * rate if settings.skew else 0.0
         if abs(late) <= 0.5 or abs(shift + late) > settings.largest_skew * rate or attempt == _ALIGNMENTS - 1:
             break
-        shift, gap = shift + round(late), fitted.found.point.gap
+        shift, points = shift + round(late), [fitted.found.point]
     return Aligned(fitted.found, (shift + late) / rate, fitted.span, fitted.first)
 
 
+def _look_around(
+    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: Settings
+) -> list[Point]:
+    """Where the search at the full rate begins."""
+    reduce = decimation(factor_for(response(servo, rate), theta_m.size))
+    angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
+    slow = Reduction.of(angle, seen, response(servo, rate / reduce.factor))
+    span = float(np.ptp(angle))
+    starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
+    return candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
+
+
 def _fit(
-    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: Settings, coarse: bool
+    theta_m: Array, position: Array, rate: float, servo: Servo, points: list[Point], settings: Settings
 ) -> Aligned:
     span = float(np.ptp(theta_m))
-    largest, tolerance = _FREE * span, PRECISION * span
     model = response(servo, rate)
     growth = Prior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
     offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
     reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
-    starts = [*gaps_to_try(span, settings.starts), min(prior, largest)]
-    near = starts if coarse else [prior]
-    first = coarse_fit(reduction, near, largest, tolerance, settings.kept)
-    found = refine(reduction, first, starts, largest, tolerance, settings.passes, settings.order)
+    found = refine(reduction, points, _FREE * span, PRECISION * span, settings.passes, settings.order)
     return Aligned(found, 0.0, span, float(theta_m[0]))
 
 

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from servotwin.identify.aligned import gaps_to_try
+from servotwin.identify.decimation import decimation
 from servotwin.identify.normal import least_squares
-from servotwin.identify.passes import coarse_fit
-from servotwin.identify.reduction import CONSTANT, RESIDUAL, Reduction
+from servotwin.identify.reduction import CONSTANT, RESIDUAL, Reduction, factor_for
 from servotwin.identify.response import response
+from servotwin.identify.search import search
 from servotwin.identify.unexplained import slow
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
@@ -48,9 +50,11 @@ def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Ar
 
 def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> float:
     """Slow part of what a plain fit leaves, over that of the position."""
-    reduction = Reduction.of(theta_m, position, response(servo, rate), skew=False)
-    span = float(np.ptp(theta_m))
-    fit = coarse_fit(reduction, list(np.linspace(0.0, span, 9)), span, 1e-4 * span, 1)
+    reduce = decimation(factor_for(response(servo, rate), theta_m.size))
+    angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
+    reduction = Reduction.of(angle, seen, response(servo, rate / reduce.factor), skew=False)
+    span = float(np.ptp(angle))
+    fit = min(search(reduction.coarse(), gaps_to_try(span, 9), span, 1e-4 * span), key=lambda fit: fit.slopes.cost)
     table = reduction.table(fit.point)
     left = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
     interval = reduction.response.interval * reduction.decimation.factor

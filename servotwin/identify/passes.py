@@ -12,12 +12,12 @@ from servotwin.identify.misfit import Misfit, Point
 from servotwin.identify.normal import least_squares
 from servotwin.identify.projection import orthonormal, project_out
 from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.search import Fit, descend, search
+from servotwin.identify.search import Fit, descend, off_the_plain, search
 from servotwin.identify.whitening import Autoregression, burg
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
-RESTARTS = 5
+_SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
 _SINGULAR = 1e-7  # of the derivative's length: what is left of it below this is rounding
 
 
@@ -69,28 +69,50 @@ def spread(derivative: Array, others: Array) -> float:
     return 1.0 / size if size > _SINGULAR * math.sqrt(float(derivative @ derivative)) else math.inf
 
 
-def coarse_fit(reduction: Reduction, starts: Sequence[float], largest: float, tolerance: float, keep: int) -> Fit:
-    """The best fit in white noise, from the best few of a grid of gaps (rad)."""
-    misfit = reduction.coarse()
-    return min(search(misfit, starts, largest, tolerance, keep), key=lambda fit: fit.slopes.cost)
+def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Point]:
+    """The best few different minima of a window at its low rate, where looking around costs a tenth.
+
+    Parameters
+    ----------
+    slow : Reduction
+        Of both channels, decimated.
+    gaps : sequence of float
+        rad, where to look.
+    largest, tolerance : float
+        rad, of the search.
+    count : int
+        At most as many.
+    """
+    fits = sorted(search(slow.coarse(), gaps, largest, tolerance), key=lambda fit: fit.slopes.cost)
+    different = fits[:1]
+    for fit in fits[1:]:
+        if fit.slopes.cost > (1.0 + _SAME) * different[-1].slopes.cost:
+            different.append(fit)
+    return [fit.point for fit in different[:count]]
+
+
+def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float) -> Fit:
+    """The lowest of the minima nearest to some points."""
+    fits = [descend(misfit, point, largest, tolerance) for point in points]
+    best = min(fits, key=lambda fit: fit.slopes.cost)
+    return Fit(best.point, best.slopes, sum(fit.evaluations for fit in fits), best.converged)
 
 
 def refine(
-    reduction: Reduction, fit: Fit, starts: Sequence[float], largest: float, tolerance: float, passes: int, order: int
+    reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float, passes: int, order: int
 ) -> Found:
     """The fit in the noise that it leaves itself, after some passes with autoregressions of at most `order`.
 
-    The last pass looks at the gaps of `starts` (rad) again: in the right noise another minimum may lie lower.
+    The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
     """
-    noise, evaluations = Autoregression.white(1.0), 0
+    fit = off_the_plain(reduction.coarse(), best_of(reduction.coarse(), points, largest, tolerance), largest, tolerance)
+    noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
         noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
         misfit = reduction.misfit(noise, fit.point)
-        fits = [descend(misfit, fit.point, largest, tolerance)]
-        if number == passes - 1:
-            fits += search(misfit, starts, largest, tolerance, RESTARTS)
-        fit = min(fits, key=lambda fit: fit.slopes.cost)
-        evaluations += sum(fit.evaluations for fit in fits)
+        starts = [fit.point, *(points if number == passes - 1 else [])]
+        fit = best_of(misfit, starts, largest, tolerance)
+        evaluations += fit.evaluations
     rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
     return Found(reduction, misfit, fit, noise, rows, evaluations)
 

@@ -71,7 +71,7 @@ class Reduction:
         skew: bool = True,
     ) -> Reduction:
         """From theta_m (n,) rad and position (n,) m, both from any origin."""
-        reduce = decimation(_factor(model, theta_m.size))
+        reduce = decimation(factor_for(model, theta_m.size))
         rows = reduce.rows(np.asarray(position - position[0])[None])
         return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew)
 
@@ -124,7 +124,7 @@ def _fixed_basis(model: Response, reduce: Decimation, samples: int) -> Array:
     return orthonormal(_fixed(model, reduce, samples))
 
 
-def _factor(model: Response, samples: int) -> int:
+def factor_for(model: Response, samples: int) -> int:
     """By how much to decimate: the structure's fastest mode keeps its band, and the window enough samples."""
     rate = 1.0 / model.interval
     fastest = float(np.abs(model.poles).max()) / (2.0 * np.pi)

@@ -21,6 +21,7 @@ class Free(NamedTuple):
 
 
 BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
+_PLAIN = 1e-6  # of the information: below it gap and place are not told apart
 PLACES, _WITHIN = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85)
 
 
@@ -34,9 +35,7 @@ class Fit:
     converged: bool
 
 
-def descend(
-    misfit: Misfit, start: Point, largest: float, tolerance: float, steps: int = 60, free: Free = BOTH
-) -> Fit:
+def descend(misfit: Misfit, start: Point, largest: float, tolerance: float, steps: int = 60, free: Free = BOTH) -> Fit:
     """From a start to the nearest minimum with 0 <= gap <= largest (rad).
 
     It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises next to no
@@ -87,8 +86,8 @@ def _distance(one: Point, other: Point) -> float:
     return max(abs(one.gap - other.gap), 0.5 * other.gap * abs(one.place - other.place))
 
 
-def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Fit]:
-    """Minima from several starts: for every place of the screw the best of some gaps (rad), the best `count` of those.
+def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float) -> list[Fit]:
+    """Minima from several starts: for every place of the screw the best of some gaps (rad).
 
     First the gap alone descends. From where the screw rests for long, gap and place move it alike, and nothing leads
     back to where it does not rest: the place must not go there early.
@@ -99,11 +98,11 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
         costs = [misfit.cost(point) for point in points]
         lowest = int(np.argmin(costs))
         best.append((costs[lowest], points[lowest]))
-    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY) for _, point in sorted(best)[:count]]
-    return [_continued(misfit, fit, largest, tolerance) for fit in near]
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY) for _, point in best]
+    return [continued(misfit, fit, largest, tolerance) for fit in near]
 
 
-def _continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
     """On with both; and again from within, if the screw would have begun in contact.
 
     There its place has no derivative, because the contact undoes it at once; that says nothing of a little further in.
@@ -115,3 +114,21 @@ def _continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fi
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
     return Fit(best.point, best.slopes, evaluations, best.converged)
+
+
+def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """A fit, or a lower one from the ends of the plain that it lies on.
+
+    Where the screw rests until one contact moves it, gap and place act alike, through the distance that the motor went
+    before: gap (1 + place) / 2 or gap (1 - place) / 2. At the ends of that plain the screw begins in contact, and a
+    little travel there, too small to be seen from afar, may lead lower.
+    """
+    J = fit.slopes.jacobian
+    a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
+    if a * c - b * b > _PLAIN * a * c:
+        return fit
+    gap, place = fit.point
+    ends = [Point(0.5 * gap * (1.0 + place), 1.0), Point(0.5 * gap * (1.0 - place), -1.0)]
+    fits = [fit, *(continued(misfit, Fit(end, fit.slopes, 0, True), largest, tolerance) for end in ends)]
+    best = min(fits, key=lambda one: one.slopes.cost)
+    return Fit(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)

@@ -21,7 +21,7 @@ class Settings:
     starts : int
         Gaps of the first search, from zero to the motor's range.
     kept : int
-        How many of the seven places of the screw in the gap are followed to their minimum in the first search.
+        How many minima of the first search, at a low rate, are followed at the full rate.
     skew : bool
         Whether a delay between the channels is estimated. Leave it on unless one clock samples both: a fifth of a
         millisecond, not accounted for, is 0.4 deg. Off, the spread falls by a fifth.
@@ -53,7 +53,7 @@ class Settings:
     passes: int = 4
     order: int = 60
     starts: int = 13
-    kept: int = 7
+    kept: int = 4
     skew: bool = True
     largest_skew: float = 5e-3
     gap_rate: float = 0.0
