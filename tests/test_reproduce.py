@@ -29,7 +29,7 @@ def quiet():
 
 def test_every_figure_of_the_paper_is_there():
     names = [plate.name for plate in figures.PLATES]
-    assert names == ["fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1"]
+    assert names == ["fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1", "estimator"]
     assert all(plate.title and plate.caption for plate in figures.PLATES)
 
 
