@@ -16,8 +16,6 @@ from servotwin.hybrid.automaton import Array, Automaton, Guard, Mode
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 
-MINUS, OPEN, PLUS = 0, 1, 2
-_SIDES = (-1, 0, 1)
 INPUTS = ("reference", "gap", "tolerance")
 
 
@@ -30,6 +28,22 @@ class Shape:
     tolerance: int = 0
     dead_zone: bool = True
     noise: bool = False
+
+
+@dataclass(frozen=True)
+class _Play:
+    """One mode of the backlash: pressed against the flank of a side, held there at rest, or open (side 0)."""
+
+    name: str
+    side: int
+    held: bool = False
+
+
+_RIGID = (_Play("-", -1), _Play("open", 0), _Play("+", 1))
+# A load that acts back would push a slow motor off its flank, and nothing would keep it off: between the two it rests
+# there under part of the load (the sliding mode of this automaton).
+_ELASTIC = (*_RIGID, _Play("held -", -1, held=True), _Play("held +", 1, held=True))
+_OPEN = 1
 
 
 @dataclass(frozen=True)
@@ -53,7 +67,7 @@ class ServoAutomaton:
     rows : dict
         Output name to (M, n) rows: q1..qn, position, theta_m, theta_d, voltage, reference, gap, tolerance, error.
     zones : tuple of str
-        Names of the controller's zones; mode = backlash * len(zones) + zone.
+        Names of the controller's zones; mode = mode of the backlash * len(zones) + zone.
     """
 
     automaton: Automaton
@@ -64,11 +78,13 @@ class ServoAutomaton:
     def __post_init__(self) -> None:
         count = len(self.zones)
         # Where the gap jumps, contact is lost unless the open mode finds it again.
-        object.__setattr__(self, "opened", tuple(OPEN * count + mode % count for mode in range(3 * count)))
+        object.__setattr__(
+            self, "opened", tuple(_OPEN * count + mode % count for mode in range(len(self.automaton.modes)))
+        )
 
     def mode(self, zone: str) -> int:
         """The open mode in a zone of the controller."""
-        return OPEN * len(self.zones) + self.zones.index(zone)
+        return _OPEN * len(self.zones) + self.zones.index(zone)
 
     def input_values(self, name: str, coefficients: Array) -> dict[int, float]:
         """States of an input at the start of a cubic piece with ascending `coefficients`: its value and derivatives."""
@@ -95,14 +111,14 @@ def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Servo
     measured = basis.row("filtered") if controller.loop_filter_hz else sensed
     zones = _zones(controller, shape, basis, basis.row("reference") - measured)
     modes = []
-    for side in _SIDES:
+    for play in _plays(servo):
         for zone in zones:
-            flow = _plant_flow(servo, basis, side, zone.voltage)
+            flow = _plant_flow(servo, basis, play, zone.voltage)
             flow[basis["integral"]], flow[basis["derivative"]] = zone.integral, zone.derivative
             if controller.loop_filter_hz:
                 rate = 2.0 * np.pi * controller.loop_filter_hz
                 flow[basis["filtered"]] = rate * (sensed - basis.row("filtered"))
-            modes.append(_mode(servo, basis, flow, side, zone, zones))
+            modes.append(_mode(servo, basis, flow, play, zone, zones))
     rows = _output_rows(servo, basis, zones)
     rows["error"] = np.tile(basis.row("reference") - measured, (len(modes), 1))
     rows["measured_position"] = np.tile(sensed, (len(modes), 1))
@@ -116,8 +132,8 @@ def sampled_plant(servo: Servo, gap_degree: int) -> ServoAutomaton:
     zero = np.zeros(len(basis.names))
     zones = (_Zone("held", basis.row("voltage"), zero, zero),)
     modes = [
-        _mode(servo, basis, _plant_flow(servo, basis, side, basis.row("voltage")), side, zones[0], zones)
-        for side in _SIDES
+        _mode(servo, basis, _plant_flow(servo, basis, play, basis.row("voltage")), play, zones[0], zones)
+        for play in _plays(servo)
     ]
     return ServoAutomaton(Automaton(tuple(modes), basis.names), _output_rows(servo, basis, zones), ("held",))
 
@@ -161,6 +177,10 @@ def _positions(servo: Servo, basis: _Basis) -> Array:
     return rows
 
 
+def _plays(servo: Servo) -> tuple[_Play, ...]:
+    return _RIGID if servo.rigid else _ELASTIC
+
+
 def _screw_rate(basis: _Basis, side: int) -> Array:
     """theta_d' of the play operator: with the motor, less the half gap's own rate, in contact; zero in the gap (facts
     E3, E4)."""
@@ -169,20 +189,22 @@ def _screw_rate(basis: _Basis, side: int) -> Array:
     return basis.row("speed") - 0.5 * side * basis.row("gap'")
 
 
-def _plant_flow(servo: Servo, basis: _Basis, side: int, voltage: Array) -> Array:
-    """(n, n) flow of motor, screw, chain and input chains for one side of the backlash; other rows are zero."""
+def _plant_flow(servo: Servo, basis: _Basis, play: _Play, voltage: Array) -> Array:
+    """(n, n) flow of motor, screw, chain and input chains in one mode of the backlash; other rows are zero."""
     flow = np.zeros((len(basis.names), len(basis.names)))
     chain, (A, B, E) = servo.chain(), servo.motor()
     size, first, screw = chain.A.shape[0], basis["chain0"], basis["theta_d"]
     states = slice(first, first + size)
     flow[:3, :3] = A
     flow[:3] += np.outer(B, voltage)
-    flow[screw] = _screw_rate(basis, side)
+    flow[screw] = _screw_rate(basis, 0 if play.held else play.side)
     flow[states, states] = chain.A
     flow[states] += servo.p * (
         np.outer(chain.B_position, basis.row("theta_d")) + np.outer(chain.B_velocity, flow[screw])
     )
-    if side:
+    if play.held:
+        flow[basis["speed"]] = 0.5 * play.side * basis.row("gap''")
+    elif play.side:
         force = chain.reaction_position * servo.p * basis.row("theta_d")
         force[states] += chain.reaction
         flow[:3] -= servo.p * np.outer(E, force)
@@ -203,23 +225,48 @@ def _contact_reset(servo: Servo, basis: _Basis, side: int) -> Array:
     return reset
 
 
-def _mode(servo: Servo, basis: _Basis, flow: Array, side: int, zone: _Zone, zones: tuple[_Zone, ...]) -> Mode:
-    names, count = [z.name for z in zones], len(zones)
-    here = names.index(zone.name)
-    backlash = _SIDES.index(side)
+def _mode(servo: Servo, basis: _Basis, flow: Array, play: _Play, zone: _Zone, zones: tuple[_Zone, ...]) -> Mode:
+    zone_names, plays = [z.name for z in zones], _plays(servo)
+    here = zone_names.index(zone.name)
+
+    def in_play(name: str) -> int:
+        return [p.name for p in plays].index(name) * len(zones) + here
+
     guards = [
-        Guard(row, backlash * count + names.index(target), None, label, which)
+        Guard(row, plays.index(play) * len(zones) + zone_names.index(target), None, label, which)
         for row, target, label, which in zone.guards
     ]
-    if side:
-        release = -side * _screw_rate(basis, side)
-        guards.append(Guard(release, OPEN * count + here, _contact_reset(servo, basis, side), "release", side))
-    else:
-        for flank in (1, -1):
-            touch = flank * (basis.row("theta_m") - basis.row("theta_d")) - 0.5 * basis.row("gap")
-            target = _SIDES.index(flank) * count + here
-            guards.append(Guard(touch, target, _contact_reset(servo, basis, flank), "contact", flank))
-    return Mode(flow, tuple(guards), f"{('-', 'open', '+')[backlash]}/{zone.name}")
+    for row, target, reset, label, which in _play_guards(servo, basis, play, zone.voltage):
+        guards.append(Guard(row, in_play(target), reset, label, which))
+    return Mode(flow, tuple(guards), f"{play.name}/{zone.name}")
+
+
+_PlayGuard = tuple[Array, str, Array | None, str, int]
+
+
+def _play_guards(servo: Servo, basis: _Basis, play: _Play, voltage: Array) -> list[_PlayGuard]:
+    """What ends a mode of the backlash: (row, mode entered, reset, label, side)."""
+    side = play.side
+    if side == 0:
+        apart = basis.row("theta_m") - basis.row("theta_d")
+        return [
+            (s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", _contact_reset(servo, basis, s), "contact", s)
+            for s in (1, -1)
+        ]
+    flank = "+" if side > 0 else "-"
+    if play.held:
+        # Accelerations away from the flank's own: free of the load, and under all of it.
+        free, pressed = (
+            side * _plant_flow(servo, basis, _Play("", s), voltage)[basis["speed"]] - 0.5 * basis.row("gap''")
+            for s in (0, side)
+        )
+        return [(pressed, flank, None, "contact", side), (-free, "open", None, "release", side)]
+    reset = _contact_reset(servo, basis, side)
+    release = -side * _screw_rate(basis, side)
+    if servo.rigid:
+        return [(release, "open", reset, "release", side)]
+    reset[basis["speed"]] = 0.5 * side * basis.row("gap'")
+    return [(release, f"held {flank}", reset, "hold", side)]
 
 
 def _zones(controller: Controller, shape: Shape, basis: _Basis, error: Array) -> tuple[_Zone, ...]:
@@ -267,10 +314,10 @@ def _saturated(
 
 
 def _output_rows(servo: Servo, basis: _Basis, zones: tuple[_Zone, ...]) -> dict[str, Array]:
-    count = 3 * len(zones)
+    count = len(_plays(servo)) * len(zones)
     rows = {f"q{i + 1}": row for i, row in enumerate(_positions(servo, basis))}
     rows |= {"position": _position(servo, basis)}
     rows |= {name: basis.row(name) for name in ("theta_m", "theta_d", "reference", "gap", "tolerance")}
     full = {name: np.tile(row, (count, 1)) for name, row in rows.items()}
-    full["voltage"] = np.tile([zone.voltage for zone in zones], (3, 1))
+    full["voltage"] = np.tile([zone.voltage for zone in zones], (len(_plays(servo)), 1))
     return full

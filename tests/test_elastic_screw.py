@@ -1,0 +1,61 @@
+"""An elastic screw whose load acts back on the motor: the motor may rest at a flank under part of the load."""
+
+import itertools
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.simulation import Run, Simulation
+
+PAPER = Servo.preset("paper")
+
+
+def run_of(servo: Servo, gap: float, **options) -> tuple[Run, dict[str, np.ndarray]]:
+    simulation = Simulation(servo, 10.0, reference=SquareWave(1e-3, 5.0), gap=gap, **options)
+    simulation.advance(simulation.samples - 1)
+    engine = simulation.engine
+    rows = np.eye(len(engine.loop.automaton.names))
+    states = {name: engine.trajectory.sampled(rows[engine.loop.automaton.index(name)]) for name in ("current", "speed")}
+    return simulation.run(), states
+
+
+def held_samples(run: Run, side: int) -> np.ndarray:
+    """Samples strictly inside the stretches between hold and what ends it."""
+    backlash = run.events[np.isin(run.events.kind, ("hold", "release", "contact"))]
+    inside = np.zeros(run.samples, dtype=bool)
+    for now, after in itertools.pairwise(backlash):
+        if now.kind == "hold" and now.side == side and after.time > now.time:
+            inside |= (run.time > now.time) & (run.time < after.time)
+    return inside
+
+
+def test_at_rest_on_a_flank_the_motor_carries_part_of_the_load() -> None:
+    servo = PAPER.replace(k_d=2e5)
+    run, states = run_of(servo, math.radians(5.0), tolerance=servo.tolerance_for(math.radians(5.0)))
+    load = servo.p * servo.k_d * (servo.p * run.theta_d - run.q[:, 0])
+    torque = servo.k_T * states["current"]
+    found = 0
+    for side in (1, -1):
+        inside = held_samples(run, side)
+        found += int(inside.sum())
+        assert np.all(np.abs(states["speed"][inside]) <= 1e-12)
+        assert np.all(side * torque[inside] >= -1e-12)
+        assert np.all(side * (load - torque)[inside] >= -1e-12)
+        assert np.allclose(run.theta_m[inside] - run.theta_d[inside], side * 0.5 * run.gap[inside], atol=1e-12)
+    assert found > 100
+
+
+@settings(max_examples=15)
+@given(st.floats(4.5, 7.0), st.sampled_from([2, 3, 5]), st.floats(0.0, 20.0), st.booleans(), st.booleans())
+def test_no_elastic_screw_chatters(stiffness: float, masses: int, degrees: float, wearing: bool, zone: bool) -> None:
+    servo = PAPER.replace(k_d=10.0**stiffness, n=masses)
+    gap = math.radians(degrees)
+    run, _ = run_of(
+        servo, SCurve(0.0, gap, duration=10.0) if wearing else gap, tolerance=servo.tolerance_for(gap) if zone else None
+    )
+    slack = 1e-12 * (1.0 + np.max(np.abs(run.theta_m)))
+    assert np.all(np.abs(run.theta_m - run.theta_d) <= 0.5 * run.gap + slack)
