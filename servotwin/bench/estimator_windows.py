@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.identify.response import response
 from servotwin.identify.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
@@ -20,7 +20,6 @@ RATE = 5000.0
 PRESETS, MASSES = ("paper", "table1"), (2, 3, 5)
 LOOPS = ("no dead zone", "dead zone", "calm", "ramping gap")
 _TRAVEL = math.radians(0.5)
-_UNSEEN = 0.1  # s: what happens to the screw so late in a window does not reach the last mass within it
 _GROWTH = math.radians(20.0) / 200.0  # rad/s, the paper's S-curve on average
 
 
@@ -37,11 +36,9 @@ class Case:
     theta_d0 : float
         rad, the screw at the first sample.
     forwards, backwards : float
-        rad: how far the screw moved, the window's last 0.1 s left out.
+        rad: how far the screw moved, but for the end of the window, which the last mass does not see.
     words : str
         How to make it again.
-    details : dict
-        More for some experiments.
     """
 
     window: Window
@@ -51,7 +48,6 @@ class Case:
     forwards: float
     backwards: float
     words: str
-    details: dict[str, Any] = field(default_factory=dict)
 
     @property
     def two_contacts(self) -> bool:
@@ -60,8 +56,11 @@ class Case:
 
     def noisy(self, noise: Array) -> Case:
         """The same with noise (n,) m on the position."""
-        window = self.window.replace(position=self.window.position + noise)
-        return Case(window, self.servo, self.gap, self.theta_d0, self.forwards, self.backwards, self.words, self.details)
+        return self.replaced(self.window.replace(position=self.window.position + noise), self.servo)
+
+    def replaced(self, window: Window, servo: Servo) -> Case:
+        """The same truth about another window, for another model."""
+        return replace(self, window=window, servo=servo)
 
 
 def cut(run: Run, start: float, duration: float, words: str = "") -> Case:
@@ -69,7 +68,7 @@ def cut(run: Run, start: float, duration: float, words: str = "") -> Case:
     window = Window.from_run(run, start, duration)
     first = round(window.start * run.sample_rate)
     screw = run.theta_d[first : first + window.position.size]
-    moved = np.diff(screw[: -round(_UNSEEN * run.sample_rate)])
+    moved = np.diff(screw[: -round(response(run.servo, RATE).unseen * run.sample_rate)])
     gap = float(run.gap[first + (window.position.size - 1) // 2])
     forwards, backwards = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
     return Case(window, run.servo, gap, float(screw[0]), forwards, backwards, f"{words}, window at {start:.4f} s")
@@ -87,9 +86,9 @@ def random_servo(rng: np.random.Generator) -> Servo:
             servo = servo.replace(Kp=0.7 * law.Kp, Ki=0.5 * law.Ki, Kd=0.7 * law.Kd)
 
 
-def random_run(rng: np.random.Generator, gap: float, duration: float, loop: str | None = None) -> tuple[Run, str]:
+def random_run(rng: np.random.Generator, gap: float, duration: float, kind: str) -> tuple[Run, str]:
     """A run with a gap of about `gap` (rad), everything else drawn, and what was drawn."""
-    servo, kind = random_servo(rng), loop or str(rng.choice(LOOPS))
+    servo = random_servo(rng)
     amplitude, period = float(rng.uniform(0.5e-3, 2e-3)), float(rng.uniform(6.0, 16.0))
     start = float(rng.uniform(-0.5, 0.5)) * gap
     law = servo.controller.replace(Ki=0.0) if kind == "calm" else servo.controller
@@ -108,11 +107,15 @@ def random_run(rng: np.random.Generator, gap: float, duration: float, loop: str 
 
 
 def random_cases(
-    rng: np.random.Generator, count: int, largest: float, two_contacts: bool, per_run: int = 4, loop: str | None = None
+    rng: np.random.Generator, count: int, largest: float, two_contacts: bool, constant: bool = False, per_run: int = 4
 ) -> Iterator[Case]:
-    """`count` windows of 1 s with gaps up to `largest` (rad), anywhere in their runs; only some where asked for."""
+    """`count` windows of 1 s with gaps up to `largest` (rad), anywhere in their runs.
+
+    On demand only those with two contacts, or only runs with a constant gap.
+    """
     made = 0
     while made < count:
+        loop = str(rng.choice(LOOPS[:-1] if constant else LOOPS))
         run, words = random_run(rng, float(rng.uniform(0.0, largest)), 20.0, loop)
         starts = rng.uniform(0.0, 18.9, 12)
         cases = [cut(run, float(start), 1.0, words) for start in starts]
@@ -121,12 +124,15 @@ def random_cases(
         made += len(kept)
 
 
-def paper_loop_cases(gaps: Array, per_gap: int, seed: int, noise: Noise | None, seconds: float = 1.0) -> list[Case]:
+def paper_loop_cases(
+    gaps: Array, per_gap: int, seed: int, noise: Noise | None, servo: Servo | None = None, seconds: float = 1.0
+) -> list[Case]:
     """Windows after the steps of the paper's loop: +-1 mm, a step every 5 s, the dead zone for the true gap.
 
     With noise the controller is section 4.3's, sampled, with a loop filter at 20 Hz.
     """
-    servo, cases = Servo.preset("paper"), []
+    cases = []
+    servo = servo or Servo.preset("paper")
     noisy = servo.controller.replace(sample_rate=RATE, loop_filter_hz=20.0)
     for number, gap in enumerate(gaps):
         run = simulate(

@@ -81,7 +81,7 @@ def follow_screw(theta_m: Array, gap: float, theta_d0: float, rate: float, out: 
 
 
 def travel(theta_m: Array, at: Gap) -> Travel:
-    """What the contacts did to the screw in a window."""
+    """What the contacts did to the screw in a window, for the motor's angle (n,)."""
     screw = np.empty(theta_m.size)
     follow_screw(theta_m, *at, screw)
     moved = np.diff(screw)

@@ -58,5 +58,5 @@ def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> f
     table = reduction.table(fit.point)
     left = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
     interval = reduction.response.interval * reduction.decimation.factor
-    slow_left, slow_moved = slow(left, interval), slow(reduction.position, interval)
-    return float(np.sqrt(np.mean(slow_left**2)) / np.std(slow_moved))
+    variation = float(np.std(slow(reduction.position, interval)))
+    return float(np.sqrt(np.mean(slow(left, interval) ** 2))) / variation if variation > 0.0 else math.inf

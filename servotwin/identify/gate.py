@@ -11,8 +11,9 @@ from servotwin.identify.estimate import GapStatus, Interval
 from servotwin.identify.modelcheck import Shift
 from servotwin.identify.whitened_settings import Settings
 
-_SIGMAS = 3.0
+_SIGMAS, _NORMAL_95 = 3.0, 1.959963984540054
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
+_LIKELIER = 60.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
 
 
@@ -80,8 +81,10 @@ def _spread(seen: Evidence, settings: Settings) -> str:
         return "the measurements do not depend on the gap"
     if math.isinf(seen.interval[1]):
         return "the window contradicts no large gap"
-    if seen.std > settings.largest_std:
-        return f"the gap is known to {_deg(seen.std)} only, and {_deg(settings.largest_std)} are allowed"
+    gap = seen.aligned.found.point.gap
+    widest = max(seen.std, (seen.interval[1] - gap) / _NORMAL_95, (gap - seen.interval[0]) / _NORMAL_95)
+    if widest > settings.largest_std:
+        return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     return ""
 
 
@@ -105,6 +108,8 @@ def _disagreements(seen: Evidence, settings: Settings) -> tuple[str, ...]:
     shift, limit = seen.shift, settings.largest_shift
     if abs(shift.gap) > max(limit, _SIGMAS * shift.std):
         found.append(f"with the model free the gap would move by {_deg(shift.gap)}: {shift.words}")
+    if shift.gain > _LIKELIER and _spread(seen, settings):
+        found.append(f"freeing the model makes the window far likelier: {shift.words}")
     move, std = seen.observer
     if abs(move) > max(2.0 * limit, _SIGMAS * std):
         found.append(f"the observer form puts the gap {_deg(move)} away, with a joint spread of {_deg(std)}")

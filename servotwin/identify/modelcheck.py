@@ -32,11 +32,13 @@ _ALPHA = 40.0  # rad/s, the paper's observer
 
 
 class Shift(NamedTuple):
-    """By how much the gap moves (rad), the standard deviation of that, and what moves it most, in words."""
+    """By how much the gap moves (rad), the standard deviation of that, what moves it most, in words, and how much more
+    likely the window becomes: twice the logarithm of the ratio, a few for a right model."""
 
     gap: float
     std: float
     words: str
+    gain: float
 
 
 def model_shift(found: Found, servo: Servo, order: int) -> Shift:
@@ -57,7 +59,9 @@ def model_shift(found: Found, servo: Servo, order: int) -> Shift:
     solved = _within_tolerance(rows, size)
     own = spread(rows[GAP], rows[PLACE:-size])
     std = math.sqrt(max(0.0, float(solved.deviations[0]) ** 2 - own**2)) if math.isfinite(own) else math.inf
-    return Shift(float(solved.coefficients[0]), std, _words(solved.coefficients[-size:], solved.deviations[-size:]))
+    words = _words(solved.coefficients[-size:], solved.deviations[-size:])
+    gain = 2.0 * table.shape[1] * math.log(found.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
+    return Shift(float(solved.coefficients[0]), std, words, gain)
 
 
 def _within_tolerance(rows: Array, free: int) -> LeastSquares:

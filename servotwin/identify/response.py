@@ -54,6 +54,8 @@ class Response:
         T, s.
     static_gain : float
         m/rad, position over angle at rest.
+    unseen : float
+        s: what the screw does so late in a window has not reached the last mass: the sum of sqrt(m / k).
     """
 
     poles: Complex
@@ -62,6 +64,7 @@ class Response:
     velocity: Readout
     interval: float
     static_gain: float
+    unseen: float
 
     def respond(self, inputs: Array) -> Array:
         """(k, n) positions (m) for angles (k, n) (rad), from rest at zero one sample before the first.
@@ -105,6 +108,7 @@ def response(servo: Servo, sample_rate: float) -> Response:
         _readout(poles, weight * poles, interval, float(np.sum(weight).real)),
         interval,
         direct - float(np.sum(weight / poles).real),
+        float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:]))),
     )
 
 

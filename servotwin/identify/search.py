@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.identify.contacts import BY_GAP, BY_START, contacts
 from servotwin.identify.misfit import Misfit, Point, Slopes
+from servotwin.plant.signals import Array
 
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
 
@@ -22,7 +24,7 @@ class Free(NamedTuple):
 
 BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
 _PLAIN = 1e-6  # of the information: below it gap and place are not told apart
-PLACES, _WITHIN = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85)
+PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85), (0.01, 0.05, 0.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +119,30 @@ def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit
 
 
 def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
-    """A fit, or a lower one from the ends of the plain that it lies on.
+    """A fit, or a lower one from the edge of the plain that it lies on.
 
-    Where the screw rests until one contact moves it, gap and place act alike, through the distance that the motor went
-    before: gap (1 + place) / 2 or gap (1 - place) / 2. At the ends of that plain the screw begins in contact, and a
-    little travel there, too small to be seen from afar, may lead lower.
+    Where the screw rests until its first contact, gap and place act alike, through the way that the motor went before.
+    The plain ends where a smaller gap would let the motor touch the screw on the other side on its way; a little travel
+    there, too small to be seen from afar, may lead lower.
     """
     J = fit.slopes.jacobian
     a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
     if a * c - b * b > _PLAIN * a * c:
         return fit
-    gap, place = fit.point
-    ends = [Point(0.5 * gap * (1.0 + place), 1.0), Point(0.5 * gap * (1.0 - place), -1.0)]
-    fits = [fit, *(continued(misfit, Fit(end, fit.slopes, 0, True), largest, tolerance) for end in ends)]
+    fits = [fit, *(descend(misfit, start, largest, tolerance) for start in _edges(misfit.theta_m, fit.point))]
     best = min(fits, key=lambda one: one.slopes.cost)
     return Fit(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
+
+
+def _edges(theta_m: Array, point: Point) -> list[Point]:
+    """Points a little beyond the edge of the plain on which `point` lies."""
+    seen = contacts(theta_m, point.screw(0.0))
+    touched = np.flatnonzero(seen[BY_START] == 0.0)
+    if not touched.size:
+        return []
+    first = int(touched[0])
+    side = 1.0 if seen[BY_GAP, first] < 0.0 else -1.0
+    way = 0.5 * point.gap * (1.0 + side * point.place)
+    edge = way - float(np.min(side * theta_m[: first + 1]))
+    gaps = [(1.0 - share) * edge for share in _BEYOND]
+    return [Point(gap, side * min(1.0, 2.0 * way / gap - 1.0)) for gap in gaps if gap > 0.0]

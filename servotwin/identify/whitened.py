@@ -20,6 +20,7 @@ from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus, I
 from servotwin.identify.gate import Evidence, judge
 from servotwin.identify.lostmotion import static_lost_motion
 from servotwin.identify.modelcheck import Shift, model_shift, observer_shift
+from servotwin.identify.passes import Found
 from servotwin.identify.profile import profile_interval
 from servotwin.identify.unexplained import noise_left, slow_share
 from servotwin.identify.whitened_settings import Settings
@@ -27,11 +28,11 @@ from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "Settings", "estimate"]
+__all__ = ["METHOD", "SHORTEST", "Settings", "estimate"]
 
 METHOD = "whitened"
 _NORMAL_95 = 1.959963984540054
-_SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
+SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
 
 def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> GapEstimate:
@@ -71,9 +72,9 @@ def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, se
 def _check(window: Window) -> None:
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method 'whitened' needs the motor's angle in rad")
-    if window.position.size < _SHORTEST:
+    if window.position.size < SHORTEST:
         size = window.position.size
-        raise InvalidInput(f"{window.where}the window has {size} samples: method 'whitened' needs at least {_SHORTEST}")
+        raise InvalidInput(f"{window.where}the window has {size} samples: method 'whitened' needs at least {SHORTEST}")
 
 
 def _start(prior: float | GapEstimate | None) -> float:
@@ -90,12 +91,18 @@ def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, sett
         aligned,
         std,
         profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
-        travel(found.reduction.theta_m, found.point.screw(0.0)),
-        model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, ""),
+        travel(seen_by_the_load(found), found.point.screw(0.0)),
+        model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, "", 0.0),
         observer_shift(found, servo) if identifiable else (0.0, math.inf),
         static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
         slow_share(found),
     )
+
+
+def seen_by_the_load(found: Found) -> Array:
+    """The motor's angle without the end of the window, to which the last mass cannot have answered."""
+    model, theta_m = found.reduction.response, found.reduction.theta_m
+    return theta_m[: max(2, theta_m.size - round(model.unseen / model.interval))]
 
 
 def _stated(
@@ -108,8 +115,7 @@ def _stated(
 ) -> GapEstimate:
     """The estimate that the evidence makes of a blank one."""
     found = seen.aligned.found
-    half_window = 0.5 * found.reduction.theta_m.size * found.reduction.response.interval
-    systematic = math.hypot(settings.model_error, seen.shift.gap, settings.gap_rate * half_window)
+    systematic = math.hypot(settings.model_error, seen.shift.gap)
     result = replace(
         blank,
         status=status,

@@ -60,7 +60,7 @@ class Settings:
     offset: tuple[float, float] | None = None
     prefilter_hz: float | None = None
     contact_travel: float = math.radians(0.5)
-    largest_std: float = math.radians(0.2)
+    largest_std: float = math.radians(0.05)
     largest_shift: float = math.radians(0.05)
     model_error: float = math.radians(0.02)
     calibration: float = 1.1
