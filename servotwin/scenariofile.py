@@ -12,22 +12,20 @@ from typing import Any
 from servotwin.control.controller import Controller
 from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
-from servotwin.identify import paper
+from servotwin.identify import settingsfile
 from servotwin.identify.gap import METHODS
+from servotwin.identify.trend import TrendSettings
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.plant import servofile
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.tomltable import Table
+from servotwin.tomltable import Table, given
 from servotwin.twin.settings import TwinSettings
 
 MM = 1e-3
 DEG = math.pi / 180.0
-
-Reader = tuple[str, Callable[[Table, str], Any]]
-"""The name that a key sets, and how the key is read."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +36,9 @@ class Recording:
     ----------
     sample_rate : float
         Hz.
-    window, pre_trigger : float
-        s, length of a window and how much of it lies before the change of the reference.
+    window, pre_trigger : float, optional
+        s, length of a window and how much of it lies before the change of the reference; None: as the controller asks
+        for, see `Scenario`.
     retry : Retry
         When a window without acknowledgement is sent again.
     limits : Limits
@@ -47,8 +46,8 @@ class Recording:
     """
 
     sample_rate: float = 5000.0
-    window: float = 1.0
-    pre_trigger: float = 0.0
+    window: float | None = None
+    pre_trigger: float | None = None
     retry: Retry = field(default_factory=Retry)
     limits: Limits = field(default_factory=Limits)
 
@@ -100,13 +99,6 @@ def _read(table: Table, key: str, read: Callable[[Table], Any]) -> Any:
         value = read(inner)
     inner.done()
     return value
-
-
-def _given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
-    """What a table gives of these keys, by the names they set."""
-    for key in readers.keys() - table.values.keys():
-        table.number(key, None)
-    return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
 
 
 def _servo(table: Table, folder: Path) -> Servo:
@@ -168,7 +160,7 @@ def _gap(table: Table) -> SignalLike:
 
 def _controller(table: Table, controller: Controller) -> Controller | None:
     """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
-    changes = _given(table, {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER})
+    changes = given(table, {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER})
     return controller.replace(**changes) if changes else None
 
 
@@ -214,8 +206,8 @@ def _recording(table: Table) -> Recording:
     default = Recording()
     return Recording(
         sample_rate=table.number("sample_rate_hz", default.sample_rate, positive=True),
-        window=table.number("window_s", default.window, positive=True),
-        pre_trigger=table.number("pre_trigger_s", default.pre_trigger, minimum=0.0),
+        window=table.number("window_s", None, positive=True),
+        pre_trigger=table.number("pre_trigger_s", None, minimum=0.0),
         retry=_retry(table, default.retry),
         limits=_read(table, "limits", _limits),
     )
@@ -241,13 +233,17 @@ def _limits(table: Table) -> Limits:
 
 def _twin(table: Table) -> TwinSettings:
     default = TwinSettings()
+    method = table.text("method", default.method, choices=tuple(METHODS))
+    limit = table.number("gap_limit_deg", None, minimum=0.0)
     return TwinSettings(
         enabled=table.boolean("enabled", True),
-        method=table.text("method", default.method, choices=tuple(METHODS)),
-        estimator=_read(table, "estimator", _estimator) if "estimator" in table.values else None,
+        method=method,
+        estimator=_read(table, "estimator", lambda inner: settingsfile.read(inner, method)),
         k_dz=table.number("k_dz", default.k_dz, minimum=0.0),
         smoothing=table.number("smoothing", default.smoothing, minimum=0.0, maximum=1.0),
         initial_gap=table.number("initial_gap_deg", 0.0, minimum=0.0) * DEG,
+        trend=_read(table, "trend", _trend),
+        gap_limit=None if limit is None else limit * DEG,
         processing=table.number("processing_s", default.processing, minimum=0.0),
         validity=table.number("validity_s", default.validity, positive=True),
         retry=table.number("retry_s", default.retry, positive=True),
@@ -255,27 +251,11 @@ def _twin(table: Table) -> TwinSettings:
     )
 
 
-def _degrees(table: Table, key: str) -> float:
-    return table.number(key) * DEG
-
-
-_ESTIMATOR: Mapping[str, Reader] = {
-    "alpha_rad_per_s": ("alpha", Table.number),
-    "settle_s": ("settle_s", Table.number),
-    "lowpass_hz": ("lowpass_hz", Table.number),
-    "lowpass_order": ("lowpass_order", Table.integer),
-    "padding": ("padding", Table.text),
-    "padding_samples": ("padding_samples", Table.integer),
-    "iterations": ("iterations", Table.integer),
-    "origin": ("origin", Table.text),
-    "reversals": ("reversals", Table.integer),
-    "rest_speed_rad_per_s": ("rest_speed", Table.number),
-    "contact_travel_deg": ("contact_travel", _degrees),
-    "method_error_deg": ("method_error", _degrees),
-    "largest_std_deg": ("largest_std", _degrees),
-    "unexplained": ("unexplained", Table.number),
-}
-
-
-def _estimator(table: Table) -> paper.Settings:
-    return paper.Settings(**_given(table, _ESTIMATOR))
+def _trend(table: Table) -> TrendSettings:
+    """How far (`wear_deg`) the gap may grow within how long (`over_s`)."""
+    if not table.values:
+        table.number("wear_deg", None)
+        table.number("over_s", None)
+        return TrendSettings()
+    gap, over = table.number("wear_deg", positive=True), table.number("over_s", positive=True)
+    return TrendSettings.for_wear(gap * DEG, over)

@@ -9,7 +9,7 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -196,6 +196,16 @@ class Table:
     def _misspelt(self, key: str) -> str:
         close = difflib.get_close_matches(key, [k for k in self.values if k not in self._asked], n=1)
         return f" (found '{self.path(close[0])}' instead)" if close else ""
+
+
+Reader = tuple[str, Callable[[Table, str], Any]]
+"""The name that a key sets, and how the key is read."""
+
+
+def given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
+    """What a table gives of these keys, by the names they set."""
+    table._asked.update(readers)
+    return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
 
 
 def read_toml(path: str | os.PathLike[str]) -> Table:

@@ -57,10 +57,11 @@ def test_an_update_lands_three_seconds_after_the_reference_step(controller):
     assert np.array_equal(loop.run.tolerance, expected)
 
 
-def test_the_published_estimator_is_near_the_truth_and_eq_21_follows_it():
-    loop = cosimulate(short())
+@pytest.mark.parametrize(("method", "error_deg"), [("paper", 0.6), ("whitened", 0.02)])
+def test_the_estimate_is_near_the_truth_and_eq_21_follows_it(method, error_deg):
+    loop = cosimulate(short(twin=TwinSettings(method=method)))
     for update, estimate in zip(loop.updates, loop.estimates, strict=True):
-        assert abs(update.gap - GAP) < math.radians(0.6)
+        assert abs(update.gap - GAP) < math.radians(error_deg)
         assert update.gap == estimate.gap
         assert update.tolerance == PAPER.tolerance_for(estimate.gap, 1.0)
     assert loop.updates[0].window == ("boot-1", 0)

@@ -5,9 +5,9 @@ import math
 
 import pytest
 
-from servotwin import scenariofile
 from servotwin.errors import InvalidInput
-from servotwin.identify import paper
+from servotwin.identify import paper, settingsfile, whitened
+from servotwin.identify.trend import TrendSettings
 from servotwin.link.simulated import LinkSettings
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
@@ -23,6 +23,7 @@ size_mm = 1.0
 [gap]
 total_deg = 10.0
 """
+PAPER = "[twin]\nmethod = 'paper'\n"
 
 
 def load(tmp_path, text):
@@ -58,11 +59,12 @@ def test_fig16_adds_noise_and_filters_to_the_sampled_loop():
     assert noisy.law == plain.law.replace(loop_filter_hz=20.0)
     assert plain.law.sample_rate == 5000.0
     assert noisy.noise == Noise(0.22e-3, (10.0, 50.0))
+    assert noisy.twin.method == "paper"
     assert noisy.twin.estimator == paper.Settings(lowpass_hz=20.0)
 
 
 def test_an_unknown_preset_is_named():
-    with pytest.raises(InvalidInput, match=r"'fig51'.*fig15, fig15-sampled, fig16"):
+    with pytest.raises(InvalidInput, match=r"'fig51'.*fig15, fig15-sampled, fig16, calm"):
         Scenario.preset("fig51")
     assert all(Scenario.preset(name).name == name for name in PRESETS)
 
@@ -112,9 +114,14 @@ def test_every_key_in_its_unit(tmp_path):
         loss = 0.2
         jitter_s = 0.3
         [twin]
+        method = "paper"
         k_dz = 1.5
         initial_gap_deg = 4
+        gap_limit_deg = 12
         processing_s = 0.1
+        [twin.trend]
+        wear_deg = 10
+        over_s = 1000
         [twin.estimator]
         alpha_rad_per_s = 80
         contact_travel_deg = 2
@@ -134,6 +141,8 @@ def test_every_key_in_its_unit(tmp_path):
     assert scenario.uplink == LinkSettings(0.5, 0.0, 0.1, outages=((1.0, 2.0),))
     assert scenario.downlink == LinkSettings(0.5, 0.3, 0.2, outages=((1.0, 2.0),))
     assert scenario.twin.estimator == paper.Settings(alpha=80.0, contact_travel=math.radians(2.0))
+    assert scenario.twin.gap_limit == pytest.approx(math.radians(12.0))
+    assert scenario.twin.trend == TrendSettings.for_wear(math.radians(10.0), 1000.0)
 
 
 @pytest.mark.parametrize(
@@ -195,18 +204,32 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ("[gap]", "[noise]\nstd_mm = 0.2\n[gap]", "noise needs a sampled controller"),
         ("[gap]", "[noise]\nstd_mm = 0.2\nband_hz = [50, 10]\n[gap]", "[noise]: noise band = (50.0, 10.0) Hz"),
         ("[gap]", "[noise]\nstd_mm = 0.2\nband_hz = 50\n[gap]", "noise.band_hz = 50 is not allowed; give two numbers"),
-        ("[gap]", "[recording]\nwindow_s = 0.25\n[gap]", "window = 0.25 s is too short for the observer"),
+        (
+            "[gap]",
+            "[recording]\nwindow_s = 0.07\n[gap]",
+            "window = 0.07 s is too short for method 'whitened', which needs 400",
+        ),
+        ("[gap]", f"[recording]\nwindow_s = 0.25\n{PAPER}[gap]", "window = 0.25 s is too short for the observer"),
         ("[gap]", "[recording]\nwindow_s = 0.90001\n[gap]", "must be a whole number of samples"),
         ("[gap]", "[recording]\npre_trigger_s = 1.0\n[gap]", "pre_trigger_s = 1.0 s"),
         ("[gap]", "[link]\nloss = 1.5\n[gap]", "link.loss = 1.5 is not allowed"),
         ("[gap]", "[link]\ndelay_ms = 5\n[gap]", "unknown key 'link.delay_ms' (did you mean 'delay_s'?)"),
         ("[gap]", "[link.up]\nloss = 'no'\n[gap]", "link.up.loss = 'no' is not allowed"),
         ("[gap]", "[[link.outages]]\nfrom_s = 3\nto_s = 2\n[gap]", "link outage from 3.0 s to 2.0 s"),
-        ("[gap]", "[twin]\nmethod = 'best'\n[gap]", "twin.method = 'best' is not allowed; give one of paper"),
+        ("[gap]", "[twin]\nmethod = 'best'\n[gap]", "twin.method = 'best' is not allowed; give one of whitened, paper"),
         ("[gap]", "[twin]\nattempts = 0\n[gap]", "twin.attempts = 0 is not allowed"),
-        ("[gap]", "[twin.estimator]\nalpha = 2\n[gap]", "unknown key 'twin.estimator.alpha'"),
-        ("[gap]", "[twin.estimator]\nalpha_rad_per_s = -2\n[gap]", "[twin.estimator]: estimator alpha = -2"),
-        ("[gap]", "[twin.estimator]\nsettle_s = 2\n[gap]", "too short for the observer: must be at least 2.0032 s"),
+        ("[gap]", f"{PAPER}[twin.estimator]\nalpha = 2\n[gap]", "unknown key 'twin.estimator.alpha'"),
+        ("[gap]", f"{PAPER}[twin.estimator]\nalpha_rad_per_s = -2\n[gap]", "[twin.estimator]: estimator alpha = -2"),
+        ("[gap]", f"{PAPER}[twin.estimator]\nsettle_s = 2\n[gap]", "too short for the observer, which takes 2"),
+        ("[gap]", f"{PAPER}[twin.estimator]\nskew = true\n[gap]", "unknown key 'twin.estimator.skew'"),
+        ("[gap]", "[twin.estimator]\nalpha_rad_per_s = 2\n[gap]", "unknown key 'twin.estimator.alpha_rad_per_s'"),
+        ("[gap]", "[twin.estimator]\ncombine = true\n[gap]", "unknown key 'twin.estimator.combine'"),
+        ("[gap]", "[twin.estimator]\nlargest_std = 1\n[gap]", "(did you mean 'largest_std_deg'?)"),
+        ("[gap]", "[twin.estimator]\nlargest_std_deg = 0\n[gap]", "[twin.estimator]: estimator largest_std = 0.0"),
+        ("[gap]", "[twin.estimator]\noffset_deg = 3\n[gap]", "offset_deg = 3 is not allowed; give two numbers"),
+        ("[gap]", "[twin]\ngap_limit_deg = -1\n[gap]", "twin.gap_limit_deg = -1 is not allowed"),
+        ("[gap]", "[twin.trend]\nwear_deg = 1\n[gap]", "'twin.trend.over_s' is missing"),
+        ("[gap]", "[twin.trend]\nrate_deg = 1\n[gap]", "'twin.trend.wear_deg' is missing"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, old, new, expected):
@@ -232,18 +255,63 @@ def test_named_seeds_differ_and_stay():
     assert scenario.seed_of("noise") == scenario.replace(duration=100.0).seed_of("noise") == 7790430383776639416
 
 
-def test_every_setting_has_its_key():
-    assert {name for name, _ in scenariofile._ESTIMATOR.values()} == {
-        f.name for f in dataclasses.fields(paper.Settings)
-    }
+@pytest.mark.parametrize(("module", "without"), [(paper, set()), (whitened, {"combine"})])
+def test_every_setting_has_its_key(module, without):
+    keys = {name for name, _ in settingsfile.KEYS[module.METHOD].values()}
+    assert keys == {f.name for f in dataclasses.fields(module.Settings)} - without
 
 
-def test_every_estimator_key_is_read(tmp_path):
+def estimator(tmp_path, method, lines):
+    text = "\n".join([f"[twin]\nmethod = '{method}'", "[twin.estimator]", *lines, "[gap]"])
+    return load(tmp_path, SHORT.replace("[gap]", text)).twin.estimator
+
+
+def test_every_key_of_the_papers_estimator_is_read(tmp_path):
     lines = ["padding = 'even'", "origin = 'first'", "lowpass_order = 4", "padding_samples = 9", "iterations = 7"]
     lines += ["reversals = 2", "rest_speed_rad_per_s = 0.2", "contact_travel_deg = 1", "method_error_deg = 2"]
     lines += ["largest_std_deg = 3", "unexplained = 0.3", "alpha_rad_per_s = 80", "settle_s = 0.1", "lowpass_hz = 30"]
-    text = SHORT.replace("[gap]", "\n".join(["[twin.estimator]", *lines, "[gap]"]))
     one, two, three = (math.radians(x) for x in (1.0, 2.0, 3.0))
-    assert load(tmp_path, text).twin.estimator == paper.Settings(
+    assert estimator(tmp_path, "paper", lines) == paper.Settings(
         80.0, 0.1, 30.0, 4, "even", 9, 7, "first", 2, 0.2, one, two, three, 0.3
     )
+
+
+def test_every_key_of_the_default_estimator_is_read(tmp_path):
+    lines = ["passes = 3", "order = 40", "starts = 9", "kept = 2", "skew = false", "largest_skew_s = 0.001"]
+    lines += ["gap_rate_deg_per_s = 1", "offset_deg = [-2, 3]", "prefilter_hz = 80", "contact_travel_deg = 1"]
+    lines += ["largest_std_deg = 3", "largest_shift_deg = 2", "model_error_deg = 3", "calibration = 1.3"]
+    one, two, three = (math.radians(x) for x in (1.0, 2.0, 3.0))
+    assert estimator(tmp_path, "whitened", lines) == whitened.Settings(
+        passes=3,
+        order=40,
+        starts=9,
+        kept=2,
+        skew=False,
+        largest_skew=1e-3,
+        gap_rate=one,
+        offset=(-two, three),
+        prefilter_hz=80.0,
+        contact_travel=one,
+        largest_std=three,
+        largest_shift=two,
+        model_error=three,
+        calibration=1.3,
+    )
+
+
+def test_the_default_twin_is_the_default_estimators(tmp_path):
+    assert load(tmp_path, SHORT).twin.method == Scenario(Servo.preset("paper"), 1.0).twin.method == "whitened"
+    assert {Scenario.preset(name).twin.method for name in ("fig15", "fig15-sampled", "fig16")} == {"paper"}
+
+
+@pytest.mark.parametrize(
+    ("recording", "window", "pre_trigger"),
+    [("", 2.0, 0.3), ("window_s = 1.5", 1.5, 0.3), ("pre_trigger_s = 0", 2.0, 0.0)],
+)
+def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path, recording, window, pre_trigger):
+    """Explicit keys go first, each by itself."""
+    calm = SHORT.replace("[gap]", f"[recording]\n{recording}\n[controller]\nki_v_per_m_s = 0\n[gap]")
+    agent = load(tmp_path, calm).agent_settings()
+    assert (agent.window_s, agent.pre_trigger_s) == (window, pre_trigger)
+    usual = load(tmp_path, SHORT).agent_settings()
+    assert (usual.window_s, usual.pre_trigger_s) == (1.0, 0.0)

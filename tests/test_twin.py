@@ -18,6 +18,7 @@ from servotwin.twin.decode import decode_channel, decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
+from servotwin.twin.wear import Expectation
 
 PITCH = 3e-4
 
@@ -32,7 +33,7 @@ def window_message(sequence=0, start=0.0, boot="boot-1", servo="axis", version=0
     )
 
 
-def known_gap(window: Window, prior: float) -> GapEstimate:
+def known_gap(window: Window, _expected: Expectation) -> GapEstimate:
     """A fake estimator: the gap grows by 0.01 rad/s."""
     gap = 0.01 * window.start
     return GapEstimate(gap, 0.0, 0.0, (gap, gap), GapStatus.OK, window.mid_time)
@@ -91,9 +92,9 @@ def test_the_window_is_safe_before_it_is_acknowledged():
 def test_the_previous_estimate_is_the_next_ones_prior():
     priors = []
 
-    def keeping(window, prior):
-        priors.append(prior)
-        return known_gap(window, prior)
+    def keeping(window, expected):
+        priors.append(expected.previous)
+        return known_gap(window, expected)
 
     twin, _ = make(keeping, initial_gap=0.5)
     for sequence, start in enumerate((10.0, 30.0, 20.0, 40.0)):

@@ -41,7 +41,7 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
     progress : callable, optional
         Called with the share done, 0 .. 1, at least once per window length.
     estimator : callable, optional
-        Replaces the twin's own: (identify.Window, previous gap in rad) -> GapEstimate.
+        Replaces the twin's own: (identify.Window, twin.wear.Expectation) -> GapEstimate.
 
     Returns
     -------
@@ -118,6 +118,7 @@ class Cosimulation:
             run=run,
             windows=tuple(self.store.windows.values()),
             estimates=tuple(self.store.estimates.values()),
+            trends=tuple(self.store.trends.values()),
             updates=tuple(self.store.updates),
             receipts=tuple(self.receipts),
             messages=tuple(sorted(self._transmissions(), key=lambda m: (m.sent, m.direction, m.serial, m.copy))),

@@ -7,6 +7,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.passage import Passage
+from servotwin.identify.trend import Trend
 from servotwin.link.simulated import Fate
 from servotwin.messages import Message, Receipt, Update, Window, decode
 from servotwin.scenario import Scenario
@@ -58,6 +60,8 @@ class Loop:
         As decoded by the twin, each once, in the order of arrival.
     estimates : tuple of GapEstimate
         One for each window.
+    trends : tuple of Trend or None
+        Gap and rate of wear as the twin knew them after each window; None before the first accepted estimate.
     updates : tuple of messages.Update
         Every version that the twin gave out.
     receipts : tuple of messages.Receipt
@@ -72,6 +76,7 @@ class Loop:
     run: Run
     windows: tuple[Window, ...]
     estimates: tuple[GapEstimate, ...]
+    trends: tuple[Trend | None, ...]
     updates: tuple[Update, ...]
     receipts: tuple[Receipt, ...]
     messages: tuple[Transmission, ...]
@@ -82,6 +87,17 @@ class Loop:
         """The first receipt of each update that was applied, in order."""
         first = {receipt.version: receipt for receipt in reversed(self.receipts) if receipt.applied}
         return tuple(sorted(first.values(), key=lambda receipt: receipt.sample))
+
+    @property
+    def trend(self) -> Trend | None:
+        """What is known of the wear in the end."""
+        return self.trends[-1] if self.trends else None
+
+    @property
+    def until_limit(self) -> Passage | None:
+        """How long after `trend.time` the gap reaches the scenario's `gap_limit`; None without limit or trend."""
+        limit = self.scenario.twin.gap_limit
+        return None if limit is None or self.trend is None else self.trend.time_until(limit)
 
     def digest(self) -> str:
         """SHA-256 over every message (bytes, times, fate) and the trajectory: equal only for runs equal bit for bit."""

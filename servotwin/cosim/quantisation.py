@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servotwin.cosim.loop import Loop
-from servotwin.identify.gap import estimate_gap
 from servotwin.identify.window import Window as NumericWindow
 from servotwin.messages import Window
 from servotwin.simulation import Run
 from servotwin.twin.decode import decode_window
+from servotwin.twin.twin import estimator_of
+from servotwin.twin.wear import Expectation
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,12 @@ def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
     Both estimates start from the same previous gap, that of the window before (as the twin does while windows arrive in
     order).
     """
-    settings, servo = loop.scenario.twin, loop.scenario.servo
+    settings = loop.scenario.twin
+    estimate = estimator_of(loop.scenario.servo, settings)
     previous, found = settings.initial_gap, []
     for window in loop.windows:
         pair = decode_window(window), _raw(loop.run, window)
-        decoded, raw = (estimate_gap(w, servo, settings.method, previous, settings.estimator) for w in pair)
+        decoded, raw = (estimate(w, Expectation(previous)) for w in pair)
         steps = {channel.name: channel.scale for channel in window.channels}
         found.append(Quantisation(window.start, steps["position"], steps["theta_m"], decoded.gap - raw.gap))
         previous = decoded.gap if decoded.ok else previous

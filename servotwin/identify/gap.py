@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from servotwin.errors import InvalidInput
 from servotwin.identify import paper, whitened
 from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.window import Window
+from servotwin.identify.window import MINIMUM_SAMPLES, Window
 from servotwin.plant.servo import Servo
 
 
@@ -54,16 +54,37 @@ def estimate_gap(
         An unknown method, a prior that is not a gap, settings of another method, a window that lacks a channel or
         is too short.
     """
-    if method not in METHODS:
-        raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(METHODS)}")
-    chosen = METHODS[method]
-    if settings is not None and not isinstance(settings, chosen.settings):
-        wanted = f"{chosen.settings.__module__.removeprefix('servotwin.')}.{chosen.settings.__name__}"
-        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {wanted}")
+    chosen = settings_of(method, settings)
     known = _believed(prior)
     if method == paper.METHOD and isinstance(known, GapEstimate):
         known = known.gap
-    return chosen.estimate(window, servo, known, settings)
+    return METHODS[method].estimate(window, servo, known, chosen)
+
+
+def settings_of(method: str, settings: Any = None) -> Any:
+    """The settings, or the method's own where they are None.
+
+    Raises
+    ------
+    InvalidInput
+        An unknown method, settings of another method.
+    """
+    if method not in METHODS:
+        raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(METHODS)}")
+    kind = METHODS[method].settings
+    if settings is not None and not isinstance(settings, kind):
+        wanted = f"{kind.__module__.removeprefix('servotwin.')}.{kind.__name__}"
+        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {wanted}")
+    return kind() if settings is None else settings
+
+
+def shortest_window(method: str, sample_rate: float, settings: Any = None) -> tuple[float, str]:
+    """The shortest window (s) that a method accepts at a sample rate (Hz), and why, in words."""
+    chosen = settings_of(method, settings)
+    if isinstance(chosen, paper.Settings):
+        settle = chosen.settle_s
+        return settle + MINIMUM_SAMPLES / sample_rate, f"the observer, which takes {settle!r} s to settle"
+    return whitened.SHORTEST / sample_rate, f"method {method!r}, which needs {whitened.SHORTEST} samples"
 
 
 def _believed(prior: float | GapEstimate | None) -> float | GapEstimate | None:

@@ -9,12 +9,17 @@ from dataclasses import dataclass
 import servotwin as st
 from servotwin import messages
 from servotwin.cosim import Loop
+from servotwin.identify import paper, whitened
+from servotwin.identify.estimate import GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.signals import as_pieces
 from servotwin.reproduce.measures import Step
 from servotwin.reproduce.runs import BIPOLAR, Square, Trace
 from servotwin.twin.known import known_gap
+from servotwin.twin.twin import Estimator, estimator_of
+from servotwin.twin.wear import Expectation
 
+PUBLISHED, OURS = paper.METHOD, whitened.METHOD
 SEEDS = (2023, 2024, 2025)  # of the noise; the first is the packaged scenario's
 CONTINUOUS, SAMPLED, NOISY = "fig15", "fig15-sampled", "fig16"
 Progress = Callable[[float], object]
@@ -22,14 +27,24 @@ Progress = Callable[[float], object]
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """One estimate: when (s, middle of its window), what (rad, total gap), how sure (rad), and the truth then (rad)."""
+    """One estimate: when (s, middle of its window), what (rad, total gap), how sure (rad), and the truth then (rad).
+
+    Where it is not OK, `gap` is what was believed already, or a bound.
+    """
 
     time: float
     gap: float
     std: float
+    interval: tuple[float, float]
     status: str
+    reasons: tuple[str, ...]
     truth: float
     seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether it reached the controller."""
+        return self.status == GapStatus.OK.value
 
     @property
     def error(self) -> float:
@@ -66,7 +81,11 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class LoopJob:
-    """A packaged scenario with another servo, reference, seed or dead-zone gain; `exact` sends the true gap instead."""
+    """A packaged scenario with another servo, reference, seed, dead-zone gain or estimator.
+
+    The scenarios are the paper's, and so is their estimator, with its settings; `OURS` is the default one with its
+    defaults; `exact` sends the true gap instead.
+    """
 
     preset: str
     scenario: str = CONTINUOUS
@@ -74,17 +93,19 @@ class LoopJob:
     seed: int = SEEDS[0]
     k_dz: float = 1.0
     exact: bool = False
+    method: str = PUBLISHED
 
     def described(self) -> st.Scenario:
         """The scenario."""
         packaged = st.Scenario.preset(self.scenario)
         servo = st.Servo.preset(self.preset)
+        settings = packaged.twin.estimator if self.method == packaged.twin.method else None
         return packaged.replace(
             servo=servo,
             controller=_with_gains(packaged.law, servo.controller),
             reference=self.square.signal,
             seed=self.seed,
-            twin=packaged.twin.replace(k_dz=self.k_dz),
+            twin=packaged.twin.replace(k_dz=self.k_dz, method=self.method, estimator=settings),
         )
 
     def run(self) -> Record:
@@ -121,22 +142,18 @@ def record(scenario: st.Scenario, exact: bool = False, progress: Progress | None
     )
 
 
-def _timed(scenario: st.Scenario, seconds: list[float], exact: bool) -> Callable[[Window, float], st.GapEstimate]:
+def _timed(scenario: st.Scenario, seconds: list[float], exact: bool) -> Estimator:
     """The twin's own estimator, or one that knows the gap, with the wall time of each call noted."""
-    truth = known_gap(scenario.gap, scenario.duration)
+    known = known_gap(scenario.gap, scenario.duration)
+    chosen = known if exact else estimator_of(scenario.servo, scenario.twin)
 
-    def estimate(window: Window, previous: float) -> st.GapEstimate:
+    def estimate(window: Window, expected: Expectation) -> st.GapEstimate:
         begin = time.perf_counter()
-        found = truth(window, previous) if exact else _own(scenario, window, previous)
+        found = chosen(window, expected)
         seconds.append(time.perf_counter() - begin)
         return found
 
     return estimate
-
-
-def _own(scenario: st.Scenario, window: Window, previous: float) -> st.GapEstimate:
-    settings = scenario.twin
-    return st.estimate_gap(window, scenario.servo, settings.method, previous, settings.estimator)
 
 
 def _with_gains(law: st.Controller, gains: st.Controller) -> st.Controller:
@@ -148,7 +165,7 @@ def _estimates(loop: Loop, seconds: list[float]) -> tuple[Estimated, ...]:
     times = [one.time for one in loop.estimates]
     truths = as_pieces(loop.scenario.gap, loop.scenario.duration).value(times)
     return tuple(
-        Estimated(one.time, one.gap, one.std_total, one.status.value, float(truth), spent)
+        Estimated(one.time, one.gap, one.std_total, one.interval, one.status.value, one.reasons, float(truth), spent)
         for one, truth, spent in zip(loop.estimates, truths, seconds, strict=True)
     )
 

@@ -6,6 +6,7 @@ from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.signals import SignalLike, as_nonnegative
 from servotwin.twin.twin import Estimator
+from servotwin.twin.wear import Expectation
 
 
 def known_gap(gap: SignalLike, duration: float) -> Estimator:
@@ -20,7 +21,7 @@ def known_gap(gap: SignalLike, duration: float) -> Estimator:
     """
     truth = as_nonnegative(gap, duration, "gap", "rad")
 
-    def estimate(window: Window, _previous: float) -> GapEstimate:
+    def estimate(window: Window, _expected: Expectation) -> GapEstimate:
         middle = window.start + 0.5 * window.duration
         value = max(0.0, float(truth.value(middle)))
         return GapEstimate(value, 0.0, 0.0, (value, value), GapStatus.OK, middle, method="known")

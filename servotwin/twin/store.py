@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.trend import Trend
 from servotwin.messages import Receipt, Update, Window
 
 Identity = tuple[str, str, int]
@@ -23,6 +24,10 @@ class Store(Protocol):
         """Keep what was estimated from a window."""
         ...
 
+    def add_trend(self, window: Window, trend: Trend | None) -> None:
+        """Keep what is known of the wear after a window; None: nothing yet."""
+        ...
+
     def add_update(self, update: Update) -> None:
         """Keep an update before it is sent."""
         ...
@@ -38,6 +43,7 @@ class MemoryStore:
 
     windows: dict[Identity, Window] = field(default_factory=dict)
     estimates: dict[Identity, GapEstimate] = field(default_factory=dict)
+    trends: dict[Identity, Trend | None] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
 
@@ -50,6 +56,10 @@ class MemoryStore:
     def add_estimate(self, window: Window, estimate: GapEstimate) -> None:
         """Keep what was estimated from a window."""
         self.estimates[window.identity] = estimate
+
+    def add_trend(self, window: Window, trend: Trend | None) -> None:
+        """Keep the trend after a window."""
+        self.trends[window.identity] = trend
 
     def add_update(self, update: Update) -> None:
         """Keep an update."""

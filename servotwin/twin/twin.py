@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
-from servotwin.identify.gap import estimate_gap
+from servotwin.identify.gap import estimate_gap, settings_of
+from servotwin.identify.trend import Trend
+from servotwin.identify.whitened import Settings
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
 from servotwin.messages import Window as WindowMessage
@@ -18,9 +21,10 @@ from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
+from servotwin.twin.wear import Expectation, Wear
 
-Estimator = Callable[[Window, float], GapEstimate]
-"""(window, previous gap in rad) -> estimate."""
+Estimator = Callable[[Window, Expectation], GapEstimate]
+"""(window, what is known before it) -> estimate."""
 Policy = Callable[[GapEstimate, float | None], Redesign]
 """(estimate, gap of the last redesign in rad or None) -> what to do."""
 
@@ -30,14 +34,14 @@ class Twin:
 
     A window is committed to the store, then acknowledged, then estimated, once: a second copy is only acknowledged.
     Windows may come in any order; every one is estimated, but only one that is newer than all before moves the
-    parameters and the starting point of the next estimate. Only an estimate whose status is OK sets parameters.
+    parameters, the trend and the starting point of the next estimate. Only an estimate whose status is OK does either.
 
     Parameters
     ----------
     servo : str
         Whose messages it takes.
     estimator : callable
-        (identify.Window, previous gap in rad) -> GapEstimate.
+        (identify.Window, Expectation) -> GapEstimate.
     policy : callable
         (estimate, gap of the last redesign in rad, or None) -> Redesign (Eq 21).
     store : Store
@@ -52,7 +56,7 @@ class Twin:
         self.settings = settings or TwinSettings()
         self._estimator, self._policy, self._store = estimator, policy, store
         self._versions = Versions()
-        self._gap = self.settings.initial_gap
+        self._wear = Wear(self.settings.initial_gap, self.settings.trend)
         self._tuned_for: float | None = None
         self._sent_at, self._attempts = -math.inf, 0
 
@@ -63,6 +67,11 @@ class Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs."""
         policy = PaperPolicy(settings.k_dz, settings.smoothing)
         return cls(name, estimator or estimator_of(servo, settings), partial(policy.redesign, servo), store, settings)
+
+    @property
+    def trend(self) -> Trend | None:
+        """Gap and rate of wear as known from all windows that counted, on the sample time of the edge's boot."""
+        return self._wear.trend
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """What to send after a message that arrived at `now` (s, any steady clock of the twin's own).
@@ -98,10 +107,11 @@ class Twin:
             return []
         return self._again(now)
 
-    def estimate(self, message: WindowMessage) -> GapEstimate:
+    def estimate(self, message: WindowMessage, now: float) -> GapEstimate:
         """What a window says about the gap; where it cannot be used at all, UNIDENTIFIABLE and why."""
         try:
-            return self._estimator(decode_window(message), self._gap)
+            window = decode_window(message)
+            return self._estimator(window, self._wear.expect(message.boot, window.mid_time, now))
         except InvalidInput as error:
             return _nothing(message, str(error))
 
@@ -112,11 +122,14 @@ class Twin:
 
     def _learn(self, message: WindowMessage, now: float) -> list[Message]:
         self._versions.hear(message.boot, message.parameter_version)
-        estimate = self.estimate(message)
+        estimate = self.estimate(message, now)
         self._store.add_estimate(message, estimate)
-        if not (estimate.ok and self._versions.admits(message)):
+        counts = estimate.ok and self._versions.admits(message)
+        if counts:
+            self._wear.learn(message.boot, estimate, now)
+        self._store.add_trend(message, self.trend)
+        if not counts:
             return []
-        self._gap = estimate.gap
         redesign = self._policy(estimate, self._tuned_for)
         if redesign.tolerance is None:
             return []
@@ -154,10 +167,18 @@ class Twin:
 
 
 def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
-    """The estimator that `settings` name, with a servo as its model."""
+    """The estimator that `settings` name, with a servo as its model.
 
-    def estimate(window: Window, previous: float) -> GapEstimate:
-        return estimate_gap(window, servo, settings.method, previous, settings.estimator)
+    The published one starts from the previous gap, as printed. The default one is told what the trend predicts, and
+    how fast the gap may grow within the window.
+    """
+    given = settings_of(settings.method, settings.estimator)
+
+    def estimate(window: Window, expected: Expectation) -> GapEstimate:
+        if not isinstance(given, Settings):
+            return estimate_gap(window, servo, settings.method, expected.previous, given)
+        drift = given.gap_rate or expected.gap_rate(settings.trend)
+        return estimate_gap(window, servo, settings.method, expected.prior, replace(given, gap_rate=drift))
 
     return estimate
 

@@ -1,0 +1,81 @@
+"""What a twin knows of its servo's wear from window to window, on the edge's clock of sample time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.trend import Trend, TrendSettings
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What is known before a window is looked at.
+
+    Attributes
+    ----------
+    previous : float
+        rad: the last gap that was accepted, or what was believed at the start.
+    trend : Trend or None
+        The wear as predicted for the middle of the window; None before the first accepted estimate.
+    """
+
+    previous: float
+    trend: Trend | None = None
+
+    @property
+    def prior(self) -> float | GapEstimate:
+        """Where an estimator may start: the prediction, or the previous gap while there is none."""
+        return self.previous if self.trend is None else self.trend.as_estimate()
+
+    def gap_rate(self, settings: TrendSettings) -> float:
+        """rad/s: root mean square of the growth to reckon with inside the window.
+
+        Without it a growing gap is taken for a wrong model, and its value is that of whenever the screw crossed it: of
+        Fig 16's windows one in three was refused, and in the calm loop estimates were off by up to 0.04 deg.
+        """
+        rate, std = (0.0, settings.rate_std_rad_per_s) if self.trend is None else (self.trend.rate, self.trend.rate_std)
+        return math.hypot(rate, std)
+
+
+class Wear:
+    """The trend of one servo, moved by accepted estimates in the order of their windows.
+
+    Sample time begins anew with each boot of the edge. What passed meanwhile is taken from the twin's own clock.
+
+    Parameters
+    ----------
+    initial_gap : float
+        rad, believed before the first estimate.
+    settings : TrendSettings
+    """
+
+    def __init__(self, initial_gap: float, settings: TrendSettings) -> None:
+        self.settings = settings
+        self.trend: Trend | None = None
+        self._previous = initial_gap
+        self._boot, self._heard = "", 0.0
+
+    def expect(self, boot: str, time: float, now: float) -> Expectation:
+        """What is known before a window of `boot` with its middle at `time` (s) that arrived at `now`.
+
+        For a window older than the trend, what is known is the trend as it stands.
+        """
+        trend = self._on_clock(boot, time, now)
+        return Expectation(self._previous, trend and trend.predict(max(time, trend.time)))
+
+    def learn(self, boot: str, estimate: GapEstimate, now: float) -> None:
+        """Take an accepted estimate; one that is not OK, or older than the trend, changes nothing."""
+        trend = self._on_clock(boot, estimate.time, now)
+        if not estimate.ok or (trend is not None and estimate.time <= trend.time):
+            return
+        self.trend = (trend or Trend.start(estimate.time, self.settings)).update(estimate)
+        self._previous = estimate.gap
+        self._boot, self._heard = boot, now
+
+    def _on_clock(self, boot: str, time: float, now: float) -> Trend | None:
+        """The trend on the clock of `boot`."""
+        if self.trend is None or boot == self._boot:
+            return self.trend
+        return replace(self.trend, time=time - max(0.0, now - self._heard))
