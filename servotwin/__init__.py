@@ -22,9 +22,11 @@ _HOMES = {
     "Simulation": "servotwin.simulation",
     "SquareWave": "servotwin.plant.signals",
     "Step": "servotwin.plant.signals",
+    "Trend": "servotwin.identify.trend",
     "Window": "servotwin.identify.window",
     "cosimulate": "servotwin.cosim",
     "estimate_gap": "servotwin.identify.gap",
+    "estimate_jointly": "servotwin.identify.jointly",
     "simulate": "servotwin.simulation",
 }
 
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
     from servotwin.errors import InvalidInput
     from servotwin.identify.estimate import GapEstimate, GapStatus
     from servotwin.identify.gap import estimate_gap
+    from servotwin.identify.jointly import estimate_jointly
+    from servotwin.identify.trend import Trend
     from servotwin.identify.window import Window
     from servotwin.plant.noise import Noise
     from servotwin.plant.servo import Servo
@@ -57,9 +61,11 @@ __all__ = [
     "Simulation",
     "SquareWave",
     "Step",
+    "Trend",
     "Window",
     "cosimulate",
     "estimate_gap",
+    "estimate_jointly",
     "simulate",
 ]
 

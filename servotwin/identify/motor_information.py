@@ -160,7 +160,7 @@ def last_contacts(
 
 
 def table(cases: tuple[Case, ...]) -> str:
-    """The relative standard deviations as a Markdown table; a dash where a product is not identifiable."""
+    """The relative standard deviations as a Markdown table; a dash where a product is not identifiable at all."""
     head = ["measured", "identifiable", *PRODUCTS]
     lines = [head, ["---"] * len(head)]
     for case in cases:
@@ -170,4 +170,4 @@ def table(cases: tuple[Case, ...]) -> str:
 
 
 def _percent(std: float) -> str:
-    return "-" if math.isinf(std) else f"{100.0 * std:.2g} %"
+    return "-" if math.isinf(std) else "> 100 %" if std > 1.0 else f"{100.0 * std:.2g} %"
