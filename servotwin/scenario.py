@@ -56,9 +56,9 @@ class Scenario:
     noise : Noise, optional
         On the measured position; needs a sampled controller.
     recording : Recording
-        Left open, a window holds 1 s from the change of the reference on. A loop without integral action is calm: it
-        reverses so seldom that the gap shows only where a window also holds the rest before the step and the crossing
-        after it, so that it begins 0.3 s before the change and holds 2 s. What `recording` says goes first.
+        Left open, a window holds 1 s from the change of the reference on. A loop without integral action is calm: the
+        screw turns back so late that a second often shows one side of the gap only. Its windows begin 0.3 s before the
+        change, or with the first sample, and hold 2 s. What `recording` says goes first.
     uplink, downlink : LinkSettings
         Edge to twin, and back.
     twin : TwinSettings

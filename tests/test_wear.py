@@ -1,0 +1,180 @@
+"""The twin's trend: what it expects of a window, what moves it, reboots; loops in which the gap wears."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from servotwin.cosim import Loop, cosimulate, quantisation
+from servotwin.errors import InvalidInput
+from servotwin.identify import whitened
+from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.trend import TrendSettings
+from servotwin.scenario import Scenario
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.wear import Wear
+
+STD = math.radians(0.02)
+SETTINGS = TrendSettings.for_wear(math.radians(20.0), 200.0)
+
+
+def seen(gap_deg: float, time: float, status: GapStatus = GapStatus.OK) -> GapEstimate:
+    gap = math.radians(gap_deg)
+    return GapEstimate(gap, STD, STD, (gap - 2 * STD, gap + 2 * STD), status, time)
+
+
+def worn(rate_deg: float = 0.1, windows: int = 6) -> Wear:
+    """After windows every 20 s of a gap that grows steadily from 1 deg on."""
+    wear = Wear(0.0, SETTINGS)
+    for time in 20.0 * np.arange(windows):
+        wear.learn("boot-1", seen(1.0 + rate_deg * time, time), time + 2.0)
+    return wear
+
+
+def test_before_the_first_estimate_there_is_only_what_is_believed():
+    expected = Wear(0.3, SETTINGS).expect("boot-1", 10.0, 12.0)
+    assert (expected.prior, expected.trend) == (0.3, None)
+    assert expected.gap_rate(SETTINGS) == SETTINGS.rate_std_rad_per_s
+
+
+def test_it_predicts_the_next_window():
+    expected = worn().expect("boot-1", 120.0, 122.0)
+    assert expected.trend.time == expected.prior.time == 120.0
+    assert math.degrees(expected.prior.gap) == pytest.approx(13.0, abs=0.2)
+    assert STD < expected.prior.std_total < math.radians(1.0)
+    assert math.degrees(expected.gap_rate(SETTINGS)) == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("status", [s for s in GapStatus if s is not GapStatus.OK])
+def test_nothing_but_a_good_estimate_moves_it(status):
+    wear = worn()
+    before = wear.trend
+    wear.learn("boot-1", seen(40.0, 120.0, status), 122.0)
+    assert wear.trend is before
+
+
+def test_an_older_window_moves_nothing_and_is_expected_as_things_stand():
+    wear = worn()
+    before = wear.trend
+    wear.learn("boot-1", seen(3.0, 50.0), 130.0)
+    assert wear.trend is before
+    assert wear.expect("boot-1", 50.0, 130.0).trend.time == before.time == 100.0
+
+
+def test_a_reboot_starts_the_edges_clock_anew_but_not_the_wear():
+    """The edge was off from 102 s to 140 s of the twin's clock: at 5 s of its new sample time 43 s have passed."""
+    wear = worn()
+    expected = wear.expect("boot-2", 5.0, 145.0)
+    assert math.degrees(expected.prior.gap) == pytest.approx(1.0 + 0.1 * 143.0, abs=0.3)
+    wear.learn("boot-2", seen(15.3, 5.0), 145.0)
+    assert (wear.trend.time, wear.trend.updates) == (5.0, 7)
+    assert math.degrees(wear.trend.rate) == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_prior_must_not_be_counted_twice():
+    with pytest.raises(InvalidInput, match="combine"):
+        TwinSettings(estimator=whitened.Settings(combine=True))
+    with pytest.raises(InvalidInput, match=r"identify\.paper|identify\.settings"):
+        TwinSettings(method="paper", estimator=whitened.Settings())
+    with pytest.raises(InvalidInput, match="'best' does not exist"):
+        TwinSettings(method="best")
+    with pytest.raises(InvalidInput, match="gap_limit"):
+        TwinSettings(gap_limit=-1.0)
+
+
+@cache
+def loop_of(name: str, **changes: object) -> Loop:
+    scenario = Scenario.preset(name)
+    ours = {"method": "whitened", "estimator": None, **changes}
+    return cosimulate(scenario.replace(twin=scenario.twin.replace(**ours)))
+
+
+def errors_deg(loop: Loop) -> np.ndarray:
+    """(n,) estimate less truth in the middle of the window, of the estimates that are OK."""
+    times = [e.time for e in loop.estimates if e.ok]
+    truth = loop.scenario.gap.pieces(loop.scenario.duration).value(times)
+    return np.degrees([e.gap for e in loop.estimates if e.ok] - truth)
+
+
+@pytest.mark.parametrize(("name", "largest"), [("fig15", 0.03), ("fig15-sampled", 0.03), ("calm", 0.005)])
+def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
+    loop = loop_of(name)
+    assert [e.status for e in loop.estimates] == [GapStatus.OK] * 10
+    errors = errors_deg(loop)
+    assert np.max(np.abs(errors)) < largest
+    assert all(abs(error) < 1.96 * math.degrees(e.std_total) for error, e in zip(errors, loop.estimates, strict=True))
+    assert [update.gap for update in loop.updates] == [e.gap for e in loop.estimates]
+
+
+@pytest.mark.parametrize("seed", [2023, 2024, 2025])
+def test_in_the_papers_noise_what_is_accepted_is_right(seed):
+    scenario = Scenario.preset("fig16")
+    ours = scenario.twin.replace(method="whitened", estimator=None)
+    loop = cosimulate(scenario.replace(seed=seed, twin=ours))
+    assert sum(e.ok for e in loop.estimates) >= 8
+    assert np.max(np.abs(errors_deg(loop))) < 0.05
+    assert {update.data_time for update in loop.updates} <= {e.time - 0.4999 for e in loop.estimates if e.ok}
+
+
+def test_the_trend_follows_the_wear():
+    loop = loop_of("calm")
+    assert [trend.updates for trend in loop.trends] == list(range(1, 11))
+    truth = loop.scenario.gap.pieces(200.0)
+    for trend in loop.trends[2:]:
+        low, high = trend.gap_interval
+        assert low < float(truth.value(trend.time)) < high
+        rate = float(truth.value(trend.time + 0.5) - truth.value(trend.time - 0.5))
+        assert abs(trend.rate - rate) < 2.5 * trend.rate_std
+    assert loop.trend is loop.trends[-1]
+    until = loop.until_limit
+    assert until.interval[0] < until.median < until.interval[1]
+    assert loop_of("fig15").until_limit is None
+
+
+def test_without_a_window_there_is_no_trend():
+    scenario = Scenario.preset("calm").replace(duration=1.0)
+    assert cosimulate(scenario).trend is None
+
+
+def test_the_paper_starts_from_the_last_estimate_whatever_the_trend_says():
+    """Published results must not hang on settings of the trend."""
+    scenario = Scenario.preset("fig15").replace(duration=45.0)
+    other = scenario.replace(twin=scenario.twin.replace(trend=SETTINGS))
+    assert cosimulate(scenario).digest() == cosimulate(other).digest()
+
+
+def calm(window: float, pre_trigger: float, **twin: float) -> Loop:
+    scenario = Scenario.preset("calm")
+    recording = replace(scenario.recording, window=window, pre_trigger=pre_trigger)
+    return cosimulate(scenario.replace(recording=recording, twin=scenario.twin.replace(**twin)))
+
+
+def test_the_first_window_has_no_time_before_its_step():
+    """At t = 0 the window begins with the first sample and keeps its length; it shows the gap all the same."""
+    loop = loop_of("calm")
+    assert [window.start for window in loop.windows] == pytest.approx([0.0, *(20.0 * np.arange(1, 10) - 0.3)])
+    assert {window.samples for window in loop.windows} == {10_000}
+    assert loop.windows[0].reference_changes == ((0.0, 1e-3),)
+    assert loop.windows[1].reference_changes == ((20.0, -1e-3),)
+
+
+def test_a_calm_loop_does_not_show_its_gap_in_a_second_after_the_step():
+    loop = calm(1.0, 0.0)
+    large = [e for e in loop.estimates if e.time > 60.0]
+    assert {e.status for e in large} <= {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND, GapStatus.MODEL_MISMATCH}
+    assert all(e.reasons for e in large)
+    assert np.max(np.abs(errors_deg(loop)), initial=0.0) < 0.05
+
+
+def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
+    """Each step ends inside the dead zone, before the screw comes to the other side."""
+    loop = calm(2.0, 0.3, k_dz=1.0)
+    assert sum(e.ok for e in loop.estimates) < 8
+    assert np.max(np.abs(errors_deg(loop))) < 0.05
+
+
+def test_quantisation_to_int16_costs_our_estimator_hundredths_of_a_degree():
+    found = quantisation(loop_of("fig15"))
+    assert max(abs(q.gap_change) for q in found) < math.radians(0.03)
