@@ -169,6 +169,10 @@ def test_random_servos_against_a_long_run(n, seed, gap_deg, share):
     assume(np.max(servo.closed_loop().poles().real) < -0.1)
     tolerance = servo.tolerance_for(gap, share)
     found = limit_cycle(servo, gap, tolerance)
+    if found.status is CycleStatus.IRREGULAR:
+        # A refusal, with its reason, is no wrong answer: dead zones can hunt for hours.
+        assert found.orbit is None and found.reason and share > 0.0
+        return
     assert found.status in (CycleStatus.CYCLE, CycleStatus.SETTLES), found.reason
     releases, position = simulated(servo, gap, tolerance, servo.controller, 80.0)
     if found.orbit is None:
