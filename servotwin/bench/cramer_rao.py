@@ -23,11 +23,14 @@ _STEP = 1e-7  # rad
 
 @lru_cache(maxsize=8)
 def noise_root(samples: int, rate: float, floor: float, noise: Noise | None) -> Array:
-    """(n, n) lower Cholesky factor of the covariance of white noise of `floor` (m) and, independent of it, `noise`."""
-    covariance = np.zeros(samples)
-    if noise is not None:
-        _, gain = sosfreqz(noise.filter(rate), worN=1 << 17, whole=True)
-        covariance = noise.std**2 * np.fft.ifft(np.abs(gain) ** 2).real[:samples]
+    """(n, n) lower Cholesky factor of the covariance of white noise of `floor` (m) and, independent of it, `noise`.
+
+    White noise alone has its standard deviation as factor, (1, 1).
+    """
+    if noise is None:
+        return np.array([[floor]])
+    _, gain = sosfreqz(noise.filter(rate), worN=1 << 17, whole=True)
+    covariance = noise.std**2 * np.fft.ifft(np.abs(gain) ** 2).real[:samples]
     covariance[0] += floor**2
     return np.asarray(cholesky(toeplitz(covariance), lower=True))
 
@@ -46,7 +49,7 @@ def bound(servo: Servo, theta_m: Array, rate: float, gap: float, theta_d0: float
         Hz.
     gap, theta_d0 : float
         rad, the truth.
-    root : (n, n) array
+    root : (n, n) or (1, 1) array
         Of the noise: `noise_root`.
     """
     times = np.arange(theta_m.size) / rate
@@ -66,8 +69,8 @@ def bound(servo: Servo, theta_m: Array, rate: float, gap: float, theta_d0: float
 def _spread(column: Array, others: Array, root: Array) -> float:
     others = others[np.abs(others).max(axis=1) > 0.0]
     table = np.vstack([others / np.linalg.norm(others, axis=1)[:, None], column])
-    white = solve_triangular(root, table.T, lower=True)
-    triangle = np.linalg.qr(white, mode="r")
+    white = table.T / root[0, 0] if root.size == 1 else solve_triangular(root, table.T, lower=True)
+    triangle = np.asarray(np.linalg.qr(white, mode="r"))
     return float(1.0 / abs(triangle[-1, -1]))
 
 

@@ -4,93 +4,71 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from statistics import median
 
 import numpy as np
-from scipy.signal import lfilter
 
+from servotwin.bench import estimator_conditions as conditions
 from servotwin.bench.cramer_rao import bound, noise_root
+from servotwin.bench.estimator_figures import (
+    ANY,
+    FLOOR,
+    OPEN_MINDED,
+    Answers,
+    Figure,
+    answers,
+    clean_cases,
+    eight_gaps,
+    on_floor,
+)
 from servotwin.bench.estimator_windows import RATE, Case, paper_loop_cases, random_cases
-from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.estimate import GapStatus
 from servotwin.identify.gap import estimate_gap
 from servotwin.identify.paper import Settings as PaperSettings
-from servotwin.identify.whitened import Settings
-from servotwin.identify.window import Window
+from servotwin.identify.plain import plain_fit
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 PAPER_NOISE = Noise(0.22e-3)
-FLOOR = 1e-6  # m
-_NORMAL_95 = 1.959963984540054
 Clock = Callable[[], float]
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One measured figure.
+def table(size: float = 1.0, seed: int = 2026) -> Iterator[Figure]:
+    """All figures, one experiment after the other.
 
-    Attributes
+    Parameters
     ----------
-    name : str
-        What was measured, with its unit.
-    value : float
-    target : (float, float)
-        Between what it must lie; (-inf, inf) where it is only reported.
-    windows : int
-    remark : str
+    size : float
+        1: as many windows as docs/estimator.md states; 0.1: a tenth, and so on.
+    seed : int
     """
 
-    name: str
-    value: float
-    target: tuple[float, float]
-    windows: int
-    remark: str = ""
+    def share(count: int) -> int:
+        return max(1, round(size * count))
 
-    @property
-    def met(self) -> bool:
-        """Whether the value is what it must be."""
-        return self.target[0] <= self.value <= self.target[1]
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """Estimates of some cases, accepted or not."""
-
-    cases: Sequence[Case]
-    estimates: Sequence[GapEstimate]
-
-    @property
-    def accepted(self) -> Array:
-        """(n,) of bool."""
-        return np.array([estimate.ok for estimate in self.estimates])
-
-    @property
-    def errors(self) -> Array:
-        """(n,) deg; NaN where refused."""
-        pairs = zip(self.cases, self.estimates, strict=True)
-        return np.array([math.degrees(e.gap - c.gap) if e.ok else math.nan for c, e in pairs])
-
-    def coverage(self, spread: str = "std") -> float:
-        """Share of the accepted errors within 1.96 `spread`."""
-        stds = np.degrees([getattr(estimate, spread) for estimate in self.estimates])
-        ratio = np.abs(self.errors)[self.accepted] / stds[self.accepted]
-        return float(np.mean(ratio <= _NORMAL_95)) if ratio.size else math.nan
-
-
-def answers(cases: Iterable[Case], servo: Servo | None = None, settings: Settings | None = None) -> Answers:
-    """The default estimator's, with another model where one is given."""
-    known = list(cases)
-    return Answers(known, [estimate_gap(c.window, servo or c.servo, settings=settings) for c in known])
+    yield from noise_free(share(500), seed)
+    yield from in_the_papers_noise(share(26), seed)
+    yield from in_the_papers_noise(share(6), seed, 1e-7)
+    yield from in_the_papers_noise(share(6), seed, 1e-5)
+    yield from in_white_noise(share(26), seed)
+    yield from conditions.in_coloured_noise(share(40), seed, 0.9)
+    yield from conditions.in_coloured_noise(share(40), seed, 0.99, False)
+    yield from conditions.quantised(share(40), seed)
+    yield from conditions.coarse_encoder(share(6), seed)
+    yield from conditions.skewed(share(9), seed)
+    yield from conditions.wrong_model(share(9), seed)
+    yield from conditions.compliant_screw(seed)
+    yield from random_windows(share(1000), seed)
+    yield from speed(share(24), seed)
 
 
 def noise_free(count: int, seed: int) -> list[Figure]:
     """Two-contact windows at random, gaps up to 60 deg."""
     found = answers(random_cases(np.random.default_rng(seed), count, math.radians(60.0), True, constant=True))
     wrong = np.nanmax(np.abs(found.errors))
-    refused = int(np.sum(~found.accepted))
+    refused = int(np.count_nonzero(np.logical_not(found.accepted)))
     right = float(np.mean(np.abs(np.nan_to_num(found.errors, nan=1.0)) <= 1e-3))
     return [
         Figure("noise-free: within 1e-3 deg, share", right, (1.0, 1.0), count, f"{refused} refused"),
@@ -100,10 +78,8 @@ def noise_free(count: int, seed: int) -> list[Figure]:
 
 def in_the_papers_noise(per_gap: int, seed: int, floor: float = FLOOR) -> list[Figure]:
     """The paper's loop, 0.22 mm high-passed and a white floor; beside the paper's estimator and the bound."""
-    rng = np.random.default_rng(seed)
-    gaps = np.radians(np.linspace(4.0, 18.0, 8))
-    cases = [_on_floor(case, floor, rng) for case in paper_loop_cases(gaps, per_gap, seed, PAPER_NOISE)]
-    found = answers(cases, settings=Settings(largest_std=math.radians(2.0), largest_shift=math.radians(2.0)))
+    cases = paper_noise_cases(per_gap, seed, floor)
+    found = answers(cases, settings=OPEN_MINDED)
     errors, label = found.errors[found.accepted], f"paper noise, floor {1e6 * floor:g} um"
     limits = _bounds(cases, floor, PAPER_NOISE)
     judged = floor == FLOOR
@@ -114,13 +90,16 @@ def in_the_papers_noise(per_gap: int, seed: int, floor: float = FLOOR) -> list[F
         Figure(f"{label}: Cramer-Rao bound, deg", float(np.sqrt(np.mean(limits**2))), ANY, errors.size),
         Figure(f"{label}: coverage of std", found.coverage(), ANY, errors.size),
     ]
-    return [*figures, _against_the_paper(cases, errors)] if judged else figures
+    return [*figures, against_the_paper(cases, errors)] if judged else figures
 
 
-ANY = (-math.inf, math.inf)
+def paper_noise_cases(per_gap: int, seed: int, floor: float) -> list[Case]:
+    """The paper's loop in its noise, and a white floor (m) on top."""
+    rng = np.random.default_rng(seed)
+    return [on_floor(case, floor, rng) for case in paper_loop_cases(eight_gaps(), per_gap, seed, PAPER_NOISE)]
 
 
-def _against_the_paper(cases: Sequence[Case], errors: Array) -> Figure:
+def against_the_paper(cases: Sequence[Case], errors: Array) -> Figure:
     """Root mean square error of the paper's method over ours."""
     settings = PaperSettings(lowpass_hz=20.0)
     published = [estimate_gap(c.window, c.servo, method="paper", prior=c.gap, settings=settings) for c in cases]
@@ -133,7 +112,7 @@ def _against_the_paper(cases: Sequence[Case], errors: Array) -> Figure:
 def in_white_noise(per_gap: int, seed: int) -> list[Figure]:
     """The paper's loop without noise in it, 1 um of white noise on the position."""
     rng = np.random.default_rng(seed)
-    cases = [_on_floor(c, FLOOR, rng) for c in paper_loop_cases(_gaps(), per_gap, seed, None)]
+    cases = [on_floor(c, FLOOR, rng) for c in paper_loop_cases(eight_gaps(), per_gap, seed, None)]
     found = answers(cases)
     ratio, size = _ratio(found, _bounds(cases, FLOOR, None)), int(found.accepted.sum())
     return [
@@ -142,114 +121,11 @@ def in_white_noise(per_gap: int, seed: int) -> list[Figure]:
     ]
 
 
-def in_coloured_noise(per_gap: int, seed: int, memory: float, judged: bool = True) -> list[Figure]:
-    """First-order autoregressive noise of 1 um, its memory that from one sample to the next."""
-    rng = np.random.default_rng(seed)
-    cases = [c.noisy(_autoregressive(c.window.position.size, memory, rng)) for c in _clean(per_gap, seed)]
-    found = answers(cases)
-    size, target = int(found.accepted.sum()), (0.92, 0.98) if judged else ANY
-    return [Figure(f"AR(1) noise, {memory:g}: coverage of std", found.coverage(), target, size)]
-
-
-def quantised(per_gap: int, seed: int, step: float = 5e-6) -> list[Figure]:
-    """The position in steps (m), a little noise below one step."""
-    rng = np.random.default_rng(seed)
-    cases = []
-    for case in _clean(per_gap, seed):
-        seen = case.window.position + 0.3 * step * rng.standard_normal(case.window.position.size)
-        cases.append(case.noisy(np.round(seen / step) * step - case.window.position))
-    found = answers(cases)
-    name = f"position in steps of {1e6 * step:g} um: coverage of std"
-    return [Figure(name, found.coverage(), (0.92, 0.98), int(found.accepted.sum()))]
-
-
-def coarse_encoder(per_gap: int, seed: int, counts: int = 8192) -> list[Figure]:
-    """An encoder of so many counts per turn, white noise of 1 um on the position."""
-    rng = np.random.default_rng(seed)
-    resolution = 2.0 * math.pi / counts
-    cases = []
-    for case in _clean(per_gap, seed):
-        angle = np.round(case.window.theta_m / resolution) * resolution
-        seen = _on_floor(case, FLOOR, rng)
-        cases.append(
-            seen.replaced(seen.window.replace(theta_m=angle), case.servo.replace(encoder_resolution=resolution))
-        )
-    found = answers(cases)
-    errors = found.errors[found.accepted]
-    name = f"encoder of {counts} counts"
-    return [
-        Figure(f"{name}: rms error, deg", float(np.sqrt(np.mean(errors**2))), ANY, errors.size),
-        Figure(f"{name}: coverage of std", found.coverage(), ANY, errors.size),
-        Figure(f"{name}: coverage of std_total", found.coverage("std_total"), (0.95, 1.0), errors.size),
-    ]
-
-
-def wrong_model(per_gap: int, seed: int) -> list[Figure]:
-    """k off by 1 %, c by 20 %, and both: what is accepted, and whether std_total covers it if nothing is refused."""
-    rng = np.random.default_rng(seed)
-    cases = [_on_floor(c, FLOOR, rng) for c in _clean(per_gap, seed)]
-    open_minded = Settings(largest_std=10.0, largest_shift=10.0)
-    figures = []
-    for words, k, c in (("k +1 %", 1.01, 1.0), ("c +20 %", 1.0, 1.2), ("k -1 %, c -20 %", 0.99, 0.8)):
-        model = Servo.preset("paper").replace(k=k * 1e4, c=c * 36.9)
-        strict, mild = answers(cases, model), answers(cases, model, open_minded)
-        errors = np.abs(mild.errors[mild.accepted])
-        share = float(np.mean(strict.accepted & (np.abs(np.nan_to_num(strict.errors, nan=0.0)) > 0.1)))
-        remark = f"errors up to {errors.max():.2f} deg, {int(strict.accepted.sum())} of {len(cases)} accepted"
-        figures += [
-            Figure(
-                f"{words}: coverage of std_total, nothing refused", mild.coverage("std_total"), (0.95, 1.0), errors.size
-            ),
-            Figure(f"{words}: accepted and off by more than 0.1 deg, share", share, (0.0, 0.0), len(cases), remark),
-        ]
-    return figures
-
-
-def skewed(per_gap: int, seed: int, samples: Sequence[int] = (-5, -2, -1, 1, 3, 5)) -> list[Figure]:
-    """Position and motor angle apart by up to 1 ms; 1 um of white noise."""
-    rng = np.random.default_rng(seed)
-    cases = []
-    for number, case in enumerate(_clean(per_gap, seed)):
-        shift, window = samples[number % len(samples)], _on_floor(case, FLOOR, rng).window
-        assert window.theta_m is not None
-        late, early = max(shift, 0), max(-shift, 0)
-        size = window.position.size - abs(shift)
-        moved = Window(window.position[early : early + size], window.theta_m[late : late + size], sample_rate=RATE)
-        cases.append(case.replaced(moved, case.servo))
-    found = answers(cases)
-    errors = np.abs(np.nan_to_num(found.errors, nan=1.0))
-    refused = int(np.sum(~found.accepted))
-    return [
-        Figure(
-            "skew up to 1 ms: largest error, deg", float(errors.max()), (0.0, 0.02), errors.size, f"{refused} refused"
-        )
-    ]
-
-
-def compliant_screw(seed: int, stiffnesses: Sequence[float] = (1e7, 3e6, 1e6, 3e5, 1e5)) -> list[Figure]:
-    """A plant with an elastic screw, a model with a rigid one: the bias if nothing were refused, and what is said."""
-    figures = []
-    rng = np.random.default_rng(seed)
-    for k_d in stiffnesses:
-        plant = Servo.preset("paper").replace(k_d=k_d)
-        rigid = plant.replace(k_d=math.inf)
-        cases = [_on_floor(c, FLOOR, rng) for c in paper_loop_cases(_gaps(), 3, seed, None, servo=plant)]
-        strict, mild = answers(cases, rigid), answers(cases, rigid, Settings(largest_std=10.0, largest_shift=10.0))
-        flagged = np.array([e.status is GapStatus.MODEL_MISMATCH for e in strict.estimates])
-        errors = mild.errors
-        large = np.abs(np.nan_to_num(errors, nan=1.0)) > 0.1
-        missed = int(np.sum(large & ~flagged))
-        remark = f"bias {np.nanmean(errors):+.3f}, up to {np.nanmax(np.abs(errors)):.3f} deg; {flagged.sum()} flagged"
-        name = f"screw of {k_d:g} N/m taken as rigid: off by more than 0.1 deg, not flagged"
-        figures.append(Figure(name, float(missed), (0.0, 0.0), len(cases), remark))
-    return figures
-
-
 def random_windows(count: int, seed: int) -> list[Figure]:
-    """Any window of any loop, 1 um of white noise on every second one: quiet, one contact, straddling, limit-cycling."""
+    """Any window of any loop, 1 um of white noise on every second one: quiet, one contact, straddling, cycling."""
     rng = np.random.default_rng(seed)
     drawn = random_cases(rng, count, math.radians(25.0), False)
-    cases = [_on_floor(case, FLOOR, rng) if number % 2 else case for number, case in enumerate(drawn)]
+    cases = [on_floor(case, FLOOR, rng) if number % 2 else case for number, case in enumerate(drawn)]
     found = answers(cases)
     errors = np.abs(np.nan_to_num(found.errors, nan=0.0))
     both = np.array([case.two_contacts for case in cases])
@@ -275,13 +151,11 @@ def random_windows(count: int, seed: int) -> list[Figure]:
 
 def speed(count: int, seed: int, clock: Clock = time.perf_counter) -> list[Figure]:
     """Milliseconds a window, median and smallest: gated and whitened; one fit from a start 2 deg off."""
-    from servotwin.identify.plain import plain_fit
-
     rng = np.random.default_rng(seed)
-    cases = [_on_floor(c, FLOOR, rng) for c in _clean(max(1, count // 8), seed)]
+    cases = [on_floor(c, FLOOR, rng) for c in clean_cases(max(1, count // 8), seed)]
     answers(cases[:2])
-    whole = _times([lambda c=c: estimate_gap(c.window, c.servo) for c in cases], clock)  # type: ignore[misc]
-    fits = _times([lambda c=c: plain_fit(c.window, c.servo, max(0.0, c.gap - 0.035)) for c in cases], clock)  # type: ignore[misc]
+    whole = _times([partial(estimate_gap, c.window, c.servo) for c in cases], clock)
+    fits = _times([partial(plain_fit, c.window, c.servo, max(0.0, c.gap - 0.035)) for c in cases], clock)
     return [
         Figure(
             "gated and whitened, ms (median)", median(whole), (0.0, 20.0), len(cases), f"fastest {min(whole):.2f} ms"
@@ -301,24 +175,6 @@ def _times(jobs: Sequence[Callable[[], object]], clock: Clock) -> list[float]:
             runs.append(1e3 * (clock() - begin))
         found.append(min(runs))
     return found
-
-
-def _gaps() -> Array:
-    return np.radians(np.linspace(4.0, 18.0, 8))
-
-
-def _clean(per_gap: int, seed: int) -> list[Case]:
-    return paper_loop_cases(_gaps(), per_gap, seed, None)
-
-
-def _on_floor(case: Case, floor: float, rng: np.random.Generator) -> Case:
-    return case.noisy(floor * rng.standard_normal(case.window.position.size))
-
-
-def _autoregressive(size: int, memory: float, rng: np.random.Generator) -> Array:
-    """(n,) m, of 1 um rms, stationary."""
-    drive = FLOOR * math.sqrt(1.0 - memory**2) * rng.standard_normal(size + 5000)
-    return np.asarray(lfilter([1.0], [1.0, -memory], drive)[5000:])
 
 
 def _bounds(cases: Sequence[Case], floor: float, noise: Noise | None) -> Array:

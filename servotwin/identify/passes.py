@@ -12,7 +12,7 @@ from servotwin.identify.misfit import Misfit, Point
 from servotwin.identify.normal import least_squares
 from servotwin.identify.projection import orthonormal, project_out
 from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.search import Fit, descend, off_the_plain, search
+from servotwin.identify.search import Fit, continued, descend, off_the_plain, search
 from servotwin.identify.whitening import Autoregression, burg
 from servotwin.plant.signals import Array
 
@@ -105,7 +105,9 @@ def refine(
 
     The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
     """
-    fit = off_the_plain(reduction.coarse(), best_of(reduction.coarse(), points, largest, tolerance), largest, tolerance)
+    white = reduction.coarse()
+    fit = continued(white, best_of(white, points, largest, tolerance), largest, tolerance)
+    fit = off_the_plain(white, fit, largest, tolerance)
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
         noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)

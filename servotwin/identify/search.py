@@ -12,6 +12,7 @@ from servotwin.identify.contacts import BY_GAP, BY_START, contacts
 from servotwin.identify.misfit import Misfit, Point, Slopes
 from servotwin.plant.signals import Array
 
+_SHORT = 20  # steps of a descent that only looks whether there is something lower
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
 
 
@@ -23,8 +24,8 @@ class Free(NamedTuple):
 
 
 BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
-_PLAIN = 1e-6  # of the information: below it gap and place are not told apart
-PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85), (0.01, 0.05, 0.2)
+_PLAIN = 1e-4  # of the information: below it gap and place are not told apart
+PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85), (0.002, 0.01, 0.03, 0.08, 0.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,7 @@ def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit
     ends = [descend(misfit, fit.point, largest, tolerance)]
     if abs(ends[0].point.place) == 1.0:
         starts = [ends[0].point._replace(place=share * ends[0].point.place) for share in _WITHIN]
-        ends += [descend(misfit, start, largest, tolerance) for start in starts]
+        ends += [descend(misfit, start, largest, tolerance, _SHORT) for start in starts]
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
     return Fit(best.point, best.slopes, evaluations, best.converged)
