@@ -87,10 +87,11 @@ def test_predictors_are_the_observer():
 
 def test_fits_find_the_gap():
     wear = Wear(duration=8.0, period=4.0, final_gap=math.radians(20.0))
-    for contestant in (fits.ours(wear), fits.scipy_fits(wear, "scipy", fits.with_loop)):
-        gaps = contestant.prepare()()
-        assert gaps.shape == (4,)
-        assert fits.typical_error(wear, gaps) < 1.0
+    contestants = fits.ours(wear), fits.scipy_fits(wear, "scipy", fits.with_loop), fits.ours(wear, "whitened")
+    found = [contestant.prepare()() for contestant in contestants]
+    paper, scipy, whitened = (fits.typical_error(wear, gaps) for gaps in found)
+    assert max(paper, scipy) < 1.0
+    assert whitened < 0.1
 
 
 def test_wrong_answers_are_counted_and_refusals_are_not():

@@ -125,11 +125,12 @@ def w3(options: Options) -> Workload:
     wear = options.wear
     return Workload(
         "W3",
-        f"the gap from {wear.turns} windows of 1 s at 5 kHz, the paper's method",
+        f"the gap from {wear.turns} windows of 1 s at 5 kHz",
         (
             fits.ours(wear),
             fits.scipy_fits(wear, "scipy BFGS, numba loop", fits.with_loop),
             fits.scipy_fits(wear, "scipy BFGS, scipy.signal", fits.with_lfilter),
+            fits.ours(wear, "whitened"),
         ),
         (
             Check("error", "deg", lambda gaps: fits.typical_error(wear, gaps)),

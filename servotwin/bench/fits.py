@@ -1,4 +1,4 @@
-"""W3: the gap from windows of 1 s, by the paper's method as we have it and as one writes it with scipy."""
+"""W3: the gap from windows of 1 s, by the paper's method as we have it and as one writes it with scipy, and by ours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from servotwin.bench.contest import Contestant, Job
-from servotwin.bench.ours import run_wear
+from servotwin.bench.ours import NAME, run_wear
 from servotwin.bench.workloads import Wear
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import compiled
@@ -46,19 +46,19 @@ def cases(workload: Wear) -> tuple[Case, ...]:
     return tuple(Case(*case) for case in zip(windows, [0.0, *truths], truths, strict=False))
 
 
-def ours(workload: Wear) -> Contestant:
-    """The package's estimator; NaN where it refuses to answer."""
+def ours(workload: Wear, method: str = "paper") -> Contestant:
+    """A method of the package; NaN where it refuses to answer."""
 
     def prepare() -> Job:
         given, servo = cases(workload), workload.servo
 
         def gap(case: Case) -> float:
-            found = estimate_gap(case.window, servo, method="paper", prior=case.prior)
+            found = estimate_gap(case.window, servo, method=method, prior=case.prior)
             return found.gap if found.ok else math.nan
 
         return lambda: np.array([gap(case) for case in given])
 
-    return Contestant("servotwin", prepare)
+    return Contestant(NAME if method == "paper" else f"{NAME}, {method}", prepare)
 
 
 def scipy_fits(workload: Wear, name: str, predictor: Callable[[Observer, Case], Predictor]) -> Contestant:
