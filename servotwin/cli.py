@@ -100,6 +100,33 @@ def simulate(
 
 
 @app.command()
+def identify(
+    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    servo: Annotated[
+        str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="One window from here on, s; not one per step.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of that window, s; to the log's end by default.")
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option(help="Length of the windows at the steps, s; the log's, or 1.")
+    ] = None,
+    pre_trigger: Annotated[float | None, typer.Option(help="How much of it lies before the step, s.")] = None,
+    method: Annotated[str, typer.Option(help="whitened or paper.")] = "whitened",
+    wear_deg: Annotated[float | None, typer.Option(help="The gap grows by about so much ...")] = None,
+    wear_over_s: Annotated[float | None, typer.Option(help="... in so long; 0.2 deg/s by default.")] = None,
+    gap_limit_deg: Annotated[float | None, typer.Option(help="Tell how long until the gap is that large.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+) -> None:
+    """The gap and its trend from a recorded log."""
+    from servotwin.identification import Request, tell
+
+    cut = (start, duration, window, pre_trigger)
+    tell(Request(log, servo, *cut, method, wear_deg, wear_over_s, gap_limit_deg), json)
+
+
+@app.command()
 def bench(
     workloads: Annotated[list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start; all by default.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,

@@ -100,6 +100,8 @@ def recording(loop: Loop, scenario_text: str) -> Recording:
         "servo": scenario.servo.dumps(),
         "seed": scenario.seed,
         "sample_rate_hz": run.sample_rate,
+        "window_s": scenario.window,
+        "pre_trigger_s": scenario.pre_trigger,
         "scenario": scenario_text,
     }
     return Recording(columns, metadata)

@@ -121,6 +121,11 @@ class Servo:
         return cls._from_table(read_toml(path))
 
     @classmethod
+    def loads(cls, text: str, source: str) -> Servo:
+        """A servo from TOML text; `source` is its name in messages."""
+        return cls._from_table(parse_toml(text, source))
+
+    @classmethod
     def resolve(cls, name_or_path: str, folder: str | os.PathLike[str] = ".") -> Servo:
         """A preset's name, or the path of a servo's TOML relative to `folder`."""
         return cls.preset(name_or_path) if name_or_path in PRESETS else cls.load(Path(folder) / name_or_path)
