@@ -13,7 +13,7 @@ from servotwin.identify.whitened_settings import Settings
 
 _SIGMAS, _NORMAL_95 = 3.0, 1.959963984540054
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
-_LIKELIER = 60.0  # gain in likelihood above which what spreads the estimate is the model, not noise
+_LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
 
 

@@ -28,7 +28,8 @@ class Settings:
     largest_skew : float
         s: a larger delay is a fault.
     gap_rate : float
-        rad/s: standard deviation of the gap's rate of growth within the window; 0: it is constant.
+        rad/s: standard deviation of the gap's rate of growth within the window, which is then estimated beside the gap
+        and counts in `std`; 0: the gap is constant. What is estimated is the gap in the middle of the window.
     offset : (float, float), optional
         rad: expected encoder offset, position / (p static gain) less screw angle, and its standard deviation, from
         earlier windows. With it one contact can be enough; None: nothing is known.
