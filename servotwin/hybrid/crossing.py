@@ -10,8 +10,16 @@ from servotwin.hybrid.flow import Scratch, dot, dot_sizes, product
 from servotwin.hybrid.polynomial import CUBIC_ERROR, first_positive, fourth_derivative_bound
 from servotwin.hybrid.tables import PIECES, TERMS, Tables
 
-# A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero.
+# A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero. Each
+# derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
+# two modes agree on the sign of the same quantity.
 SIGNIFICANT = 1e-13
+
+
+@inlined
+def rounding(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
+    """What of a guard's Taylor coefficient (in steps) may be rounding."""
+    return SIGNIFICANT * dot_sizes(t.sizes, ((mode * t.guards + guard) * TERMS + order) * t.states, x)
 
 
 @inlined
@@ -19,9 +27,8 @@ def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
     """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
     rounding."""
     product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
-    limit = SIGNIFICANT * dot_sizes(t.sizes, (mode * t.guards + guard) * t.states, x)
     for order in range(TERMS):
-        if abs(c[order]) > limit:
+        if abs(c[order]) > rounding(t, mode, guard, order, x):
             return order
     return TERMS
 
@@ -31,7 +38,7 @@ def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
     """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
     base = (mode * t.guards + guard) * t.states
     value = dot(t.rows, base, x)
-    if abs(value) > SIGNIFICANT * dot_sizes(t.sizes, base, x):
+    if abs(value) > rounding(t, mode, guard, 0, x):
         return value > 0.0
     first = series(t, mode, guard, x, c)
     return first < TERMS and c[first] > 0.0

@@ -8,6 +8,7 @@ the mode", and one product settles a whole block.
 
 from __future__ import annotations
 
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ class Tables(NamedTuple):
     flow_part: Array  # M * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside the first interval's rows of fine
     rows: Array  # M * G * n
-    sizes: Array  # M * G * n: sum over the orders of abs(taylor)
+    sizes: Array  # M * G * TERMS * n: sum over the orders of abs(taylor), those of each derivative's own series
     changes: Array  # M * G * n: the same without order 0, with a margin for rounding
     bernstein: Array  # TERMS * 16: Taylor coefficients on [0, 1] to Bernstein rows over 5 intervals
 
@@ -96,10 +97,15 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
         flow_part=flow_part,
         single=single,
         rows=rows.ravel(),
-        sizes=orders.sum(axis=3).ravel(),
+        sizes=np.einsum("kj,mgij->mgki", _binomials(), orders).ravel(),
         changes=(orders[..., 1:].sum(axis=3) + 1e-12 * orders[..., 0]).ravel(),
         bernstein=_bernstein_of_taylor().ravel(),
     )
+
+
+def _binomials() -> Array:
+    """``[k, j]`` is "j over k": the terms of the k-th derivative's own series in those of the function's."""
+    return np.array([[float(comb(j, k)) for j in range(TERMS)] for k in range(TERMS)])
 
 
 def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
