@@ -173,6 +173,7 @@ class Scenario:
             sample_rate=r.sample_rate,
             window_s=self.window,
             pre_trigger_s=self.pre_trigger,
+            fine_angle=r.fine_angle,
             retry=r.retry,
             limits=r.limits,
             parameters=Parameters(tolerance=self.start_tolerance),

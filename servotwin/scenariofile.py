@@ -43,6 +43,9 @@ class Recording:
         When a window without acknowledgement is sent again.
     limits : Limits
         What an update must respect.
+    fine_angle : bool
+        Whether theta_m travels with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the
+        estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do.
     """
 
     sample_rate: float = 5000.0
@@ -50,6 +53,7 @@ class Recording:
     pre_trigger: float | None = None
     retry: Retry = field(default_factory=Retry)
     limits: Limits = field(default_factory=Limits)
+    fine_angle: bool = True
 
 
 def read(table: Table, folder: Path) -> dict[str, Any]:
@@ -208,6 +212,7 @@ def _recording(table: Table) -> Recording:
         sample_rate=table.number("sample_rate_hz", default.sample_rate, positive=True),
         window=table.number("window_s", None, positive=True),
         pre_trigger=table.number("pre_trigger_s", None, minimum=0.0),
+        fine_angle=table.boolean("fine_angle", default.fine_angle),
         retry=_retry(table, default.retry),
         limits=_read(table, "limits", _limits),
     )

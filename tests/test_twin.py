@@ -231,6 +231,16 @@ def test_settings_out_of_range(name, value):
         TwinSettings(**{name: value})
 
 
+def test_a_fine_channel_joins_its_own():
+    """With it an angle has 32 bits."""
+    samples = 700.0 * np.random.default_rng(5).normal(size=1000)
+    position = pack_channel("position", "m", samples)
+    whole = decode_window(window_message(channels=(position, *messages.pack_finely("theta_m", "rad", samples))))
+    half = decode_window(window_message(channels=(position, pack_channel("theta_m", "rad", samples))))
+    assert np.max(np.abs(half.theta_m - samples)) > 1e-3
+    assert np.max(np.abs(whole.theta_m - samples)) < 1e-6
+
+
 def test_decoding_equals_the_edges_own():
     channel = pack_channel("position", "m", np.random.default_rng(5).normal(size=1000))
     assert decode_channel(channel).tolist() == list(messages.unpack_channel(channel))

@@ -86,9 +86,13 @@ def test_a_prior_must_not_be_counted_twice():
 
 @cache
 def loop_of(name: str, **changes: object) -> Loop:
-    scenario = Scenario.preset(name)
-    ours = {"method": "whitened", "estimator": None, **changes}
-    return cosimulate(scenario.replace(twin=scenario.twin.replace(**ours)))
+    return cosimulate(ours(Scenario.preset(name), **changes))
+
+
+def ours(scenario: Scenario, fine_angle: bool = True, **changes: object) -> Scenario:
+    """A packaged scenario with the default estimator."""
+    twin = scenario.twin.replace(method="whitened", estimator=None, **changes)
+    return scenario.replace(twin=twin, recording=replace(scenario.recording, fine_angle=fine_angle))
 
 
 def errors_deg(loop: Loop) -> np.ndarray:
@@ -98,7 +102,7 @@ def errors_deg(loop: Loop) -> np.ndarray:
     return np.degrees([e.gap for e in loop.estimates if e.ok] - truth)
 
 
-@pytest.mark.parametrize(("name", "largest"), [("fig15", 0.03), ("fig15-sampled", 0.03), ("calm", 0.005)])
+@pytest.mark.parametrize(("name", "largest"), [("fig15", 0.003), ("fig15-sampled", 0.003), ("calm", 0.003)])
 def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
     loop = loop_of(name)
     assert [e.status for e in loop.estimates] == [GapStatus.OK] * 10
@@ -110,11 +114,9 @@ def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
 
 @pytest.mark.parametrize("seed", [2023, 2024, 2025])
 def test_in_the_papers_noise_what_is_accepted_is_right(seed):
-    scenario = Scenario.preset("fig16")
-    ours = scenario.twin.replace(method="whitened", estimator=None)
-    loop = cosimulate(scenario.replace(seed=seed, twin=ours))
-    assert sum(e.ok for e in loop.estimates) >= 8
-    assert np.max(np.abs(errors_deg(loop))) < 0.05
+    loop = cosimulate(ours(Scenario.preset("fig16")).replace(seed=seed))
+    assert sum(e.ok for e in loop.estimates) >= 9
+    assert np.max(np.abs(errors_deg(loop))) < 0.01
     assert {update.data_time for update in loop.updates} <= {e.time - 0.4999 for e in loop.estimates if e.ok}
 
 
@@ -175,6 +177,11 @@ def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
     assert np.max(np.abs(errors_deg(loop))) < 0.05
 
 
-def test_quantisation_to_int16_costs_our_estimator_hundredths_of_a_degree():
-    found = quantisation(loop_of("fig15"))
-    assert max(abs(q.gap_change) for q in found) < math.radians(0.03)
+def test_sixteen_bits_for_the_angle_cost_hundredths_of_a_degree():
+    """Decision 8: what the angle's rounding does, and that of the position does not."""
+    fine, coarse = (loop_of("fig15", fine_angle=fine) for fine in (True, False))
+    found = [max(abs(q.gap_change) for q in quantisation(loop)) for loop in (fine, coarse)]
+    assert found[0] < math.radians(0.003) < math.radians(0.005) < found[1]
+    assert 0.005 < np.max(np.abs(errors_deg(coarse))) < 0.05
+    names = [channel.name for channel in fine.windows[0].channels]
+    assert names == ["reference", "theta_m", "theta_m_fine", "position", "voltage"]

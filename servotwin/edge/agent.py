@@ -6,7 +6,7 @@ guard decide about updates. It does not control: whoever ticks the law asks `par
 
 from array import array
 from collections import Counter
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Sender
 from servotwin.messages import (
     Acknowledge,
+    Channel,
     Hello,
     InvalidMessage,
     Message,
@@ -25,6 +26,7 @@ from servotwin.messages import (
     Window,
     checksum,
     pack_channel,
+    pack_finely,
 )
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
@@ -162,7 +164,7 @@ class Agent:
 
     def _window(self, first: int, sequence: int, reason: str) -> Window:
         signals = self._recorder.cut(first, first + self.settings.window_samples)
-        channels = tuple(pack_channel(name, CHANNELS[name], values) for name, values in signals.items())
+        channels = tuple(chain.from_iterable(self._packed(name, values) for name, values in signals.items()))
         return Window(
             servo=self.settings.servo,
             boot=self.settings.boot,
@@ -176,6 +178,11 @@ class Agent:
             reason=reason,
             crc=checksum(channels),
         )
+
+    def _packed(self, name: str, values: "array[float]") -> tuple[Channel, ...]:
+        if self.settings.fine_angle and name == "theta_m":
+            return pack_finely(name, CHANNELS[name], values)
+        return (pack_channel(name, CHANNELS[name], values),)
 
     def _changes(self, first: int, reference: "array[float]") -> tuple[tuple[float, float], ...]:
         """(time, new value) of the first changes inside a window."""

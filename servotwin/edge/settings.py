@@ -28,6 +28,8 @@ class AgentSettings:
         What updates must respect.
     parameters : Parameters
         In force at the start.
+    fine_angle : bool
+        Whether theta_m is sent with 32 bits instead of 16 (as a second channel).
     reference : float
         Before the first sample, m; the first sample is a change when it differs.
     model_version : str
@@ -42,6 +44,7 @@ class AgentSettings:
     retry: Retry = field(default_factory=Retry)
     limits: Limits = field(default_factory=Limits)
     parameters: Parameters = field(default_factory=Parameters)
+    fine_angle: bool = False
     reference: float = 0.0
     model_version: str = ""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import servotwin as st
 from servotwin import messages
@@ -84,7 +84,7 @@ class LoopJob:
     """A packaged scenario with another servo, reference, seed, dead-zone gain or estimator.
 
     The scenarios are the paper's, and so is their estimator, with its settings; `OURS` is the default one with its
-    defaults; `exact` sends the true gap instead.
+    defaults, and theta_m sent with 32 bits instead of 16; `exact` sends the true gap instead.
     """
 
     preset: str
@@ -99,11 +99,13 @@ class LoopJob:
         """The scenario."""
         packaged = st.Scenario.preset(self.scenario)
         servo = st.Servo.preset(self.preset)
-        settings = packaged.twin.estimator if self.method == packaged.twin.method else None
+        published = self.method == packaged.twin.method
+        settings = packaged.twin.estimator if published else None
         return packaged.replace(
             servo=servo,
             controller=_with_gains(packaged.law, servo.controller),
             reference=self.square.signal,
+            recording=replace(packaged.recording, fine_angle=not published),
             seed=self.seed,
             twin=packaged.twin.replace(k_dz=self.k_dz, method=self.method, estimator=settings),
         )

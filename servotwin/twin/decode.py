@@ -19,13 +19,18 @@ def decode_window(message: messages.Window) -> Window:
         The position is missing, a channel has another unit than the estimators expect, or is too short.
     """
     source = "window {}/{}/{}".format(*message.identity)
-    known = {channel.name: channel for channel in message.channels if channel.name in CHANNELS}
+    channels = {channel.name: channel for channel in message.channels}
+    known = {name: channel for name, channel in channels.items() if name.removesuffix(messages.FINE) in CHANNELS}
     for name, channel in known.items():
-        if channel.unit != CHANNELS[name]:
-            raise InvalidInput(f"{source}: channel {name} is in {channel.unit!r}; it must be in {CHANNELS[name]!r}")
+        unit = CHANNELS[name.removesuffix(messages.FINE)]
+        if channel.unit != unit:
+            raise InvalidInput(f"{source}: channel {name} is in {channel.unit!r}; it must be in {unit!r}")
     if "position" not in known:
         raise InvalidInput(f"{source}: channel 'position' is missing; it has {', '.join(sorted(known)) or 'none'}")
-    values = {name: decode_channel(channel) for name, channel in known.items()}
+    values = {name: decode_channel(channel) for name, channel in known.items() if name in CHANNELS}
+    for name in values:
+        if name + messages.FINE in known:
+            values[name] += decode_channel(known[name + messages.FINE])
     return Window(**values, sample_rate=message.rate, start=message.start, source=source)
 
 
