@@ -48,8 +48,9 @@ PLATE = Plate(
     "Position while the gap wears and the twin's estimates set the dead zone 3 s after each step: (a) with the paper's"
     " continuous controller, (b) with the sampled one; (c) the gap, the twin's estimates (at the middle of their"
     " windows) and the gap that the dead zone in force is made for, from run (a). Then run (a) again with our"
-    " estimator: (d) position, (e) gap and estimates. (f) How far the estimates of both are off, and half the width of"
-    f" the 95 % intervals that they state; errors below {worn.FAINTEST:g} deg are drawn there.",
+    " estimator, for which the motor's angle is sent with 32 bits instead of 16: (d) position, (e) gap and estimates."
+    " (f) How far the estimates of both are off, and half the width of the 95 % intervals that they state; errors below"
+    f" {worn.FAINTEST:g} deg are drawn there.",
     data,
     plot,
 )
