@@ -26,7 +26,7 @@ _HOMES = {
     "Window": "servotwin.identify.window",
     "cosimulate": "servotwin.cosim",
     "estimate_gap": "servotwin.identify.gap",
-    "estimate_jointly": "servotwin.identify.jointly",
+    "estimate_jointly": "servotwin.identify.joint.estimator",
     "simulate": "servotwin.simulation",
 }
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from servotwin.errors import InvalidInput
     from servotwin.identify.estimate import GapEstimate, GapStatus
     from servotwin.identify.gap import estimate_gap
-    from servotwin.identify.jointly import estimate_jointly
+    from servotwin.identify.joint.estimator import estimate_jointly
     from servotwin.identify.trend import Trend
     from servotwin.identify.window import Window
     from servotwin.plant.noise import Noise

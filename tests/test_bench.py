@@ -17,7 +17,7 @@ from servotwin.bench.measure import race, turns
 from servotwin.bench.workloads import UNIT, Noisy, Sweep, Wear
 from servotwin.cli import app
 from servotwin.errors import InvalidInput
-from servotwin.identify.observer import observer
+from servotwin.identify.paper.observer import observer
 
 WEAR = Wear(duration=4.0, period=2.0)
 SWEEP = Sweep(side=3, duration=1.0)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize, rosen, rosen_der
 
-from servotwin.identify.bfgs import minimise
+from servotwin.identify.paper.bfgs import minimise
 
 
 def quadratic(hessian, centre):

@@ -50,8 +50,8 @@ def test_the_misfits_valley_is_a_point_a_line_or_a_plain(drawn):
 
 def test_the_sensitivity_is_the_derivative(drawn):
     """Against a difference of the positions that two gaps give."""
-    from servotwin.identify.contacts import SCREW, Gap, contacts
-    from servotwin.identify.response import response
+    from servotwin.identify.core.contacts import SCREW, Gap, contacts
+    from servotwin.identify.core.response import response
     from servotwin.plant.servo import Servo
 
     panel, model = drawn.panels[0], response(Servo.preset("paper"), estimator.RATE)

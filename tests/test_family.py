@@ -5,8 +5,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.signal import lsim
 
-from servotwin.identify.family import MOTOR, STRUCTURE, Family, Hold, motor_family, structure_family
-from servotwin.identify.response import response
+from servotwin.identify.core.family import MOTOR, STRUCTURE, Family, Hold, motor_family, structure_family
+from servotwin.identify.core.response import response
 from servotwin.plant.servo import Servo
 
 RATE = 5000.0

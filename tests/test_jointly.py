@@ -8,7 +8,7 @@ import pytest
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, GapStatus
-from servotwin.identify.jointly import JointSettings, estimate_jointly
+from servotwin.identify.joint.estimator import JointSettings, estimate_jointly
 from servotwin.identify.trend import Trend
 from servotwin.identify.window import Window
 from servotwin.plant.noise import Noise

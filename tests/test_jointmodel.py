@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from measured_windows import measured
 
-from servotwin.identify.family import Hold
-from servotwin.identify.jointmodel import JointModel, cubic, cubic_slopes, margin_for
+from servotwin.identify.core.family import Hold
+from servotwin.identify.joint.model import JointModel, cubic, cubic_slopes, margin_for
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 

@@ -8,10 +8,10 @@ import pytest
 from scipy.linalg import null_space, subspace_angles
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.contacts import Gap
-from servotwin.identify.family import MOTOR, motor_family
-from servotwin.identify.identifiability import identifiability
-from servotwin.identify.motor_information import PRODUCTS, Case, SensorNoise, last_contacts, motor_cases, table
+from servotwin.identify.core.contacts import Gap
+from servotwin.identify.core.family import MOTOR, motor_family
+from servotwin.identify.joint.identifiability import identifiability
+from servotwin.identify.joint.motor_information import PRODUCTS, Case, SensorNoise, last_contacts, motor_cases, table
 from servotwin.identify.window import Window
 from servotwin.plant.backlash import play
 from servotwin.plant.motor import motor_transfer

@@ -8,7 +8,7 @@ from measured_windows import RATE, measured, swinging
 from scipy.signal import lsim
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.observer import Observer, observer
+from servotwin.identify.paper.observer import Observer, observer
 from servotwin.plant.backlash import play
 from servotwin.plant.servo import Servo
 

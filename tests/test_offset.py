@@ -11,7 +11,7 @@ from servotwin.identify.estimate import GapStatus
 from servotwin.identify.gap import estimate_gap
 from servotwin.identify.offset import read_offset
 from servotwin.identify.trend import Trend, TrendSettings
-from servotwin.identify.whitened import Settings
+from servotwin.identify.whitened.estimator import Settings
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave

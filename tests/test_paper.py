@@ -12,7 +12,7 @@ from measured_windows import RATE, measured
 from servotwin.errors import InvalidInput
 from servotwin.identify import gap as entry
 from servotwin.identify.estimate import GapEstimate, GapStatus
-from servotwin.identify.paper import Settings
+from servotwin.identify.paper.estimator import Settings
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servotwin.identify import gap as entry
-from servotwin.identify.paper import Settings
+from servotwin.identify.paper.estimator import Settings
 from servotwin.identify.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo

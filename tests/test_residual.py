@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from measured_windows import RATE, measured, swinging
 
-from servotwin.identify.observer import observer
-from servotwin.identify.residual import PlayResidual, screw_motion
+from servotwin.identify.paper.observer import observer
+from servotwin.identify.paper.residual import PlayResidual, screw_motion
 from servotwin.plant.backlash import play
 from servotwin.plant.servo import Servo
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from measured_windows import RATE, position_of
 from scipy.linalg import expm
 
-from servotwin.identify.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, travel
-from servotwin.identify.projection import orthonormal, project_out
-from servotwin.identify.response import response
+from servotwin.identify.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, travel
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.response import response
 from servotwin.plant.backlash import play
 from servotwin.plant.servo import Servo
 from servotwin.simulation import simulate

@@ -13,8 +13,8 @@ from servotwin.bench.estimator_windows import RATE, Case, paper_loop_cases, rand
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.gap import estimate_gap
-from servotwin.identify.plain import plain_fit
-from servotwin.identify.whitened import Settings
+from servotwin.identify.whitened.estimator import Settings
+from servotwin.identify.whitened.plain import plain_fit
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 

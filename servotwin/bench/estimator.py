@@ -26,8 +26,8 @@ from servotwin.bench.estimator_figures import (
 from servotwin.bench.estimator_windows import RATE, Case, paper_loop_cases, random_cases
 from servotwin.identify.estimate import GapStatus
 from servotwin.identify.gap import estimate_gap
-from servotwin.identify.paper import Settings as PaperSettings
-from servotwin.identify.plain import plain_fit
+from servotwin.identify.paper.estimator import Settings as PaperSettings
+from servotwin.identify.whitened.plain import plain_fit
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Array
 

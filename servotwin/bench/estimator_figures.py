@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from servotwin.bench.estimator_windows import Case, paper_loop_cases
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.gap import estimate_gap
-from servotwin.identify.whitened import Settings
+from servotwin.identify.whitened.estimator import Settings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.response import response
+from servotwin.identify.core.response import response
 from servotwin.identify.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo

@@ -16,7 +16,7 @@ from servotwin.bench.workloads import Wear
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import compiled
 from servotwin.identify.gap import estimate_gap
-from servotwin.identify.observer import Observer, observer
+from servotwin.identify.paper.observer import Observer, observer
 from servotwin.identify.window import Window
 from servotwin.plant.backlash import play_samples
 

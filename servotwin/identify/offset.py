@@ -12,10 +12,10 @@ import math
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.core.response import response
 from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.normal import least_squares
-from servotwin.identify.response import response
 from servotwin.identify.trend import OffsetReading
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo

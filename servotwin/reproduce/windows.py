@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import servotwin as st
-from servotwin.identify.paper import Settings
+from servotwin.identify.paper.estimator import Settings
 from servotwin.reproduce.runs import BIPOLAR, PERIOD, RATE
 
 GAPS_DEG = (3.0, 10.0, 18.0)

@@ -11,7 +11,7 @@ from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
 from servotwin.identify.gap import estimate_gap, settings_of
 from servotwin.identify.trend import Trend
-from servotwin.identify.whitened import Settings
+from servotwin.identify.whitened.estimator import Settings
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
 from servotwin.messages import Window as WindowMessage

@@ -6,7 +6,7 @@ from math import comb
 
 import numpy as np
 
-from servotwin.identify.observer import Observer, observer
+from servotwin.identify.paper.observer import Observer, observer
 from servotwin.reproduce import measures as measure
 from servotwin.reproduce.claims.claim import Finding, decided, measures
 from servotwin.reproduce.figures.figA1 import ALPHAS, INITIAL

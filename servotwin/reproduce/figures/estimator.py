@@ -11,13 +11,13 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from servotwin.identify.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.response import Response, response
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.gap import estimate_gap
-from servotwin.identify.misfit import Point
-from servotwin.identify.projection import orthonormal, project_out
-from servotwin.identify.reduction import Reduction
-from servotwin.identify.response import Response, response
+from servotwin.identify.whitened.misfit import Point
+from servotwin.identify.whitened.reduction import Reduction
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import signal
 
-from servotwin.identify.observer import observer
+from servotwin.identify.paper.observer import observer
 from servotwin.plant.backlash import play
 from servotwin.reproduce.figures import style
 from servotwin.reproduce.figures.plate import Plate

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.identify.misfit import Misfit, Point
-from servotwin.identify.normal import least_squares
-from servotwin.identify.projection import orthonormal, project_out
-from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.search import Fit, continued, descend, off_the_plain, search
-from servotwin.identify.whitening import Autoregression, burg
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.whitening import Autoregression, burg
+from servotwin.identify.whitened.misfit import Misfit, Point
+from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
+from servotwin.identify.whitened.search import Fit, continued, descend, off_the_plain, search
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servotwin.identify.bfgs import Minimum
 from servotwin.identify.estimate import NOTHING_KNOWN, GapStatus, Interval
-from servotwin.identify.residual import PlayResidual
-from servotwin.identify.settings import Settings
+from servotwin.identify.paper.bfgs import Minimum
+from servotwin.identify.paper.residual import PlayResidual
+from servotwin.identify.paper.settings import Settings
 
 _NORMAL_95 = 1.959963984540054
 

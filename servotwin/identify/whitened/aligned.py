@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.identify.decimation import decimation
-from servotwin.identify.misfit import Point
-from servotwin.identify.normal import least_squares
-from servotwin.identify.passes import Found, candidates, refine
-from servotwin.identify.reduction import CONSTANT, RESIDUAL, Prior, Reduction, factor_for
-from servotwin.identify.response import response
-from servotwin.identify.whitened_settings import Settings
+from servotwin.identify.core.decimation import decimation
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.core.response import response
+from servotwin.identify.whitened.misfit import Point
+from servotwin.identify.whitened.passes import Found, candidates, refine
+from servotwin.identify.whitened.reduction import CONSTANT, RESIDUAL, Prior, Reduction, factor_for
+from servotwin.identify.whitened.settings import Settings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.identify.contacts import BY_GAP, BY_START, contacts
-from servotwin.identify.misfit import Misfit, Point, Slopes
+from servotwin.identify.core.contacts import BY_GAP, BY_START, contacts
+from servotwin.identify.whitened.misfit import Misfit, Point, Slopes
 from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servotwin.identify.contacts import travel
+from servotwin.identify.core.contacts import travel
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
-from servotwin.identify.jointmodel import JointModel
-from servotwin.identify.jointsearch import Stand
-from servotwin.identify.jointsettings import SPREADS, JointSettings
+from servotwin.identify.joint.model import JointModel
+from servotwin.identify.joint.search import Stand
+from servotwin.identify.joint.settings import SPREADS, JointSettings
 from servotwin.identify.trend import NORMAL_95
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -12,12 +12,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from servotwin.identify.contacts import BY_RATE, contacts
-from servotwin.identify.decimation import Decimation, decimation
-from servotwin.identify.misfit import Misfit, Point, mix_places
-from servotwin.identify.projection import orthonormal
-from servotwin.identify.response import Response
-from servotwin.identify.whitening import Autoregression
+from servotwin.identify.core.contacts import BY_RATE, contacts
+from servotwin.identify.core.decimation import Decimation, decimation
+from servotwin.identify.core.projection import orthonormal
+from servotwin.identify.core.response import Response
+from servotwin.identify.core.whitening import Autoregression
+from servotwin.identify.whitened.misfit import Misfit, Point, mix_places
 from servotwin.plant.signals import Array
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next

@@ -14,10 +14,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from servotwin.identify.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
-from servotwin.identify.family import STRUCTURE, Hold, Sampled, motor_family, structure_family
-from servotwin.identify.motor_information import through_gap
-from servotwin.identify.projection import orthonormal, project_out
+from servotwin.identify.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.family import STRUCTURE, Hold, Sampled, motor_family, structure_family
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.joint.motor_information import through_gap
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.hybrid.compiled import bare
-from servotwin.identify.contacts import Gap, follow, follow_screw
-from servotwin.identify.decimation import Decimation
-from servotwin.identify.projection import remove
-from servotwin.identify.response import Response
-from servotwin.identify.whitening import Autoregression
+from servotwin.identify.core.contacts import Gap, follow, follow_screw
+from servotwin.identify.core.decimation import Decimation
+from servotwin.identify.core.projection import remove
+from servotwin.identify.core.response import Response
+from servotwin.identify.core.whitening import Autoregression
 from servotwin.plant.signals import Array
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.zerophase import PADDINGS
+from servotwin.identify.paper.zerophase import PADDINGS
 
 ORIGINS = ("absolute", "first")
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.lags import LagFilter
+from servotwin.identify.paper.lags import LagFilter
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import transfer

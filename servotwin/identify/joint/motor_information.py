@@ -15,9 +15,9 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
-from servotwin.identify.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
-from servotwin.identify.family import MOTOR, Hold, Sampled, motor_family, structure_family
-from servotwin.identify.identifiability import Identifiability, identifiability
+from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.family import MOTOR, Hold, Sampled, motor_family, structure_family
+from servotwin.identify.joint.identifiability import Identifiability, identifiability
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.family import Hold
+from servotwin.identify.core.family import Hold
 
 SPREADS: Mapping[str, float] = MappingProxyType(
     {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_B": 0.1, "gap rate": math.radians(0.5)}

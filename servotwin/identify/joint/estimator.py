@@ -12,18 +12,18 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.channels import faults, motor_angle
-from servotwin.identify.decimation import Decimation, decimation
+from servotwin.identify.core.decimation import Decimation, decimation
+from servotwin.identify.core.family import Hold
+from servotwin.identify.core.whitening import Autoregression
 from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.family import Hold
-from servotwin.identify.jointmodel import JUMP, MOTOR_START, JointModel, jumps, margin_for
-from servotwin.identify.jointnoise import noise_left
-from servotwin.identify.jointsearch import Known, Stand, descend, scan, stand
-from servotwin.identify.jointsettings import SPREADS, JointSettings
-from servotwin.identify.jointverdict import JointEstimate, Parameter, stated
+from servotwin.identify.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
+from servotwin.identify.joint.noise import noise_left
+from servotwin.identify.joint.search import Known, Stand, descend, scan, stand
+from servotwin.identify.joint.settings import SPREADS, JointSettings
+from servotwin.identify.joint.verdict import JointEstimate, Parameter, stated
 from servotwin.identify.trend import Prior
-from servotwin.identify.whitened_settings import Settings as Whitened
-from servotwin.identify.whitening import Autoregression
+from servotwin.identify.whitened.channels import faults, motor_angle
+from servotwin.identify.whitened.settings import Settings as Whitened
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

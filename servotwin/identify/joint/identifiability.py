@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.projection import orthonormal, project_out
+from servotwin.identify.core.projection import orthonormal, project_out
 from servotwin.plant.signals import Array
 
 _SINGULAR = 1e-9  # of the longest sensitivity: less is rounding

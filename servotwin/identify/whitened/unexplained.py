@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from servotwin.identify.normal import least_squares
-from servotwin.identify.passes import Found
-from servotwin.identify.reduction import CONSTANT, RESIDUAL
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.whitened.passes import Found
+from servotwin.identify.whitened.reduction import CONSTANT, RESIDUAL
 from servotwin.plant.signals import Array
 
 _SLOW_S = 0.06  # s: motions faster than this are averaged away, twice

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from servotwin.hybrid.compiled import compiled
-from servotwin.identify.lags import LagFilter
-from servotwin.identify.observer import Observer
+from servotwin.identify.paper.lags import LagFilter
+from servotwin.identify.paper.observer import Observer
 from servotwin.plant.backlash import play_step
 from servotwin.plant.signals import Array
 

@@ -12,16 +12,16 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.bfgs import Minimum, minimise
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
-from servotwin.identify.information import standard_deviation
-from servotwin.identify.motion import motion
-from servotwin.identify.observer import observer
-from servotwin.identify.residual import PlayResidual
-from servotwin.identify.settings import Settings
-from servotwin.identify.verdict import judge
+from servotwin.identify.paper.bfgs import Minimum, minimise
+from servotwin.identify.paper.information import standard_deviation
+from servotwin.identify.paper.motion import motion
+from servotwin.identify.paper.observer import observer
+from servotwin.identify.paper.residual import PlayResidual
+from servotwin.identify.paper.settings import Settings
+from servotwin.identify.paper.verdict import judge
+from servotwin.identify.paper.zerophase import ZeroPhase
 from servotwin.identify.window import MINIMUM_SAMPLES, Window
-from servotwin.identify.zerophase import ZeroPhase
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from servotwin.identify.aligned import gaps_to_try
-from servotwin.identify.decimation import decimation
-from servotwin.identify.normal import least_squares
-from servotwin.identify.reduction import CONSTANT, RESIDUAL, Reduction, factor_for
-from servotwin.identify.response import response
-from servotwin.identify.search import search
-from servotwin.identify.unexplained import slow
+from servotwin.identify.core.decimation import decimation
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.core.response import response
+from servotwin.identify.whitened.aligned import gaps_to_try
+from servotwin.identify.whitened.reduction import CONSTANT, RESIDUAL, Reduction, factor_for
+from servotwin.identify.whitened.search import search
+from servotwin.identify.whitened.unexplained import slow
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from servotwin.identify.misfit import Point
-from servotwin.identify.reduction import Reduction
-from servotwin.identify.response import response
-from servotwin.identify.search import Fit, descend
+from servotwin.identify.core.response import response
+from servotwin.identify.whitened.misfit import Point
+from servotwin.identify.whitened.reduction import Reduction
+from servotwin.identify.whitened.search import Fit, descend
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 

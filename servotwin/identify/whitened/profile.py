@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 
 from servotwin.identify.estimate import Interval
-from servotwin.identify.misfit import Point
-from servotwin.identify.passes import Found
-from servotwin.identify.search import PLACE_ONLY, PLACES, descend
+from servotwin.identify.whitened.misfit import Point
+from servotwin.identify.whitened.passes import Found
+from servotwin.identify.whitened.search import PLACE_ONLY, PLACES, descend
 
 _CHI_SQUARED_95 = 3.841458820694124
 _CLOSE, _TRIALS = 0.1, 12

@@ -12,18 +12,18 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.aligned import Aligned, align_and_fit
-from servotwin.identify.channels import faults, motor_angle
-from servotwin.identify.contacts import travel
-from servotwin.identify.diagnosis import likely_fault
+from servotwin.identify.core.contacts import travel
 from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus, Interval
-from servotwin.identify.gate import Evidence, judge
-from servotwin.identify.lostmotion import static_lost_motion
-from servotwin.identify.modelcheck import Shift, model_shift, observer_shift
-from servotwin.identify.passes import Found
-from servotwin.identify.profile import profile_interval
-from servotwin.identify.unexplained import noise_left, slow_share
-from servotwin.identify.whitened_settings import Settings
+from servotwin.identify.whitened.aligned import Aligned, align_and_fit
+from servotwin.identify.whitened.channels import faults, motor_angle
+from servotwin.identify.whitened.diagnosis import likely_fault
+from servotwin.identify.whitened.gate import Evidence, judge
+from servotwin.identify.whitened.lostmotion import static_lost_motion
+from servotwin.identify.whitened.modelcheck import Shift, model_shift, observer_shift
+from servotwin.identify.whitened.passes import Found
+from servotwin.identify.whitened.profile import profile_interval
+from servotwin.identify.whitened.settings import Settings
+from servotwin.identify.whitened.unexplained import noise_left, slow_share
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.whitened_settings import Settings
+from servotwin.identify.paper.zerophase import ZeroPhase
+from servotwin.identify.whitened.settings import Settings
 from servotwin.identify.window import Window
-from servotwin.identify.zerophase import ZeroPhase
 from servotwin.plant.signals import Array
 
 _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there

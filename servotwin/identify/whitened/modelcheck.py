@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.identify.contacts import contacts
-from servotwin.identify.lags import LagFilter
-from servotwin.identify.normal import LeastSquares, least_squares
-from servotwin.identify.observer import observer
-from servotwin.identify.passes import Found, spread
-from servotwin.identify.projection import orthonormal, project_out
-from servotwin.identify.reduction import CONSTANT, GAP, PLACE, RESIDUAL
-from servotwin.identify.response import Response, response
-from servotwin.identify.whitening import burg
+from servotwin.identify.core.contacts import contacts
+from servotwin.identify.core.normal import LeastSquares, least_squares
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.response import Response, response
+from servotwin.identify.core.whitening import burg
+from servotwin.identify.paper.lags import LagFilter
+from servotwin.identify.paper.observer import observer
+from servotwin.identify.whitened.passes import Found, spread
+from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 

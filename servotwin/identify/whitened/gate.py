@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from servotwin.identify.aligned import Aligned
-from servotwin.identify.contacts import Travel
+from servotwin.identify.core.contacts import Travel
 from servotwin.identify.estimate import GapStatus, Interval
-from servotwin.identify.modelcheck import Shift
-from servotwin.identify.whitened_settings import Settings
+from servotwin.identify.whitened.aligned import Aligned
+from servotwin.identify.whitened.modelcheck import Shift
+from servotwin.identify.whitened.settings import Settings
 
 _SIGMAS, _NORMAL_95 = 3.0, 1.959963984540054
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing

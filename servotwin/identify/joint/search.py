@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servotwin.identify.jointmodel import JointModel, Reduce
-from servotwin.identify.projection import orthonormal, project_out
+from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.joint.model import JointModel, Reduce
 from servotwin.plant.signals import Array
 
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from servotwin.identify.decimation import Decimation
-from servotwin.identify.jointmodel import JUMP, MOTOR_START, JointModel
-from servotwin.identify.jointsearch import Stand
-from servotwin.identify.normal import least_squares
-from servotwin.identify.whitening import Autoregression, burg
+from servotwin.identify.core.decimation import Decimation
+from servotwin.identify.core.normal import least_squares
+from servotwin.identify.core.whitening import Autoregression, burg
+from servotwin.identify.joint.model import JUMP, MOTOR_START, JointModel
+from servotwin.identify.joint.search import Stand
 from servotwin.plant.signals import Array
 
 

@@ -1,0 +1,1 @@
+"""The gap together with the model's own numbers, and what of the motor can be known at all."""
