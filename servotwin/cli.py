@@ -128,7 +128,9 @@ def identify(
 
 @app.command()
 def bench(
-    workloads: Annotated[list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start; all by default.")] = None,
+    workloads: Annotated[
+        list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start (all by default); or estimator.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small workloads, to see that all works.")] = False,
@@ -138,10 +140,15 @@ def bench(
     """Speed and accuracy beside what one would use instead, side by side."""
     from datetime import UTC, datetime
 
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    if workloads == ["estimator"]:
+        from servotwin.bench.accuracy import accuracy
+
+        accuracy(date, json, 0.02 if quick else 1.0)
+        return
     from servotwin.bench.catalogue import Options
     from servotwin.bench.command import bench as run
 
-    date = datetime.now(UTC).isoformat(timespec="seconds")
     run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
 
 
