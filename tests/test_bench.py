@@ -324,6 +324,11 @@ def test_the_machine_is_described_without_its_name(tmp_path):
     assert machine._cpu(tmp_path / "none")
 
 
+@pytest.mark.parametrize(("ratio", "text"), [(0.3712, "0.371"), (42.86, "42.9"), (2310.4, "2,310")])
+def test_ratios_are_plain_numbers(ratio, text):
+    assert command.figure(ratio) == text
+
+
 @pytest.mark.parametrize(("seconds", "text"), [(0.00123456, "1.23 ms"), (2.5, "2.5 s"), (0.25, "250 ms")])
 def test_durations_carry_their_unit(seconds, text):
     assert command.duration(seconds) == text

@@ -99,7 +99,12 @@ def _numbers(result: Result, row: Row, checks: Sequence[Check]) -> list[str]:
     if row.missing:
         return ["-"] * (2 + len(checks))
     errors = [f"{row.errors[check.name]:.2g}" for check in checks]
-    return [duration(row.median), f"{result.ratio(row):.3g}", *errors]
+    return [duration(row.median), figure(result.ratio(row)), *errors]
+
+
+def figure(ratio: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{ratio:,.0f}" if ratio >= 100.0 else f"{ratio:.3g}"
 
 
 def duration(seconds: float) -> str:
