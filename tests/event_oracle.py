@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
+from scipy.linalg import expm, matrix_balance
 from scipy.optimize import brentq
 
 Array = NDArray[np.float64]
@@ -20,12 +20,13 @@ NODES = 64
 
 @dataclass
 class OracleGuard:
-    """Leave to `target` when ``row @ x > 0``, with ``x = reset @ x``."""
+    """Leave to `target` when ``row @ x > 0``, with ``x = reset @ x``; at a node, values up to `floor` are rounding."""
 
     row: Array
     target: int
     label: str
     reset: Array | None = None
+    floor: float = 0.0
 
 
 @dataclass
@@ -35,11 +36,16 @@ class OracleMode:
     stack: Array = field(init=False)
 
     def prepare(self, step: float) -> None:
-        self.stack = np.array([expm(self.flow * step * k) for k in range(NODES + 1)])
+        self.balanced, (self.scale, _) = matrix_balance(self.flow, permute=False, separate=True)
+        self.stack = np.array([self.exponential(step * k) for k in range(NODES + 1)])
+        self.floors = np.array([guard.floor for guard in self.guards])
         self.rows = np.array([guard.row for guard in self.guards]).reshape(-1, len(self.flow))
 
+    def exponential(self, time: float) -> Array:
+        return np.asarray(self.scale[:, None] * expm(self.balanced * time) / self.scale)
+
     def after(self, x: Array, time: float) -> Array:
-        return np.asarray(expm(self.flow * time) @ x)
+        return self.exponential(time) @ x
 
 
 @dataclass
@@ -89,8 +95,8 @@ def follow(modes: Sequence[OracleMode], x: Array, mode: int, end: float, step: f
 def _first_event(mode: OracleMode, x: Array, step: float) -> tuple[float, int | None]:
     states = mode.stack @ x
     values, slopes = states @ mode.rows.T, states @ (mode.rows @ mode.flow).T
-    above = values[1:] > 0.0
-    turning = (slopes[:-1] > 0.0) & (slopes[1:] < 0.0) & ~above
+    above = values[1:] > mode.floors
+    turning = (slopes[:-1] > 0.0) & (slopes[1:] < 0.0) & ~above & (values[:-1] < -mode.floors)
     for k in np.flatnonzero((above | turning).any(axis=1)):
         best = min(
             (_root(mode, states[k], row, g, bool(above[k, g]), step), g)
@@ -113,6 +119,8 @@ def _root(mode: OracleMode, x: Array, row: Array, guard: int, above: bool, step:
 
     stop = step
     if not above:
+        if value(0.0) >= 0.0 or slope(0.0) <= 0.0 or slope(step) >= 0.0:  # the guard just left, zero to rounding
+            return np.inf
         stop = brentq(slope, 0.0, step, xtol=1e-16, rtol=1e-14)
         if value(stop) <= 0.0:
             return np.inf
