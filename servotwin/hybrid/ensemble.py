@@ -17,6 +17,8 @@ from servotwin.hybrid.output import output_table, sample_segments
 from servotwin.hybrid.tables import Tables, search_step
 from servotwin.hybrid.trajectory import ZenoError, tables_for
 
+_PARTS_PER_WORKER = 8
+
 
 @bare
 def run_members(
@@ -97,13 +99,13 @@ def run_ensemble(
     table = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
     out, events = np.empty((len(starts), samples)), np.zeros(len(starts), dtype=np.int64)
     workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
-    # Neighbours cost alike, so each worker takes every `workers`-th member.
-    parts = [np.arange(worker, len(starts), workers) for worker in range(workers)]
+    # Members cost unequally: many small parts keep every worker busy to the end.
+    size = max(1, len(starts) // (_PARTS_PER_WORKER * workers))
+    parts = [slice(first, first + size) for first in range(0, len(starts), size)]
 
-    def work(part: NDArray[np.int64]) -> None:
-        x, m, y, count = starts[part], first_modes[part], np.empty((len(part), samples)), np.zeros(len(part), np.int64)
-        _run_part(tables, x, m, (samples - 1) * divisor, divisor, table, y, count)
-        out[part], events[part] = y, count
+    def work(part: slice) -> None:
+        steps = (samples - 1) * divisor
+        _run_part(tables, starts[part], first_modes[part], steps, divisor, table, out[part], events[part])
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, parts))

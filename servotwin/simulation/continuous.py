@@ -116,10 +116,10 @@ def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float)
         raise InvalidInput(f"theta_d0 = {theta_d0} rad: must be finite")
     state = np.zeros(len(loop.automaton.names))
     screw = float(np.clip(theta_d0, -0.5 * gap, 0.5 * gap))
-    state[loop.automaton.index("theta_d")] = screw
-    rest = servo.chain().equilibrium(servo.p * screw)
-    first = loop.automaton.index("chain0")
-    state[first : first + rest.size] = rest if screw else 0.0
+    if screw:
+        rest = servo.chain().equilibrium(servo.p * screw)
+        first = loop.automaton.index("chain0")
+        state[loop.automaton.index("theta_d")], state[first : first + rest.size] = screw, rest
     return state
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.ensemble import run_ensemble
-from servotwin.plant.automaton import Shape, continuous_loop
+from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.plant.servo import Servo
-from servotwin.simulation.continuous import plant_start, start_zone
+from servotwin.simulation.continuous import plant_start
 
 
 def simulate_ensemble(
@@ -55,14 +55,24 @@ def simulate_ensemble(
         if not (np.isfinite(value).all() and (value >= 0.0).all()):
             raise InvalidInput(f"{name}: every value of an ensemble must be finite and 0 or more")
     loop = continuous_loop(servo, law, Shape())
-    index = {name: loop.automaton.index(name) for name in ("reference", "gap", "tolerance")}
-    states, modes = [], []
-    for r, b, tol, screw in zip(*(value.ravel().tolist() for value in values), strict=True):
-        state = plant_start(servo, loop, b, screw)
-        state[index["reference"]], state[index["gap"]], state[index["tolerance"]] = r, b, tol
-        modes.append(loop.mode(start_zone(float(loop.rows["error"][0] @ state), law.enter * tol)))
-        states.append(state)
+    states = _starts(servo, loop, *(value.ravel() for value in values))
+    modes = _modes(loop, states, law.enter)
     samples = round(duration * sample_rate) + 1
     rows = loop.rows["position"]
     out, _ = run_ensemble(loop.automaton, states, modes, 1.0 / sample_rate, samples, rows, threads)
     return out.reshape(*values[0].shape, samples)
+
+
+def _starts(servo: Servo, loop: ServoAutomaton, reference: Array, gap: Array, tolerance: Array, screw: Array) -> Array:
+    """(K, n) states at rest: as `plant_start` says of one."""
+    index = loop.automaton.index
+    states = np.array([plant_start(servo, loop, b, w) for b, w in zip(gap, screw, strict=True)])
+    states[:, index("reference")], states[:, index("gap")], states[:, index("tolerance")] = reference, gap, tolerance
+    return states
+
+
+def _modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np.int64]:
+    """(K,) modes: as `start_zone` says of one."""
+    error = states @ loop.rows["error"][0]
+    inside = np.abs(error) <= enter * states[:, loop.automaton.index("tolerance")]
+    return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))
