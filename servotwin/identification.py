@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.passage import Passage
 from servotwin.identify.trend import Trend, TrendSettings
 from servotwin.identify.window import Window
@@ -197,7 +197,7 @@ def _table(found: Identified) -> Table:
 
 def _unsure(estimate: GapEstimate) -> tuple[str, str, str]:
     """A bound where there is one; what was believed before is no result of the window."""
-    bounded = estimate.status.value == "lower bound"
+    bounded = estimate.status is GapStatus.LOWER_BOUND
     return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-", "-")
 
 

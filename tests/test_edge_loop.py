@@ -100,7 +100,7 @@ class Loop:
         edge = AgentSettings("axis-1", "b0", RATE, 0.4, 0.1, Retry(1.5, 2.0, 4.0), Limits(maximum=1.0))
         self.outbox = MemoryOutbox(capacity)
         self.agent, self.twin = Agent(edge, self.outbox), twin
-        self.link = SimulatedLink("axis-1", self.clock, self._at_twin, self._at_edge, link, seed)
+        self.link = SimulatedLink("axis-1", self.clock, self._at_twin, self._at_edge, link, link, seed)
         self.history: list[Parameters] = []
         self.swaps: list[tuple[int, int]] = []
         self.receipts: list[Receipt] = []

@@ -35,7 +35,7 @@ def to_twin(data):
 def to_edge(data):
     agent.receive(decode(data))
 
-link = SimulatedLink("axis-1", clock, to_twin, to_edge, LinkSettings(delay_s=0.5), 0)
+link = SimulatedLink("axis-1", clock, to_twin, to_edge, LinkSettings(delay_s=0.5), LinkSettings(delay_s=0.5), 0)
 state, position = start(0.0), 0.0
 for _ in range(250):
     clock.run_until(agent.time)

@@ -69,64 +69,64 @@ def test_an_unknown_preset_is_named():
     assert all(Scenario.preset(name).name == name for name in PRESETS)
 
 
+EVERY_KEY = """
+servo = "table1"
+name = "axis-7"
+duration_s = 30
+seed = 4
+theta_d0_deg = 1.0
+[reference]
+kind = "square"
+amplitude_mm = 0.5
+offset_mm = 0.5
+period_s = 10
+[gap]
+from_deg = 2
+to_deg = 8
+over_s = 20
+begin_s = 3
+[controller]
+sample_rate_hz = 1000
+enter_tolerances = 0.5
+leave_tolerances = 1.5
+voltage_limit_v = 24
+ki_v_per_m_s = 500
+[noise]
+std_mm = 0.1
+kind = "white"
+[recording]
+sample_rate_hz = 2000
+window_s = 0.8
+pre_trigger_s = 0.2
+retry_first_s = 3
+[recording.limits]
+maximum_mm = 0.3
+[link]
+delay_s = 0.5
+loss = 0.1
+[[link.outages]]
+from_s = 1
+to_s = 2
+[link.down]
+loss = 0.2
+jitter_s = 0.3
+[twin]
+method = "paper"
+k_dz = 1.5
+initial_gap_deg = 4
+gap_limit_deg = 12
+processing_s = 0.1
+[twin.trend]
+wear_deg = 10
+over_s = 1000
+[twin.estimator]
+alpha_rad_per_s = 80
+contact_travel_deg = 2
+"""
+
+
 def test_every_key_in_its_unit(tmp_path):
-    scenario = load(
-        tmp_path,
-        """
-        servo = "table1"
-        name = "axis-7"
-        duration_s = 30
-        seed = 4
-        theta_d0_deg = 1.0
-        [reference]
-        kind = "square"
-        amplitude_mm = 0.5
-        offset_mm = 0.5
-        period_s = 10
-        [gap]
-        from_deg = 2
-        to_deg = 8
-        over_s = 20
-        begin_s = 3
-        [controller]
-        sample_rate_hz = 1000
-        enter_tolerances = 0.5
-        leave_tolerances = 1.5
-        voltage_limit_v = 24
-        ki_v_per_m_s = 500
-        [noise]
-        std_mm = 0.1
-        kind = "white"
-        [recording]
-        sample_rate_hz = 2000
-        window_s = 0.8
-        pre_trigger_s = 0.2
-        retry_first_s = 3
-        [recording.limits]
-        maximum_mm = 0.3
-        [link]
-        delay_s = 0.5
-        loss = 0.1
-        [[link.outages]]
-        from_s = 1
-        to_s = 2
-        [link.down]
-        loss = 0.2
-        jitter_s = 0.3
-        [twin]
-        method = "paper"
-        k_dz = 1.5
-        initial_gap_deg = 4
-        gap_limit_deg = 12
-        processing_s = 0.1
-        [twin.trend]
-        wear_deg = 10
-        over_s = 1000
-        [twin.estimator]
-        alpha_rad_per_s = 80
-        contact_travel_deg = 2
-        """,
-    )
+    scenario = load(tmp_path, EVERY_KEY)
     assert (scenario.name, scenario.seed, scenario.theta_d0) == ("axis-7", 4, math.radians(1.0))
     assert scenario.reference == SquareWave(0.5e-3, 10.0, 0.5e-3)
     assert scenario.gap == SCurve(math.radians(2.0), math.radians(8.0), 20.0, begin=3.0)

@@ -90,7 +90,7 @@ def test_outages_take_what_is_sent_and_what_would_arrive() -> None:
 
 def test_directions_and_servos_have_their_own_randomness() -> None:
     clock, settings = VirtualClock(), LinkSettings(jitter_s=1.0)
-    one, two = (SimulatedLink(name, clock, len, len, settings, 1) for name in ("axis-1", "axis-2"))
+    one, two = (SimulatedLink(name, clock, len, len, settings, settings, 1) for name in ("axis-1", "axis-2"))
     lines = (one.up, one.down, two.up, two.down)
     for line in lines:
         line.send(b"")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.bench.estimator_windows import Case, paper_loop_cases
-from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.estimate import NORMAL_95, GapEstimate
 from servotwin.identify.gap import estimate_gap
 from servotwin.identify.whitened.estimator import Settings
 from servotwin.plant.servo import Servo
@@ -21,7 +21,6 @@ Flags: TypeAlias = NDArray[np.bool_]
 FLOOR = 1e-6  # m
 ANY = (-math.inf, math.inf)
 OPEN_MINDED = Settings(largest_std=10.0, largest_shift=10.0)  # refuses next to nothing
-_NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Answers:
         """Share of the accepted errors within 1.96 `spread`."""
         stds = np.degrees([getattr(estimate, spread) for estimate in self.estimates])
         ratio = np.abs(self.errors)[self.accepted] / stds[self.accepted]
-        return float(np.mean(ratio <= _NORMAL_95)) if ratio.size else math.nan
+        return float(np.mean(ratio <= NORMAL_95)) if ratio.size else math.nan
 
 
 def answers(cases: Iterable[Case], servo: Servo | None = None, settings: Settings | None = None) -> Answers:

@@ -18,7 +18,7 @@ from servotwin.clock import Event, VirtualClock
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.recorder import Floats
-from servotwin.link.simulated import Line, LinkSettings
+from servotwin.link.simulated import SimulatedLink
 from servotwin.messages import Message, Receipt, Update, decode, encode
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run, Simulation
@@ -85,8 +85,8 @@ class Cosimulation:
         self.agent = Agent(scenario.agent_settings())
         self.store = MemoryStore()
         self.twin = Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
-        self.up = self._line("up", scenario.uplink, self._at_twin)
-        self.down = self._line("down", scenario.downlink, self._at_edge)
+        ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
+        self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
         self._wake: Event | None = None
 
@@ -142,7 +142,7 @@ class Cosimulation:
     def _send_up(self, outgoing: Outgoing) -> None:
         if isinstance(outgoing.message, Receipt):
             self.receipts.append(outgoing.message)
-        self.up.send(encode(outgoing.message))
+        self.link.up.send(encode(outgoing.message))
 
     def _at_edge(self, data: bytes) -> None:
         """Bytes arrive at the machine."""
@@ -165,17 +165,14 @@ class Cosimulation:
         """Send what the twin says, updates after its processing time, and note when it wants to be woken."""
         for message in messages:
             delay = self.scenario.twin.processing if isinstance(message, Update) else 0.0
-            self.clock.schedule(self.clock.now + delay, partial(self.down.send, encode(message)))
+            self.clock.schedule(self.clock.now + delay, partial(self.link.down.send, encode(message)))
         if self._wake is not None:
             self.clock.cancel(self._wake)
         due = self.twin.next_wake()
         self._wake = None if due is None else self.clock.schedule(max(due, self.clock.now), self._wake_twin)
 
-    def _line(self, direction: str, settings: LinkSettings, deliver: Callable[[bytes], object]) -> Line:
-        return Line(f"{self.scenario.name}/{direction}", self.clock, deliver, settings, self.scenario.seed)
-
     def _transmissions(self) -> Iterable[Transmission]:
-        for direction, line in (("up", self.up), ("down", self.down)):
+        for direction, line in (("up", self.link.up), ("down", self.link.down)):
             for r in line.records:
                 yield Transmission(direction, r.serial, r.copy, r.data, r.sent, r.arrival, r.fate)
 

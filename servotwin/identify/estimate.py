@@ -8,6 +8,7 @@ from enum import StrEnum
 
 Interval = tuple[float, float]
 NOTHING_KNOWN: Interval = (0.0, math.inf)
+NORMAL_95 = 1.959963984540054  # standard deviations on either side of the mean hold 95 % of a normal distribution
 
 
 class GapStatus(StrEnum):
@@ -73,3 +74,23 @@ class GapEstimate:
     def ok(self) -> bool:
         """Whether the value may be used to set a controller."""
         return self.status is GapStatus.OK
+
+
+def no_estimate(time: float, reasons: tuple[str, ...] = (), model_version: str = "", method: str = "") -> GapEstimate:
+    """What is stated of the gap at a time (s) of which nothing is known, and why."""
+    return GapEstimate(
+        gap=math.nan,
+        std=math.inf,
+        std_total=math.inf,
+        interval=NOTHING_KNOWN,
+        status=GapStatus.UNIDENTIFIABLE,
+        time=time,
+        reasons=reasons,
+        model_version=model_version,
+        method=method,
+    )
+
+
+def interval_95(gap: float, std: float) -> Interval:
+    """95 % interval (rad) of a total gap with a normal spread, cut at 0."""
+    return max(0.0, gap - NORMAL_95 * std), gap + NORMAL_95 * std

@@ -14,14 +14,13 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapEstimate, GapStatus, Interval
+from servotwin.identify.estimate import NORMAL_95, GapEstimate, GapStatus, Interval
 from servotwin.identify.passage import Passage, passage
 from servotwin.identify.trendsettings import TrendSettings
 from servotwin.plant.signals import Array
 
 __all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
 
-NORMAL_95 = 1.959963984540054
 GAP, RATE, OFFSET = 0, 1, 2
 
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from servotwin.errors import InvalidInput
+from servotwin.identify.settingscheck import check_number
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,7 @@ class TrendSettings:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-                raise InvalidInput(f"trend {item.name} = {value!r}: must be a finite number of at least 0")
+            check_number(f"trend {item.name}", getattr(self, item.name))
         if not isinstance(self.restart_after, int) or self.restart_after < 1:
             raise InvalidInput(f"trend restart_after = {self.restart_after!r}: must be a whole number of at least 1")
 

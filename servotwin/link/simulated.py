@@ -153,7 +153,8 @@ class SimulatedLink:
     clock : VirtualClock
     to_twin, to_edge : callable
         Called with the bytes that arrive there.
-    settings : LinkSettings
+    up, down : LinkSettings
+        Of the direction to the twin, and of the one to the edge.
     seed : int
     """
 
@@ -163,11 +164,12 @@ class SimulatedLink:
         clock: VirtualClock,
         to_twin: Callable[[bytes], object],
         to_edge: Callable[[bytes], object],
-        settings: LinkSettings,
+        up: LinkSettings,
+        down: LinkSettings,
         seed: int,
     ) -> None:
-        self.up = Line(f"{servo}/up", clock, to_twin, settings, seed)
-        self.down = Line(f"{servo}/down", clock, to_edge, settings, seed)
+        self.up = Line(f"{servo}/up", clock, to_twin, up, seed)
+        self.down = Line(f"{servo}/down", clock, to_edge, down, seed)
 
 
 def derive_seed(root: int, *names: str) -> int:

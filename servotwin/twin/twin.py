@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
+from servotwin.identify.estimate import GapEstimate, no_estimate
 from servotwin.identify.gap import estimate_gap, settings_of
 from servotwin.identify.trend import Trend
 from servotwin.identify.whitened.estimator import Settings
@@ -186,4 +186,4 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
 def _nothing(message: WindowMessage, reason: str) -> GapEstimate:
     """The estimate from a window that no estimator accepts."""
     middle = message.start + 0.5 * (message.samples - 1) / message.rate
-    return GapEstimate(math.nan, math.inf, math.inf, NOTHING_KNOWN, GapStatus.UNIDENTIFIABLE, middle, reasons=(reason,))
+    return no_estimate(middle, (reason,))

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.core.family import Hold
+from servotwin.identify.settingscheck import check_number
 
 SPREADS: Mapping[str, float] = MappingProxyType(
     {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_B": 0.1, "gap rate": math.radians(0.5)}
@@ -62,11 +63,11 @@ class JointSettings:
     def __post_init__(self) -> None:
         for item in fields(self):
             if item.name not in ("spreads", "hold"):
-                _check(item.name, getattr(self, item.name))
+                check_number(f"joint {item.name}", getattr(self, item.name), item.name in _WHOLE)
         for name, value in self.spreads.items():
             if name not in SPREADS:
                 raise InvalidInput(f"joint spreads {name!r}: allowed are {', '.join(SPREADS)}")
-            _check(f"spreads {name!r}", value)
+            check_number(f"joint spreads {name!r}", value)
             if value == 0.0:
                 raise InvalidInput(f"joint spreads {name!r} = 0: must be above 0; leave out of `free` what is known")
 
@@ -75,7 +76,4 @@ class JointSettings:
         return self.spreads.get(name, SPREADS[name])
 
 
-def _check(name: str, value: object) -> None:
-    number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else value
-    if not 0.0 <= number < math.inf:
-        raise InvalidInput(f"joint {name} = {value!r}: must be a finite number of at least 0")
+_WHOLE = ("noise_order", "whitenings")

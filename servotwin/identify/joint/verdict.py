@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.identify.core.contacts import travel
-from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
+from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus, interval_95
 from servotwin.identify.joint.model import JointModel
 from servotwin.identify.joint.search import Stand
 from servotwin.identify.joint.settings import SPREADS, JointSettings
-from servotwin.identify.trend import NORMAL_95
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -89,7 +88,8 @@ def _gap_estimate(
     known, gap, total = status is GapStatus.OK, values["gap"], math.hypot(std, settings.model_error_rad)
     interval = NOTHING_KNOWN
     if status in (GapStatus.OK, GapStatus.LOWER_BOUND):
-        interval = max(0.0, gap - NORMAL_95 * total), gap + NORMAL_95 * total if known else math.inf
+        low, high = interval_95(gap, total)
+        interval = low, high if known else math.inf
     return GapEstimate(
         gap=gap if known else math.nan,
         std=std if known else math.inf,

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus
+from servotwin.identify.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.identify.paper.bfgs import Minimum, minimise
 from servotwin.identify.paper.information import standard_deviation
 from servotwin.identify.paper.motion import motion
@@ -125,14 +125,4 @@ def _stated(
 
 def _nothing(window: Window, servo: Servo, *reasons: str) -> GapEstimate:
     """An estimate that knows nothing, and why."""
-    return GapEstimate(
-        gap=math.nan,
-        std=math.inf,
-        std_total=math.inf,
-        interval=NOTHING_KNOWN,
-        status=GapStatus.UNIDENTIFIABLE,
-        time=window.mid_time,
-        reasons=reasons,
-        model_version=servo.version,
-        method=METHOD,
-    )
+    return no_estimate(window.mid_time, reasons, servo.version, METHOD)

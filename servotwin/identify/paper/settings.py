@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.paper.zerophase import PADDINGS
+from servotwin.identify.settingscheck import check_number
 
 ORIGINS = ("absolute", "first")
 
@@ -73,17 +74,9 @@ class Settings:
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name not in _CHOICES and not (value is None and item.default is None):
-                _check(item.name, value)
+                check_number(f"estimator {item.name}", value, item.name in _WHOLE, item.name in _POSITIVE)
 
 
 _CHOICES = {"padding": PADDINGS, "origin": ORIGINS}
 _POSITIVE = ("alpha", "lowpass_hz", "lowpass_order", "iterations")
 _WHOLE = ("lowpass_order", "padding_samples", "iterations", "reversals")
-
-
-def _check(name: str, value: object) -> None:
-    whole, positive = name in _WHOLE, name in _POSITIVE
-    number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else value
-    if (whole and not isinstance(value, int)) or not 0.0 <= number < math.inf or (positive and number == 0.0):
-        what = "whole number" if whole else "finite number"
-        raise InvalidInput(f"estimator {name} = {value!r}: must be a {what} {'above' if positive else 'of at least'} 0")

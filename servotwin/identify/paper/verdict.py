@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servotwin.identify.estimate import NOTHING_KNOWN, GapStatus, Interval
+from servotwin.identify.estimate import NORMAL_95, NOTHING_KNOWN, GapStatus, Interval, interval_95
 from servotwin.identify.paper.bfgs import Minimum
 from servotwin.identify.paper.residual import PlayResidual
 from servotwin.identify.paper.settings import Settings
-
-_NORMAL_95 = 1.959963984540054
 
 
 class Verdict(NamedTuple):
@@ -23,9 +21,9 @@ class Verdict(NamedTuple):
     def interval(self, std: float) -> Interval:
         """95 % interval of the gap for a standard deviation, rad."""
         if self.status is GapStatus.OK:
-            return max(0.0, self.gap - _NORMAL_95 * std), self.gap + _NORMAL_95 * std
+            return interval_95(self.gap, std)
         if self.status is GapStatus.LOWER_BOUND:
-            return max(0.0, self.gap - _NORMAL_95 * std), math.inf
+            return interval_95(self.gap, std)[0], math.inf
         return NOTHING_KNOWN
 
 
@@ -35,7 +33,7 @@ def judge(residual: PlayResidual, found: Minimum, std: float, settings: Settings
     if objection is not None:
         return objection
     fitted, total = float(found.point[0]) * residual.scale, math.hypot(std, settings.method_error)
-    widest = max(0.0, fitted) + _NORMAL_95 * total
+    widest = max(0.0, fitted) + NORMAL_95 * total
     if residual.scale < widest:
         moved = f"the motor moved by {math.degrees(residual.scale):.3g} deg"
         return _unknown(f"{moved}, less than the {math.degrees(widest):.3g} deg that the gap may have")
@@ -62,7 +60,7 @@ def _objection(residual: PlayResidual, found: Minimum, std: float, settings: Set
 def _negative(fitted: float, std: float) -> Verdict:
     """A minimum at a negative gap: zero when that lies within its spread, otherwise a sign that the model is wrong."""
     reason = f"the best fit has a negative gap of {math.degrees(fitted):.3g} deg"
-    if -fitted <= _NORMAL_95 * std:
+    if -fitted <= NORMAL_95 * std:
         return Verdict(GapStatus.OK, 0.0, (f"{reason}, taken as 0",))
     return Verdict(GapStatus.MODEL_MISMATCH, math.nan, (reason,))
 

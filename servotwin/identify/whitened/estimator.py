@@ -13,7 +13,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.identify.core.contacts import travel
-from servotwin.identify.estimate import NOTHING_KNOWN, GapEstimate, GapStatus, Interval
+from servotwin.identify.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.identify.whitened.aligned import Aligned, align_and_fit
 from servotwin.identify.whitened.channels import faults, motor_angle
 from servotwin.identify.whitened.diagnosis import likely_fault
@@ -31,7 +31,6 @@ from servotwin.plant.signals import Array
 __all__ = ["METHOD", "SHORTEST", "Settings", "estimate"]
 
 METHOD = "whitened"
-_NORMAL_95 = 1.959963984540054
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
 
@@ -137,7 +136,7 @@ def _stated(
 
 def _widened(gap: float, interval: Interval, systematic: float) -> Interval:
     """A statistical interval with a systematic standard deviation (rad) added on both sides."""
-    extra = _NORMAL_95 * systematic
+    extra = NORMAL_95 * systematic
     return max(0.0, gap - math.hypot(gap - interval[0], extra)), gap + math.hypot(interval[1] - gap, extra)
 
 
@@ -148,23 +147,13 @@ def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
     share = estimate.std_total**2 / (estimate.std_total**2 + prior.std_total**2)
     gap = estimate.gap + share * (prior.gap - estimate.gap)
     total = math.sqrt(1.0 - share) * estimate.std_total
-    interval = max(0.0, gap - _NORMAL_95 * total), gap + _NORMAL_95 * total
     std = math.hypot((1.0 - share) * estimate.std, share * prior.std)
-    return replace(estimate, gap=gap, std=std, std_total=total, interval=interval)
+    return replace(estimate, gap=gap, std=std, std_total=total, interval=interval_95(gap, total))
 
 
 def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
     """What is known without the window: the prior."""
-    blank = GapEstimate(
-        gap=math.nan,
-        std=math.inf,
-        std_total=math.inf,
-        interval=NOTHING_KNOWN,
-        status=GapStatus.UNIDENTIFIABLE,
-        time=window.mid_time,
-        model_version=servo.version,
-        method=METHOD,
-    )
+    blank = no_estimate(window.mid_time, model_version=servo.version, method=METHOD)
     if isinstance(prior, GapEstimate):
         return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)
     return blank if prior is None else replace(blank, gap=prior)

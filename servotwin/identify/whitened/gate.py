@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 from servotwin.identify.core.contacts import Travel
-from servotwin.identify.estimate import GapStatus, Interval
+from servotwin.identify.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.identify.whitened.aligned import Aligned
 from servotwin.identify.whitened.modelcheck import Shift
 from servotwin.identify.whitened.settings import Settings
 
-_SIGMAS, _NORMAL_95 = 3.0, 1.959963984540054
+_SIGMAS = 3.0
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
@@ -82,7 +82,7 @@ def _spread(seen: Evidence, settings: Settings) -> str:
     if math.isinf(seen.interval[1]):
         return "the window contradicts no large gap"
     gap = seen.aligned.found.point.gap
-    widest = max(seen.std, (seen.interval[1] - gap) / _NORMAL_95, (gap - seen.interval[0]) / _NORMAL_95)
+    widest = max(seen.std, (seen.interval[1] - gap) / NORMAL_95, (gap - seen.interval[0]) / NORMAL_95)
     if widest > settings.largest_std:
         return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     return ""

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from servotwin.errors import InvalidInput
+from servotwin.identify.settingscheck import check_number
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,7 @@ def _check(name: str, value: object, kind: object) -> None:
         if not isinstance(value, bool):
             raise InvalidInput(f"estimator {name} = {value!r}: must be True or False")
         return
-    whole, positive = kind == "int", name in _POSITIVE
-    number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else value
-    if (whole and not isinstance(value, int)) or not 0.0 <= number < math.inf or (positive and number == 0.0):
-        what = "whole number" if whole else "finite number"
-        raise InvalidInput(f"estimator {name} = {value!r}: must be a {what} {'above' if positive else 'of at least'} 0")
+    check_number(f"estimator {name}", value, kind == "int", name in _POSITIVE)
 
 
 def _check_offset(value: object) -> None:
