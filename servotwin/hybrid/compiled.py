@@ -40,7 +40,8 @@ def summed(function: _Function) -> _Function:
 
 def verbatim(function: _Function) -> _Function:
     """Inlined, but every operation rounded as written: the same bits as the interpreter's."""
-    return _compile(function, _nrt=False, forceinline=True)
+    # Left unset, it would be the caller's: numba compiles a callee with what its caller asked for.
+    return _compile(function, fastmath=False, _nrt=False, forceinline=True)
 
 
 def _compile(function: _Function, **options: Any) -> _Function:
