@@ -97,13 +97,10 @@ class LoopJob:
 
     def described(self) -> st.Scenario:
         """The scenario."""
-        packaged = st.Scenario.preset(self.scenario)
-        servo = st.Servo.preset(self.preset)
+        packaged = st.Scenario.preset(self.scenario).with_servo(st.Servo.preset(self.preset))
         published = self.method == packaged.twin.method
         settings = packaged.twin.estimator if published else None
         return packaged.replace(
-            servo=servo,
-            controller=_with_gains(packaged.law, servo.controller),
             reference=self.square.signal,
             recording=replace(packaged.recording, fine_angle=not published),
             seed=self.seed,
@@ -156,11 +153,6 @@ def _timed(scenario: st.Scenario, seconds: list[float], exact: bool) -> Estimato
         return found
 
     return estimate
-
-
-def _with_gains(law: st.Controller, gains: st.Controller) -> st.Controller:
-    """The scenario's way to run a controller (rate, loop filter) with another servo's gains."""
-    return gains.replace(sample_rate=law.sample_rate, loop_filter_hz=law.loop_filter_hz)
 
 
 def _estimates(loop: Loop, seconds: list[float]) -> tuple[Estimated, ...]:

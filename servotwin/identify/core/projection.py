@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
+_SINGULAR = 1e-7  # of a derivative's length: what is left of it below this is rounding
 _DEPENDENT = 1e-9  # of its length: a column of which less is left adds nothing but rounding
 
 
@@ -32,6 +35,17 @@ def project_out(basis: Array, columns: Array) -> Array:
     for row in left:
         remove(basis, len(basis), row)
     return left
+
+
+def spread(derivative: Array, others: Array, singular: float = _SINGULAR) -> float:
+    """Standard deviation of a parameter in white noise of variance 1, `others` (k, m) being estimated beside it.
+
+    The Schur complement of the information is the squared length of what is left of its derivative (m,) off all
+    others; when no more than the part `singular` is left, nothing shows the parameter: inf.
+    """
+    left = project_out(orthonormal(others), derivative[None])[0]
+    size = math.sqrt(float(left @ left))
+    return 1.0 / size if size > singular * math.sqrt(float(derivative @ derivative)) else math.inf
 
 
 @bare

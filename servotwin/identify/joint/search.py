@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.projection import spread
 from servotwin.identify.joint.model import JointModel, Reduce
 from servotwin.plant.signals import Array
 
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9
+_SINGULAR = 1e-8  # of a derivative's length: what the others leave of it below this is nothing
 _SMALL_GAIN = 1e-6  # of the cost: a step that gains less is the last; whitened, far below one standard deviation
 
 
@@ -47,7 +48,8 @@ class Stand:
 
     def deviations(self) -> Array:
         """(P,) standard deviations for residuals of variance 1, all else unknown; inf where nothing is known."""
-        return np.array([_deviation(self.jacobian, index) for index in range(self.point.size)])
+        rows = self.jacobian
+        return np.array([spread(row, np.delete(rows, i, axis=0), _SINGULAR) for i, row in enumerate(rows)])
 
     def covariance(self) -> Array:
         """(P, P) covariance for residuals of variance 1; inf on the diagonal of what is not known."""
@@ -57,13 +59,6 @@ class Stand:
         covariance = np.linalg.pinv(scaled @ scaled.T, hermitian=True) / np.outer(scale, scale)
         np.fill_diagonal(covariance, self.deviations() ** 2)
         return covariance
-
-
-def _deviation(jacobian: Array, index: int) -> float:
-    """The Schur complement: one over the length of what the other rows leave of a row."""
-    row = jacobian[index : index + 1]
-    left = float(np.linalg.norm(project_out(orthonormal(np.delete(jacobian, index, axis=0)), row)))
-    return 1.0 / left if left > 1e-8 * float(np.linalg.norm(row)) else float("inf")
 
 
 def stand(model: JointModel, point: Array, known: Known, reduce: Reduce) -> Stand:

@@ -15,12 +15,12 @@ import numpy as np
 
 from servotwin.identify.core.contacts import contacts
 from servotwin.identify.core.normal import LeastSquares, least_squares
-from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.projection import orthonormal, project_out, spread
 from servotwin.identify.core.response import Response, response
 from servotwin.identify.core.whitening import burg
 from servotwin.identify.paper.lags import LagFilter
 from servotwin.identify.paper.observer import observer
-from servotwin.identify.whitened.passes import Found, spread
+from servotwin.identify.whitened.passes import Found
 from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.identify.core.normal import least_squares
-from servotwin.identify.core.projection import orthonormal, project_out
+from servotwin.identify.core.projection import spread
 from servotwin.identify.core.whitening import Autoregression, burg
 from servotwin.identify.whitened.misfit import Misfit, Point
 from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
@@ -18,7 +18,6 @@ from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
 _SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
-_SINGULAR = 1e-7  # of the derivative's length: what is left of it below this is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +54,8 @@ class Found:
 
     @property
     def std(self) -> float:
-        """Standard deviation of the gap from the Schur complement of the information, rad; inf where there is none.
-
-        The Schur complement is the squared length of what is left of the derivative by the gap off all others.
-        """
+        """Standard deviation of the gap from the Schur complement of the information, rad; inf where there is none."""
         return spread(self.rows[GAP], self.rows[PLACE:])
-
-
-def spread(derivative: Array, others: Array) -> float:
-    """Standard deviation of a parameter in white noise of variance 1, `others` (k, m) being estimated beside it."""
-    left = project_out(orthonormal(others), derivative[None])[0]
-    size = math.sqrt(float(left @ left))
-    return 1.0 / size if size > _SINGULAR * math.sqrt(float(derivative @ derivative)) else math.inf
 
 
 def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Point]:
