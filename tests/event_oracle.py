@@ -34,8 +34,13 @@ class OracleMode:
     flow: Array
     guards: Sequence[OracleGuard] = ()
     stack: Array = field(init=False)
+    step: float = field(init=False, default=0.0)
 
     def prepare(self, step: float) -> None:
+        """Tables for a grid of `step`, once."""
+        if step == self.step:
+            return
+        self.step = step
         self.balanced, (self.scale, _) = matrix_balance(self.flow, permute=False, separate=True)
         self.stack = np.array([self.exponential(step * k) for k in range(NODES + 1)])
         self.floors = np.array([guard.floor for guard in self.guards])
