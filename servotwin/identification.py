@@ -124,7 +124,7 @@ def opened(reference: Sequence[float] | np.ndarray[Any, Any], length: int, befor
 
 def _one(whole: Window, request: Request) -> Window:
     start = whole.start if request.start is None else request.start
-    end = whole.start + whole.position.size / whole.sample_rate
+    end = float(whole.start + whole.position.size / whole.sample_rate)
     duration = end - start if request.duration is None else request.duration
     if not (math.isfinite(start) and math.isfinite(duration) and duration > 0.0):
         shown = f"--start {start!r} s, --duration {duration!r} s"

@@ -13,16 +13,25 @@ from servotwin.errors import InvalidInput
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
+
+    Raises
+    ------
+    InvalidInput
+        The system does not let it be written: a full disk, for one.
+    """
     try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InvalidInput(f"output {path}: cannot be written ({error.strerror or error})") from None
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -67,8 +76,10 @@ def make_directory(path: Path) -> Path:
 
 
 def _check_writable(directory: Path) -> None:
-    if not os.access(directory, os.W_OK):
-        raise InvalidInput(f"output directory {directory}: may not be written to; choose another")
+    try:
+        tempfile.TemporaryFile(dir=directory).close()
+    except OSError:
+        raise InvalidInput(f"output directory {directory}: may not be written to; choose another") from None
 
 
 def _umask() -> int:

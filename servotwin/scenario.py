@@ -29,6 +29,7 @@ from servotwin.twin.settings import TwinSettings
 BOOT = "boot-1"
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+MOST_SAMPLES = 1e8  # some 10 GB of signals
 PRESETS = ("fig15", "fig15-sampled", "fig16", "calm")
 
 
@@ -89,9 +90,9 @@ class Scenario:
             raise InvalidInput(f"name = {self.name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
         if not (math.isfinite(self.duration) and self.duration > 0.0):
             raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
+        self._check_rates()
         as_pieces(self.reference, self.duration)
         as_nonnegative(self.gap, self.duration, "gap", "rad")
-        self._check_rates()
         self._check_window()
 
     @classmethod
@@ -101,7 +102,8 @@ class Scenario:
         Raises
         ------
         InvalidInput
-            The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed.
+            The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
+            is unstable on the servo even without a gap.
         """
         return cls._from_table(read_toml(path), Path(path).parent)
 
@@ -118,7 +120,9 @@ class Scenario:
     def _from_table(cls, table: Table, folder: Path) -> Scenario:
         values = scenariofile.read(table, folder)
         with scenariofile.named(table):
-            return cls(**values)
+            scenario = cls(**values)
+            scenario.servo.check_loop(scenario.law)
+            return scenario
 
     def replace(self, **changes: Any) -> Scenario:
         """A copy with some values changed, validated again."""
@@ -187,11 +191,14 @@ class Scenario:
     def _check_rates(self) -> None:
         rate, law = self.recording.sample_rate, self.law.sample_rate
         samples = self.duration * rate
+        self._check_size(max(rate, law or 0.0))
         if abs(samples - round(samples)) > 1e-6:
             raise InvalidInput(f"duration = {self.duration!r} s: must be a whole number of samples at {rate!r} Hz")
         if law is None:
             if self.noise is not None:
                 raise InvalidInput("noise needs a sampled controller: give the controller a sample rate in Hz")
+            if self.law.rate_limit is not None:
+                raise InvalidInput("a rate limit needs a sampled controller: give the controller a sample rate in Hz")
             return
         ratio = max(rate, law) / min(rate, law)
         if abs(ratio - round(ratio)) > 1e-9 * ratio:
@@ -199,6 +206,15 @@ class Scenario:
                 f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
                 "whole multiples of one another"
             )
+
+    def _check_size(self, rate: float) -> None:
+        """All samples and one window fit into memory."""
+        for key, seconds in (("duration", self.duration), ("window", self.window)):
+            if not seconds * rate <= MOST_SAMPLES:
+                raise InvalidInput(
+                    f"{key} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} "
+                    "are allowed"
+                )
 
     def _check_window(self) -> None:
         """The edge accepts the window's length, and the estimator finds enough in it."""

@@ -1,5 +1,6 @@
 """Files are written whole or not at all, and a path that cannot be written is refused before anything is computed."""
 
+import errno
 import stat
 
 import pytest
@@ -64,3 +65,20 @@ def test_a_directory_under_a_file_is_refused(tmp_path):
 
 def test_a_directory_is_made_with_its_parents(tmp_path):
     assert outputs.make_directory(tmp_path / "a" / "b").is_dir()
+
+
+def test_what_the_system_refuses_is_one_sentence(tmp_path):
+    with pytest.raises(InvalidInput, match=r"a\.txt: cannot be written \(No space left on device\)"):
+        write_half(tmp_path / "a.txt", OSError(errno.ENOSPC, "No space left on device"))
+    assert names(tmp_path) == []
+    with pytest.raises(InvalidInput, match="cannot be written"):
+        outputs.write_text(tmp_path / "missing" / "a.txt", "gap")
+
+
+def test_a_directory_that_takes_no_file_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    def refuse(**_where):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr(outputs.tempfile, "TemporaryFile", refuse)
+    with pytest.raises(InvalidInput, match="may not be written to"):
+        outputs.check_file(tmp_path / "run.csv", (".csv",))

@@ -315,3 +315,33 @@ def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path,
     assert (agent.window_s, agent.pre_trigger_s) == (window, pre_trigger)
     usual = load(tmp_path, SHORT).agent_settings()
     assert (usual.window_s, usual.pre_trigger_s) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("controller", "said"),
+    [
+        ("kp_v_per_m = 13777", "unstable"),
+        ("ki_v_per_m_s = -100", "unstable"),
+        ("sample_rate_hz = 10", "at 10 Hz is unstable"),
+        ("sample_rate_hz = 5000\nloop_filter_hz = 0.5", "unstable"),
+        ("rate_limit_v_per_s = 100", "sample rate in Hz"),
+    ],
+)
+def test_a_controller_that_cannot_run_is_refused(tmp_path, controller, said):
+    assert said in refusal(tmp_path, f"{SHORT}[controller]\n{controller}\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (SHORT.replace("duration_s = 5.0", "duration_s = 1e12"), "duration = 1000000000000.0 s: has 5e+15 samples"),
+        (f"{SHORT}[controller]\nsample_rate_hz = 1e12\n", "at most 1e+08"),
+        (f"{SHORT}[recording]\nwindow_s = 1e6\n", "window = 1000000.0 s: has 5e+09 samples"),
+        (
+            SHORT.replace('kind = "step"\nsize_mm = 1.0', 'kind = "square"\namplitude_mm = 1.0\nperiod_s = 1e-9'),
+            "period = 1e-09 s: gives 1e+10 half periods",
+        ),
+    ],
+)
+def test_what_would_not_fit_into_memory_is_refused(tmp_path, text, said):
+    assert said in refusal(tmp_path, text)

@@ -173,3 +173,9 @@ def test_values_on_increasing_times_are_the_values(knots: list[float], count: in
     pieces = PiecewiseCubic(knots, [[k, 0.0, 0.5 * (k > 1.0), 0.0] for k in knots])
     times = first + 0.1 * np.arange(count)
     assert np.array_equal(pieces.on(times), pieces.value(times))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_number_that_is_not_finite_is_named(value):
+    with pytest.raises(InvalidInput, match=f"tolerance = {value} m: must be finite"):
+        as_nonnegative(value, 1.0, "tolerance", "m")

@@ -19,6 +19,7 @@ from servotwin.errors import InvalidInput
 Array: TypeAlias = NDArray[np.float64]
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _SMALLEST = float(np.finfo(float).tiny)
+_MOST_PIECES = 1e7
 _TIME_ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -207,7 +208,11 @@ class SquareWave:
 
     def pieces(self, duration: float, /) -> PiecewiseCubic:
         """One constant per half period that starts on [0, duration]."""
-        halves = np.arange(math.floor(2.0 * max(duration, 0.0) / self.period) + 1)
+        count = 2.0 * max(duration, 0.0) / self.period
+        if not count <= _MOST_PIECES:
+            shown = f"SquareWave period = {self.period!r} s: gives {count:.3g} half periods in {duration!r} s"
+            raise InvalidInput(f"{shown}; at most {_MOST_PIECES:g} are allowed")
+        halves = np.arange(math.floor(count) + 1)
         return PiecewiseCubic.held(halves * (0.5 * self.period), self.offset + self.amplitude * (-1.0) ** halves)
 
 
@@ -268,8 +273,10 @@ def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit:
     Raises
     ------
     InvalidInput
-        With the time and the value of the lowest point.
+        With the time and the value of the lowest point; a number that is not finite, by its name.
     """
+    if isinstance(signal, int | float) and not math.isfinite(signal):
+        raise InvalidInput(f"{name} = {signal} {unit}: must be finite and 0 or more")
     pieces = as_pieces(signal, duration)
     time, value = pieces.minimum(duration)
     if value < -_ROUNDING * float(np.max(np.abs(pieces.value(np.append(pieces.times, duration))))):
