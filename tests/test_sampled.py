@@ -312,3 +312,16 @@ def test_the_first_and_the_last_tick_are_taken() -> None:
     assert run.voltage[0] == first.voltage != 0.0
     longer = sampled(1e3, 0.2, 1e3, reference=1e-3, gap=1.0 * DEGREE)
     assert run.voltage[-1] == longer.voltage[100]
+
+
+def test_dead_zone_events_of_the_ticks() -> None:
+    """They alternate; what a jump of the reference between two ticks sets off is not the state's doing."""
+    reference = PiecewiseCubic.held([0.0, 0.50037, 3.0], [0.0, 1e-3, -1e-3])
+    run = sampled(1e3, 4.0, reference=reference, gap=3.0 * DEGREE, tolerance=PAPER.tolerance_for(4.0 * DEGREE))
+    zone = run.events[np.isin(run.events.kind, ["enter", "leave"])]
+    assert list(zone.kind[:2]) == ["leave", "enter"]
+    assert all(a != b for a, b in zip(zone.kind, zone.kind[1:], strict=False))
+    assert zone.time[0] == 0.501
+    assert set(zone.time[~zone.state_triggered]) - {3.0} == {0.501}
+    assert np.count_nonzero(zone.state_triggered) >= 3
+    assert len(simulate(PAPER, 0.1, controller=PAPER.controller.replace(sample_rate=1e3), tolerance=1.0).events) == 0

@@ -132,8 +132,8 @@ class Run:
         """Table of (time s, kind, side, state_triggered), in time order.
 
         Kinds: contact and release of the backlash (with an elastic screw also hold: the motor stops at the flank),
-        enter and leave of the dead zone, saturate (side 0: ends), reference and parameter (jumps of the inputs).
-        `state_triggered` is false for those two and for what they flip at once.
+        enter and leave of the dead zone, saturate (side 0: ends; continuous law only), reference and parameter (jumps
+        of the inputs). `state_triggered` is false for those two and for what they flip at once.
         """
         end = (self.samples - 1) / self.sample_rate
         jumps = [(time, kind, 0, False) for time, kind in self.inputs.jumps(end)]

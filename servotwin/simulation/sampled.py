@@ -24,7 +24,7 @@ from servotwin.hybrid.kernel import (
     new_record,
 )
 from servotwin.hybrid.tables import search_step
-from servotwin.hybrid.trajectory import Jump, ZenoError, schedule_of, tables_for
+from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
@@ -211,16 +211,17 @@ class SampledEngine:
         return sorted(found + self._tick_events(), key=lambda event: event[0])
 
     def _tick_events(self) -> list[tuple[float, str, int, bool]]:
-        """Dead-zone and saturation events, at the ticks that decided them."""
+        """Dead-zone events, at the ticks that decided them; forced where the reference jumped since the tick before."""
         count = (self.base - 1) // self.tick_every + 1 + (1 if self.finished else 0) if self.base else 0
         count = min(count, len(self.output.active))
         active, times = self.output.active[:count], np.arange(count) / self.tick_rate
-        changed = np.flatnonzero(np.diff(active, prepend=np.int8(1)))
+        changed = np.flatnonzero(np.diff(active, prepend=active[:1]))
         jumps = self.inputs.reference.jumps
         error = self.inputs.reference.value(times[changed]) - self.output.measured[changed]
         found = []
         for k, e in zip(changed.tolist(), error.tolist(), strict=True):
-            forced = bool(np.any(np.abs(jumps - times[k]) < 0.5 / self.tick_rate))
+            ticks_ago = (times[k] - jumps) * self.tick_rate
+            forced = bool(np.any((ticks_ago > -ON_GRID) & (ticks_ago < 1.0 - ON_GRID)))
             found.append((float(times[k]), "leave" if active[k] else "enter", 1 if e > 0 else -1, not forced))
         return found
 
