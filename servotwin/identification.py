@@ -95,6 +95,10 @@ def cut(log: Log, request: Request) -> tuple[Window, ...]:
     """One window as asked for, or one after each change of the reference, as an edge cuts them: never overlapping."""
     whole = log.whole
     if request.start is not None or request.duration is not None:
+        if request.window is not None or request.pre_trigger is not None:
+            raise InvalidInput(
+                "--window and --pre-trigger cut at the steps: leave them out with --start and --duration"
+            )
         return (_one(whole, request),)
     if whole.reference is None:
         raise InvalidInput(

@@ -78,6 +78,8 @@ def _whole(path: Path, columns: Columns) -> Window:
 
 def _numbers(path: Path, name: str, columns: Columns) -> Array:
     try:
+        if np.iscomplexobj(columns.values[name]):
+            raise TypeError
         return np.asarray(columns.values[name], dtype=np.float64)
     except (TypeError, ValueError):
         raise InvalidInput(f"log {path}: column {name!r} must hold numbers") from None

@@ -99,6 +99,8 @@ def test_one_window_as_asked_for(folder):
     assert (window.start, window.duration) == pytest.approx((5.0, 2.0))
     assert found.estimates[0].ok
     assert identify(Request(folder / "run.npz", duration=1.0)).windows[0].start == 0.0
+    with pytest.raises(InvalidInput, match="leave them out with --start"):
+        identify(Request(folder / "run.npz", start=5.0, window=1.0))
 
 
 def test_a_window_at_rest_says_so_and_there_is_no_trend(folder):
@@ -224,6 +226,9 @@ def test_junk_is_one_sentence(tmp_path, suffix, content):
 
 
 def test_columns_that_hold_no_numbers(tmp_path):
+    np.savez(tmp_path / "complex.npz", time_s=np.arange(20.0) + 1j, position_m=np.arange(20.0))
+    with pytest.raises(InvalidInput, match="'time_s' must hold numbers"):
+        logfile.read_log(tmp_path / "complex.npz")
     words = {"time_s": np.array(["a"] * 20), "position_m": np.arange(20.0)}
     np.savez(tmp_path / "words.npz", **words)
     parquet.write_table(pyarrow.table(words), tmp_path / "words.parquet")

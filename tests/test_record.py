@@ -90,7 +90,7 @@ def test_a_failing_writer_leaves_nothing(written, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setitem(record._WRITERS, ".npz", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InvalidInput, match=r"cannot be written \(disk full\)"):
         record.record(written[".npz"].parent / "scenario.toml", tmp_path / "run.npz")
     assert not list(tmp_path.iterdir())
 

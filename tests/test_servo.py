@@ -166,6 +166,8 @@ def test_resolve_a_preset_or_a_file(tmp_path: Path) -> None:
     assert Servo.resolve("own.toml", tmp_path) == own
     with pytest.raises(InvalidInput, match=r"absent\.toml: cannot be read"):
         Servo.resolve("absent.toml", tmp_path)
+    with pytest.raises(InvalidInput, match="did you mean 'paper'"):
+        Servo.resolve("papr", tmp_path)
 
 
 def test_replace_allows_unstable_loops_for_studies_and_check_loop_refuses_them() -> None:

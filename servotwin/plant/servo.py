@@ -128,7 +128,9 @@ class Servo:
     @classmethod
     def resolve(cls, name_or_path: str, folder: str | os.PathLike[str] = ".") -> Servo:
         """A preset's name, or the path of a servo's TOML relative to `folder`."""
-        return cls.preset(name_or_path) if name_or_path in PRESETS else cls.load(Path(folder) / name_or_path)
+        path = Path(folder) / name_or_path
+        named = name_or_path in PRESETS or not (path.suffix or path.exists())
+        return cls.preset(name_or_path) if named else cls.load(path)
 
     @classmethod
     def _from_table(cls, table: Table) -> Servo:
