@@ -14,6 +14,8 @@ from servotwin.hybrid.tables import PIECES, TERMS, Tables
 # derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
 # two modes agree on the sign of the same quantity.
 SIGNIFICANT = 1e-13
+# A coefficient below this part of the largest one: 24 of them are below its rounding.
+NEGLIGIBLE = 1e-18
 
 
 @inlined
@@ -58,20 +60,34 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         return np.inf
     if c[first] > 0.0:
         return 0.0
-    # Leading zeros are divided out: the guard starts at zero and moves away.
-    power = 1.0
-    for k in range(TERMS - first):
-        c[k] = c[k + first] * power
-        power *= length
-    for k in range(TERMS - first, TERMS):
-        c[k] = 0.0
+    if first > 0 or length < 1.0:
+        # Leading zeros are divided out: the guard starts at zero and moves away.
+        power = 1.0
+        for k in range(TERMS - first):
+            c[k] = c[k + first] * power
+            power *= length
+        for k in range(TERMS - first, TERMS):
+            c[k] = 0.0
     return _search_unit(t, scratch) * length
+
+
+@inlined
+def significant(c: Array) -> int:
+    """Number of leading coefficients, at least two, after which all the rest cannot change a value on [0, 1]."""
+    largest = 0.0
+    for k in range(TERMS):
+        largest = max(largest, abs(c[k]))
+    terms = TERMS
+    while terms > 2 and abs(c[terms - 1]) < NEGLIGIBLE * largest:
+        terms -= 1
+    return terms
 
 
 @inlined
 def _search_unit(t: Tables, scratch: Scratch) -> float:
     c, b = scratch.series, scratch.rows
     product(t.bernstein, 0, 3 * PIECES + 1, 3 * PIECES + 1, c, b)
+    c = c[: significant(c)]
     error = CUBIC_ERROR * fourth_derivative_bound(c, 1.0) / PIECES**4
     for piece in range(PIECES):
         at = 3 * piece

@@ -13,7 +13,7 @@ from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.flow import Scratch, new_scratch
 from servotwin.hybrid.kernel import DONE, FULL, ZENO, Record, flow_until, grown, new_record, settle
-from servotwin.hybrid.output import output_table, sample_segments
+from servotwin.hybrid.output import Outputs, output_table, sample_segments
 from servotwin.hybrid.tables import Tables, search_step
 from servotwin.hybrid.trajectory import ZenoError, tables_for
 
@@ -28,7 +28,7 @@ def run_members(
     first: int,
     steps: int,
     stride: int,
-    table: Array,
+    outputs: Outputs,
     out: Array,
     events: NDArray[np.int64],
     record: Record,
@@ -47,7 +47,9 @@ def run_members(
         modes[k] = mode
         events[k] = record.size[1]
         size = record.size[0]
-        sample_segments(0, size, record.step, record.fraction, record.mode, record.state, table, stride, 0, out[k])
+        sample_segments(
+            0, size, record.step, record.fraction, record.mode, record.state, outputs, stride, 0, scratch.change, out[k]
+        )
     return DONE, len(states)
 
 
@@ -96,7 +98,7 @@ def run_ensemble(
         raise InvalidInput(f"states must be finite and modes one of 0 to {len(automaton.modes) - 1}")
     step, divisor = search_step(automaton, sample_step)
     tables = tables_for(automaton, step)
-    table = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
+    outputs = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
     out, events = np.empty((len(starts), samples)), np.zeros(len(starts), dtype=np.int64)
     workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
     # Members cost unequally: many small parts keep every worker busy to the end.
@@ -105,7 +107,7 @@ def run_ensemble(
 
     def work(part: slice) -> None:
         steps = (samples - 1) * divisor
-        _run_part(tables, starts[part], first_modes[part], steps, divisor, table, out[part], events[part])
+        _run_part(tables, starts[part], first_modes[part], steps, divisor, outputs, out[part], events[part])
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, parts))
@@ -118,14 +120,16 @@ def _run_part(
     modes: NDArray[np.int64],
     steps: int,
     stride: int,
-    table: Array,
+    outputs: Outputs,
     out: Array,
     events: NDArray[np.int64],
 ) -> None:
     record = new_record(states.shape[1])
     scratch, kept, member = new_scratch(tables), states.copy(), 0
     while True:
-        status, member = run_members(tables, states, modes, member, steps, stride, table, out, events, record, scratch)
+        status, member = run_members(
+            tables, states, modes, member, steps, stride, outputs, out, events, record, scratch
+        )
         if status == DONE:
             return
         if status != FULL:

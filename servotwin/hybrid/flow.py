@@ -9,7 +9,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
-from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, padded
+from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, aligned, padded
 
 
 class Scratch(NamedTuple):
@@ -26,9 +26,9 @@ class Scratch(NamedTuple):
 def new_scratch(tables: Tables) -> Scratch:
     """Working memory for one run."""
     n = tables.states
-    rows = max(padded(tables.guards * (3 * NODES_COARSE + 1)), n + 4 * tables.guards)
+    rows = max(padded(2 * tables.guards * (NODES_COARSE + 1)), n + 4 * tables.guards)
     sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
-    return Scratch(*(np.zeros(size) for size in sizes))
+    return Scratch(*(aligned(np.zeros(size)) for size in sizes))
 
 
 @inlined
@@ -50,6 +50,37 @@ def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arra
             out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
         at = d + step
     for rest in range(fours * np.uint64(4), n):
+        factor = x[rest]
+        for r in range(count):
+            out[r] += table[at + r] * factor
+        at += step
+
+
+@inlined
+def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
+    """The same for many rows: eight columns at a time."""
+    count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
+    at: Any = np.uint64(base)
+    eights = n // np.uint64(8)
+    for r in range(count):
+        out[r] = 0.0
+    for block in range(eights):
+        j = block * np.uint64(8)
+        x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
+        x4, x5, x6, x7 = x[j + np.uint64(4)], x[j + np.uint64(5)], x[j + np.uint64(6)], x[j + np.uint64(7)]
+        b = at + step
+        c = b + step
+        d = c + step
+        e = d + step
+        f = e + step
+        g = f + step
+        h = g + step
+        for r in range(count):
+            out[r] += ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+            )
+        at = h + step
+    for rest in range(eights * np.uint64(8), n):
         factor = x[rest]
         for r in range(count):
             out[r] += table[at + r] * factor
@@ -92,17 +123,14 @@ def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: S
     if part > 0:
         advance(t.jump_part, (mode * PARTS + part) * n2, x, scratch.change)
     terms = scratch.terms
-    product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
-    at = np.uint64(PART_TERMS * t.states)
-    change = scratch.change
+    tall_product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
     for i in range(n):
-        change[i] = 0.0
-    for _ in range(PART_TERMS):
-        at -= n
-        for i in range(n):
-            change[i] = (change[i] + terms[at + i]) * rest
-    for i in range(n):
-        x[i] += change[i]
+        change = 0.0
+        at = np.uint64(PART_TERMS) * n + i
+        for _ in range(PART_TERMS):
+            at -= n
+            change = (change + terms[at]) * rest
+        x[i] += change
 
 
 @inlined
@@ -114,14 +142,14 @@ def advance_clean(
     `table` and `jumps` are those of one scale; returns the number of intervals advanced.
     """
     out, guards = scratch.rows, t.guard_count[mode]
-    rows = 3 * nodes + 1
-    stride = (t.guards * rows + VECTOR - 1) // VECTOR * VECTOR
-    used = (guards * rows + VECTOR - 1) // VECTOR * VECTOR
-    product(table, mode * t.states * stride, stride, used, x, out)
+    values = guards * (nodes + 1)
+    stride = (2 * t.guards * (nodes + 1) + VECTOR - 1) // VECTOR * VECTOR
+    used = (2 * values + VECTOR - 1) // VECTOR * VECTOR
+    tall_product(table, mode * t.states * stride, stride, used, x, out)
     positive = 0
-    for r in range(np.uint64(guards * rows)):
-        positive += out[r] > 0.0
-    clean = wanted if positive == 0 else clean_intervals(out, guards, rows, wanted)
+    for r in range(np.uint64(values)):
+        positive += out[r] + abs(out[np.uint64(values) + r]) > 0.0
+    clean = wanted if positive == 0 else clean_intervals(out, guards, nodes + 1, wanted)
     if clean > 0:
         advance(jumps, (mode * nodes + clean - 1) * t.states * t.states, x, scratch.change)
     return clean
@@ -130,11 +158,12 @@ def advance_clean(
 @inlined
 def clean_intervals(out: Array, guards: int, rows: int, wanted: int) -> int:
     """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
-    clean = wanted
+    clean, thirds = wanted, guards * rows
     for g in range(guards):
         for k in range(clean):
-            at = g * rows + 3 * k
-            if max(out[at], out[at + 1], out[at + 2], out[at + 3]) > 0.0:
+            at = g * rows + k
+            begin, end = out[at], out[at + 1]
+            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > 0.0:
                 clean = k
                 break
     return clean

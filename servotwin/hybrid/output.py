@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,15 @@ from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
 _BLOCK = NODES_COARSE * NODES_FINE
 
 
-def output_table(tables: Tables, rows: Array, stride: int) -> Array:
+class Outputs(NamedTuple):
+    """How one output follows from the state at the start of a segment, up to 127 steps later."""
+
+    table: Array  # M * 128 * n, or M * n * 128 for the states in `order`
+    order: NDArray[np.int64]  # (M, n) states, those that count first
+    used: NDArray[np.int64]  # (M,) number of those that count
+
+
+def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
     """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)`` for a
     few."""
     n, modes = tables.states, len(tables.guard_count)
@@ -24,7 +34,12 @@ def output_table(tables: Tables, rows: Array, stride: int) -> Array:
     starts = np.concatenate([rows[:, None], eights], axis=1)
     ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
     table = np.concatenate([starts[:, :, None], ones], axis=2).reshape(modes, _BLOCK, n)
-    return table.ravel() if stride > 1 else np.ascontiguousarray(table.transpose(0, 2, 1)).ravel()
+    counts = np.abs(table).max(axis=1) > 0.0
+    order, used = np.argsort(~counts, axis=1, kind="stable"), counts.sum(axis=1)
+    if stride > 1:
+        return Outputs(table.ravel(), order, used)
+    columns = np.take_along_axis(table.transpose(0, 2, 1), order[:, :, None], axis=1)
+    return Outputs(np.ascontiguousarray(columns).ravel(), order, used)
 
 
 @bare
@@ -35,13 +50,15 @@ def sample_segments(
     fraction: Array,
     mode: NDArray[np.int64],
     state: Array,
-    table: Array,
+    outputs: Outputs,
     stride: int,
     first: int,
+    chosen: Array,
     out: Array,
 ) -> None:
     """Write the output at samples `first` on, one every `stride` search steps, from the segments that start on the
-    grid."""
+    grid. `chosen` is working memory for one state."""
+    table = outputs.table
     n, last = state.shape[1], first + len(out)
     for s in range(begin, size):
         if fraction[s] > 0.0:
@@ -56,7 +73,10 @@ def sample_segments(
             continue
         at, offset = mode[s] * n * _BLOCK, low * stride - step[s]
         if stride == 1:
-            product(table, at + offset, _BLOCK, high - low, state[s], out[low - first : high - first])
+            used = outputs.used[mode[s]]
+            for j in range(np.uint64(used)):
+                chosen[j] = state[s, outputs.order[mode[s], j]]
+            product(table, at + offset, _BLOCK, high - low, chosen[:used], out[low - first : high - first])
         else:
             for sample in range(low, high):
                 out[sample - first] = dot(table, at + (sample * stride - step[s]) * n, state[s])

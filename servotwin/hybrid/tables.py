@@ -1,9 +1,9 @@
 """The numbers that the kernel needs for one automaton and one search step, in flat arrays.
 
 Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every
-step, and a single step as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; the
-table's rows give that cubic's Bernstein coefficients, so "no coefficient above zero" means "the cubic does not leave
-the mode", and one product settles a whole block.
+step, and a single step as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; its
+Bernstein coefficients are the values and the values plus or minus a third of the slopes, so "no coefficient above zero"
+means "the cubic does not leave the mode", and one product settles a whole block.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class Tables(NamedTuple):
     target: NDArray[np.int64]  # (M, G)
     has_reset: NDArray[np.bool_]  # (M, G)
     reset: Array  # M * G * n * n, transposed: reset - I
-    coarse: Array  # M * n * padded(G * 49): Bernstein rows over 16 intervals of 8 steps
-    fine: Array  # M * n * padded(G * 25): the same over 8 intervals of one step
+    coarse: Array  # M * n * padded(G * 34): values, then thirds of the slopes, at 17 nodes 8 steps apart
+    fine: Array  # M * n * padded(G * 18): the same at 9 nodes one step apart
     taylor: Array  # M * G * n * TERMS
     jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # M * 8 * n * n, transposed
     jump_part: Array  # M * 32 * n * n, transposed: exp(A j step / 32) - I
     flow_part: Array  # M * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
-    single: Array  # M * n * (n + G * 4): the first of jump_fine beside the first interval's rows of fine
+    single: Array  # M * n * (n + G * 4): the first of jump_fine beside Bernstein rows over one step
     rows: Array  # M * G * n
     sizes: Array  # M * G * TERMS * n: sum over the orders of abs(taylor), those of each derivative's own series
     changes: Array  # M * G * n: the same without order 0, with a margin for rounding
@@ -77,8 +77,10 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
             target[m, g], rows[m, g] = guard.target, guard.row
             if guard.reset is not None:
                 has_reset[m, g], reset[m, g] = True, (np.asarray(guard.reset) - np.eye(n)).T
-    parts = zip(*(_mode_tables(automaton.flows[m], rows[m], step) for m in range(len(modes))), strict=True)
-    flat = [_aligned(np.array(part, dtype=float).ravel()) for part in parts]
+    parts = zip(
+        *(_mode_tables(automaton.flows[m], rows[m], step, len(modes[m].guards)) for m in range(len(modes))), strict=True
+    )
+    flat = [aligned(np.array(part, dtype=float).ravel()) for part in parts]
     coarse, fine, taylor, jump_coarse, jump_fine, jump_part, flow_part, single = flat
     orders = np.abs(taylor.reshape(len(modes), guards, n, TERMS))
     return Tables(
@@ -108,7 +110,7 @@ def _binomials() -> Array:
     return np.array([[float(comb(j, k)) for j in range(TERMS)] for k in range(TERMS)])
 
 
-def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
+def _mode_tables(flow: Array, rows: Array, step: float, count: int) -> tuple[Long, ...]:
     unit = expm1(flow, step)
     fine = powers(unit, NODES_FINE)
     coarse = powers(fine[-1], NODES_COARSE)
@@ -116,31 +118,33 @@ def _mode_tables(flow: Array, rows: Array, step: float) -> tuple[Long, ...]:
     taylor = np.array([taylor_rows(row, flow, step, TERMS).T for row in rows])
     slopes = rows @ flow
     return (
-        _bernstein_rows(rows, slopes * (NODES_FINE * step), coarse),
-        _bernstein_rows(rows, slopes * step, fine),
+        _node_rows(rows, slopes * (NODES_FINE * step), coarse, count),
+        _node_rows(rows, slopes * step, fine, count),
         taylor,
         coarse.transpose(0, 2, 1),
         fine.transpose(0, 2, 1),
         part.transpose(0, 2, 1),
         taylor_rows(np.eye(len(flow)), flow, step / PARTS, PART_TERMS + 1)[1:].reshape(-1, len(flow)).T,
-        np.hstack([unit.T, _bernstein_rows(rows, slopes * step, fine[:1])[:, : 4 * len(rows)]]),
+        np.hstack([unit.T, _step_rows(rows, slopes * step, unit)]),
     )
 
 
-def _bernstein_rows(rows: Array, slopes: Array, deviations: Long) -> Long:
-    """Bernstein rows of every guard over the intervals between nodes 0, 1, ... (`deviations`), ``(n, G * (3 * intervals
-    + 1))``."""
-    nodes = len(deviations) + 1
-    values = np.empty((len(rows), 3 * nodes - 2, rows.shape[1]), dtype=np.longdouble)
-    for node in range(nodes):
-        change = deviations[node - 1] if node else np.zeros_like(deviations[0])
-        value, third = rows + rows @ change, (slopes + slopes @ change) / 3
-        values[:, 3 * node] = value
-        if node < nodes - 1:
-            values[:, 3 * node + 1] = value + third
-        if node:
-            values[:, 3 * node - 1] = value - third
-    return _padded(values.reshape(-1, rows.shape[1]).T)
+def _node_rows(rows: Array, slopes: Array, deviations: Long, count: int) -> Long:
+    """Values, then thirds of the slopes, of the first `count` guards at nodes 0, 1, ... (`deviations`), padded to the
+    columns that all the guards need."""
+    node = np.concatenate([np.zeros((1, *deviations[0].shape), np.longdouble), deviations])
+    parts = [part[:count, None] + np.einsum("gi,kij->gkj", part[:count], node) for part in (rows, slopes / 3)]
+    table = np.concatenate(parts).reshape(-1, rows.shape[1]).T
+    result = np.zeros((len(table), padded(2 * len(rows) * len(node))), dtype=np.longdouble)
+    result[:, : table.shape[1]] = table
+    return result
+
+
+def _step_rows(rows: Array, slopes: Array, unit: Long) -> Long:
+    """Bernstein rows of every guard over one step, ``(n, G * 4)``."""
+    later, later_slopes = rows + rows @ unit, slopes + slopes @ unit
+    bernstein = [rows, rows + slopes / 3, later - later_slopes / 3, later]
+    return np.stack(bernstein, axis=1).reshape(-1, rows.shape[1]).T
 
 
 def padded(rows: int) -> int:
@@ -148,13 +152,7 @@ def padded(rows: int) -> int:
     return -(-rows // VECTOR) * VECTOR
 
 
-def _padded(table: Long) -> Long:
-    result = np.zeros((len(table), padded(table.shape[1])), dtype=np.longdouble)
-    result[:, : table.shape[1]] = table
-    return result
-
-
-def _aligned(flat: Array) -> Array:
+def aligned(flat: Array) -> Array:
     """A copy that starts on a cache line, so that no vector spans two."""
     room = np.empty(len(flat) + 8)
     start = -(room.ctypes.data // 8) % 8

@@ -14,7 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import FULL, ZENO, Record, follow_schedule, grown, new_record
-from servotwin.hybrid.output import evaluate, output_table, sample_segments
+from servotwin.hybrid.output import Outputs, evaluate, output_table, sample_segments
 from servotwin.hybrid.tables import Tables, build_tables, search_step
 
 # Jumps this close to a search step, in steps, are taken on it.
@@ -38,6 +38,13 @@ class Jump:
 def tables_for(automaton: Automaton, step: float) -> Tables:
     """Tables of an automaton at one search step; kept for the automata used last."""
     return build_tables(automaton, step)
+
+
+@lru_cache(maxsize=256)
+def outputs_for(automaton: Automaton, step: float, stride: int, rows: bytes) -> Outputs:
+    """The table of one output, its rows (M, n) as bytes; kept for the outputs used last."""
+    full = np.frombuffer(rows).reshape(automaton.flows.shape[:2])
+    return output_table(tables_for(automaton, step), full, stride)
 
 
 @dataclass
@@ -80,7 +87,6 @@ class Trajectory:
         self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
         self._at = np.array([0, self.mode, 0, 1], dtype=np.int64)
-        self._rows: dict[bytes, Array] = {}
         self._failure = ""
 
     @property
@@ -176,13 +182,15 @@ class Trajectory:
         stop = self.samples if last is None else last
         if not 0 <= first <= stop <= self.samples:
             raise InvalidInput(f"samples {first} .. {stop} are outside 0 .. {self.samples}")
-        table = self._output_table(rows)
+        outputs = self._outputs(rows)
         result = np.empty(stop - first) if out is None else out
         if result.shape != (stop - first,):
             raise InvalidInput(f"out has shape {result.shape}; it must be ({stop - first},)")
         r, size = self.record, int(self.record.size[0])
         begin = max(int(np.searchsorted(r.step[:size], first * self.divisor, side="left")) - 1, 0)
-        sample_segments(begin, size, r.step, r.fraction, r.mode, r.state, table, self.divisor, first, result)
+        sample_segments(
+            begin, size, r.step, r.fraction, r.mode, r.state, outputs, self.divisor, first, self._scratch.change, result
+        )
         return result
 
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
@@ -208,12 +216,9 @@ class Trajectory:
         )
         return result
 
-    def _output_table(self, rows: ArrayLike) -> Array:
-        full = np.ascontiguousarray(np.broadcast_to(rows, (len(self.automaton.modes), len(self.state))), dtype=float)
-        key = full.tobytes()
-        if key not in self._rows:
-            self._rows[key] = output_table(self.tables, full, self.divisor)
-        return self._rows[key]
+    def _outputs(self, rows: ArrayLike) -> Outputs:
+        full = np.broadcast_to(np.asarray(rows, dtype=float), self.automaton.flows.shape[:2])
+        return outputs_for(self.automaton, self.step, self.divisor, full.tobytes())
 
     @cached_property
     def labels(self) -> list[list[tuple[str, int]]]:
