@@ -141,9 +141,12 @@ def bench(
     from datetime import UTC, datetime
 
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    if workloads == ["estimator"]:
+    if workloads and "estimator" in workloads:
         from servotwin.bench.accuracy import accuracy
+        from servotwin.errors import InvalidInput
 
+        if len(workloads) > 1 or slow or runs is not None or reference is not None:
+            raise InvalidInput("bench estimator stands alone: of the options it takes --json and --quick only")
         accuracy(date, json, 0.02 if quick else 1.0)
         return
     from servotwin.bench.catalogue import Options

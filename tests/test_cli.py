@@ -131,3 +131,9 @@ def test_a_reproduction_can_be_interrupted(tmp_path):
     assert "Traceback" not in stderr
     assert not (tmp_path / "out" / "report.html").exists()
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_the_estimator_s_bench_takes_no_option_that_it_ignores():
+    for words in (["W1"], ["--runs", "3"], ["--slow"]):
+        result = run("bench", "estimator", *words)
+        assert result.exit_code == 2, words
