@@ -107,7 +107,9 @@ def run_ensemble(
 
     def work(part: slice) -> None:
         steps = (samples - 1) * divisor
-        _run_part(tables, starts[part], first_modes[part], steps, divisor, outputs, out[part], events[part])
+        run = _run_part(tables, starts[part], first_modes[part], steps, divisor, outputs, out[part], events[part])
+        if run < size and part.start + run < len(starts):
+            raise ZenoError(f"member {part.start + run} changes mode without end: the automaton is Zeno or slides")
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, parts))
@@ -123,16 +125,15 @@ def _run_part(
     outputs: Outputs,
     out: Array,
     events: NDArray[np.int64],
-) -> None:
+) -> int:
+    """Run the members of a part; return the one that cannot go on, their number when all are done."""
     record = new_record(states.shape[1])
     scratch, kept, member = new_scratch(tables), states.copy(), 0
     while True:
         status, member = run_members(
             tables, states, modes, member, steps, stride, outputs, out, events, record, scratch
         )
-        if status == DONE:
-            return
         if status != FULL:
-            raise ZenoError(f"member {member} changes mode without end: the automaton is Zeno or slides")
+            return int(member)
         record = grown(record)
         states[member] = kept[member]
