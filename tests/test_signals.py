@@ -127,7 +127,8 @@ def test_a_gap_that_goes_negative_is_refused_with_time_and_value() -> None:
 
 @given(st.floats(1e-6, 1.0), st.floats(1.0, 300.0))
 def test_a_gap_that_closes_is_not_refused_for_its_rounding(gap: float, duration: float) -> None:
-    as_nonnegative(SCurve(gap, 0.0, duration), 2.0 * duration)
+    closing = as_nonnegative(SCurve(gap, 0.0, duration), 2.0 * duration)
+    assert abs(closing.minimum(2.0 * duration)[1]) <= 1e-13 * gap
 
 
 def test_signals_are_values() -> None:

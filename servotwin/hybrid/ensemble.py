@@ -91,11 +91,7 @@ def run_ensemble(
     ZenoError
         Naming the member.
     """
-    starts, first_modes = np.array(states, dtype=float, ndmin=2), np.array(modes, dtype=np.int64, ndmin=1)
-    if starts.shape != (len(first_modes), len(automaton.names)):
-        raise InvalidInput(f"{starts.shape} states for {len(first_modes)} modes of {len(automaton.names)} states each")
-    if not (np.isfinite(starts).all() and np.isin(first_modes, np.arange(len(automaton.modes))).all()):
-        raise InvalidInput(f"states must be finite and modes one of 0 to {len(automaton.modes) - 1}")
+    starts, first_modes = _checked_starts(automaton, states, modes)
     step, divisor = search_step(automaton, sample_step)
     tables = tables_for(automaton, step)
     outputs = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
@@ -114,6 +110,15 @@ def run_ensemble(
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, parts))
     return out, events
+
+
+def _checked_starts(automaton: Automaton, states: ArrayLike, modes: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+    starts, first_modes = np.array(states, dtype=float, ndmin=2), np.array(modes, dtype=np.int64, ndmin=1)
+    if starts.shape != (len(first_modes), len(automaton.names)):
+        raise InvalidInput(f"{starts.shape} states for {len(first_modes)} modes of {len(automaton.names)} states each")
+    if not (np.isfinite(starts).all() and np.isin(first_modes, np.arange(len(automaton.modes))).all()):
+        raise InvalidInput(f"states must be finite and modes one of 0 to {len(automaton.modes) - 1}")
+    return starts, first_modes
 
 
 def _run_part(
