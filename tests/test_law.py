@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from servotwin.control import Controller, LawParameters, LawState, start, tick
+from servotwin.control import Controller, LawParameters, LawState, start, tick, transfer
 
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
 LIMITED = PAPER.replace(voltage_limit=4.0, rate_limit=1e3, loop_filter_hz=20.0, enter=0.6, leave=1.4)
@@ -134,6 +134,69 @@ def test_a_new_integral_gain_is_bumpless(ki: float, error: float) -> None:
     assert tick(PAPER.replace(Ki=ki).law(), state, error, 0.0).voltage == kept
 
 
+def test_the_feedforward_is_added_at_all_times_and_the_limits_act_on_the_sum() -> None:
+    law, plain = PAPER.replace(feedforward=0.25, voltage_limit=8.0).law(1e-3), PAPER.law(1e-3)
+    assert {state.voltage for state in run(law, [0.9e-3] * 20)} == {0.25}
+    assert run(law, [-2e-3])[0].voltage == run(plain, [-2e-3])[0].voltage + 0.25
+    assert run(law, [2e-2] * 2000)[-1].voltage == 8.0
+
+
+def test_the_offset_is_let_go_with_the_release_time() -> None:
+    law = PAPER.replace(release_time=0.25).law(1e-3)
+    states = run(law, [0.0] * 5000, start(0.0)._replace(offset=0.7))
+    assert states[0].voltage == 0.7
+    assert [s.voltage for s in states] == pytest.approx([0.7 * exp(-k / 5000.0 / 0.25) for k in range(5000)], rel=1e-11)
+
+
+_GAINS = st.tuples(st.floats(-5e3, 5e3), st.floats(-1e5, 1e5) | st.just(0.0), st.floats(-500.0, 500.0))
+
+
+@given(
+    gains=_GAINS,
+    tf=st.floats(0.01, 1.0),
+    feedforward=st.floats(-0.2, 0.2),
+    tolerances=st.tuples(st.floats(0.0, 3e-3), st.floats(0.0, 3e-3)),
+    inputs=st.tuples(st.floats(-5e-3, 5e-3), st.floats(-5e-3, 5e-3)),
+    limited=st.booleans(),
+)
+def test_a_swap_leaves_the_voltage_where_it_is(
+    gains: tuple[float, float, float],
+    tf: float,
+    feedforward: float,
+    tolerances: tuple[float, float],
+    inputs: tuple[float, float],
+    limited: bool,
+) -> None:
+    first = LIMITED if limited else PAPER
+    second = first.replace(**dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)), Tf=tf, feedforward=feedforward)
+    old, new = first.law(tolerances[0]), second.law(tolerances[1])
+    state = run(old, [1e-3, 2e-3, -1e-3] * 30)[-1]
+    moved = transfer(old, new, state, *inputs)
+    assert tick(new, moved, *inputs).voltage == pytest.approx(tick(old, state, *inputs).voltage, abs=1e-9)
+
+
+def test_a_swap_to_the_same_law_changes_nothing() -> None:
+    law = PAPER.law(1e-3)
+    state = run(law, [1e-3, 2e-3, 3e-4] * 30)[-1]._replace(offset=0.3)
+    moved = transfer(law, law, state, 2e-3, 1e-3)
+    assert moved._replace(offset=0.3) == state
+    assert moved.offset == pytest.approx(0.3, abs=1e-13)
+
+
+def test_what_the_old_law_wanted_beyond_the_limit_is_forgotten() -> None:
+    old, new = PAPER.replace(voltage_limit=4.0).law(), PAPER.replace(Kp=100.0, Ki=0.0, Kd=0.0, voltage_limit=4.0).law()
+    moved = transfer(old, new, run(old, [0.1] * 10)[-1], 0.1, 0.0)
+    assert moved.offset == pytest.approx(4.0 - 10.0, rel=1e-12)
+
+
+def test_without_integral_action_what_the_integral_held_is_let_go() -> None:
+    old, new = PAPER.law(), PAPER.replace(Ki=0.0, release_time=0.2).law()
+    state = run(old, [1e-3] * 500)[-1]
+    moved = transfer(old, new, state, 0.0, 0.0)
+    assert (moved.integral, moved.offset) == (0.0, pytest.approx(state.integral, rel=1e-12))
+    assert run(new, [0.0] * 20_000, moved)[-1].voltage == pytest.approx(0.0, abs=1e-8)
+
+
 @given(power=st.integers(-40, 40), seed=st.integers(0, 10))
 def test_homogeneous_bit_for_bit(power: int, seed: int) -> None:
     rng, scale = random.Random(seed), 2.0**power
@@ -150,7 +213,7 @@ def _compiled_run(parameters: Any, state: Any, references: Any, measurements: An
     for k in range(len(references)):
         state = _compiled_tick(parameters, state, references[k], measurements[k])
         out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
-        out[k, 3], out[k, 4] = state.voltage, state.active
+        out[k, 3], out[k, 4], out[k, 5] = state.voltage, state.active, state.offset
 
 
 def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -161,13 +224,19 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
     return reference, lag + rng.normal(0.0, 3e-4, samples)
 
 
-@pytest.mark.parametrize("controller", [PAPER, LIMITED], ids=["paper", "limits, hysteresis, filter"])
+BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
+
+
+@pytest.mark.parametrize(
+    "controller", [PAPER, LIMITED, BIASED], ids=["paper", "limits, hysteresis, filter", "offset, feedforward"]
+)
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
     law, samples = controller.law(1e-3), 1_000_000
     reference, measurement = _signals(samples)
-    compiled = np.empty((samples, 5))
-    numba.njit(_compiled_run)(law, start(0.0), reference, measurement, compiled)
-    state, interpreted = start(0.0), array("d")
+    compiled = np.empty((samples, 6))
+    first = start(0.0)._replace(offset=2.3)
+    numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
+    state, interpreted = first, array("d")
     for r, y in zip(reference.tolist(), measurement.tolist(), strict=True):
         state = tick(law, state, r, y)
         interpreted.extend(state)

@@ -32,6 +32,10 @@ class Controller:
         Hz; None: the law runs in continuous time.
     tracking_time : float, optional
         Time constant of the back-calculation, s; None: see `tracking`.
+    feedforward : float
+        V, added to the voltage at all times, inside the dead zone too: it cancels a bias of the plant's input.
+    release_time : float
+        s, time constant with which the voltage that a change of parameters left over (`LawState.offset`) is let go.
 
     Raises
     ------
@@ -50,11 +54,13 @@ class Controller:
     rate_limit: float | None = None
     sample_rate: float | None = None
     tracking_time: float | None = None
+    feedforward: float = 0.0
+    release_time: float = 0.5
 
     def __post_init__(self) -> None:
         for field in fields(self):
             _check_number(field.name, getattr(self, field.name))
-        for name in ("Tf", *_OPTIONAL):
+        for name in ("Tf", "release_time", *_OPTIONAL):
             _check_positive(name, getattr(self, name))
         if self.enter < 0.0:
             raise InvalidInput(f"controller enter = {self.enter!r} tolerances: must be at least 0")
@@ -116,6 +122,8 @@ class Controller:
             rate_step=inf if self.rate_limit is None else self.rate_limit / self.sample_rate,
             loop_step=1.0 if self.loop_filter_hz is None else -expm1(-2.0 * pi * self.loop_filter_hz * step),
             tracking_step=step / max(step, self.tracking),
+            feedforward=float(self.feedforward),
+            release_step=-expm1(-step / self.release_time),
         )
 
 

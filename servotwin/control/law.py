@@ -5,6 +5,7 @@ bits. So it keeps to what every back end computes alike: additions, products, co
 `Controller.law`, which prepares the parameters.
 """
 
+from math import inf
 from typing import NamedTuple
 
 
@@ -31,6 +32,10 @@ class LawParameters(NamedTuple):
         1 - exp(-2 pi f Ts) of the loop filter; 1.0: no filter.
     tracking_step : float
         Ts / Tt of the back-calculation, at most 1.
+    feedforward : float
+        Always added to the voltage, V.
+    release_step : float
+        1 - exp(-Ts / release time) of `LawState.offset`.
     """
 
     Kp: float
@@ -43,6 +48,8 @@ class LawParameters(NamedTuple):
     rate_step: float
     loop_step: float
     tracking_step: float
+    feedforward: float = 0.0
+    release_step: float = 1.0
 
 
 class LawState(NamedTuple):
@@ -60,6 +67,9 @@ class LawState(NamedTuple):
         What was applied at the last tick, V.
     active : float
         1.0: the loop is closed; 0.0: the error is inside the dead zone.
+    offset : float
+        What a change of parameters left over, V: added to the voltage, inside the dead zone too, and let go
+        exponentially.
     """
 
     integral: float
@@ -67,11 +77,12 @@ class LawState(NamedTuple):
     filtered: float
     voltage: float
     active: float
+    offset: float = 0.0
 
 
 def start(measurement: float) -> LawState:
     """State at rest at `measurement` (m), the loop closed."""
-    return LawState(0.0, 0.0, measurement, 0.0, 1.0)
+    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0)
 
 
 def tick(parameters: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
@@ -91,8 +102,9 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
 
     Notes
     -----
-    Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and the voltage is zero
-    (decision E16). With limits off the voltage equals the continuous PIDF's driven by the held error.
+    Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and it gives no voltage
+    (decision E16): what is left is the feedforward and the offset. With limits off the voltage equals the continuous
+    PIDF's driven by the held error. The limits act on the sum.
     """
     filtered = measurement + (1.0 - parameters.loop_step) * (state.filtered - measurement)
     error = reference - filtered
@@ -105,7 +117,8 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
         active = 1.0
     driven = error * active
     slope = driven - state.derivative
-    wanted = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * active
+    pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * active
+    wanted = pidf + (parameters.feedforward + state.offset)
     voltage = wanted
     if voltage > parameters.voltage_limit:
         voltage = parameters.voltage_limit
@@ -118,4 +131,35 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     correction = parameters.tracking_step * (voltage - wanted) * active
     integral = state.integral + parameters.integral_step * driven + correction
     derivative = state.derivative + parameters.filter_step * slope
-    return LawState(integral, derivative, filtered, voltage, active)
+    offset = state.offset * (1.0 - parameters.release_step)
+    return LawState(integral, derivative, filtered, voltage, active, offset)
+
+
+def transfer(old: LawParameters, new: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
+    """The state with which the next tick of `new` gives the voltage that `old` would have given.
+
+    Parameters
+    ----------
+    old, new : LawParameters
+        The law so far and the law to come, equally limited.
+    state : LawState
+        After the last tick of `old`.
+    reference, measurement : float
+        Inputs of the tick that is due, m.
+
+    Returns
+    -------
+    LawState
+        For the first tick of `new`. The difference between the two laws is in the offset and fades with it; what the
+        old one wanted beyond its limits is forgotten.
+
+    Notes
+    -----
+    The integral is kept in volts. A law without integral action neither changes nor corrects it, so there it would stay
+    as a bias for ever: its part goes into the offset too.
+    """
+    kept = tick(old, state, reference, measurement).voltage
+    integral = state.integral if new.integral_step != 0.0 else 0.0
+    moved = state._replace(integral=integral, offset=0.0)
+    unlimited = new._replace(voltage_limit=inf, rate_step=inf)
+    return moved._replace(offset=kept - tick(unlimited, moved, reference, measurement).voltage)

@@ -24,7 +24,7 @@ def sampled_poles(servo: Servo, controller: Controller) -> Complex:
     if controller.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
     plant = linear.plant(servo)
-    law = controller.replace(voltage_limit=None, rate_limit=None).law(None)
+    law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)
     advance, drive = held(plant.A, plant.B, 1.0 / controller.sample_rate)
     size = plant.B.size
     names = ["derivative"] + ["integral"] * (controller.Ki != 0.0) + ["filtered"] * (law.loop_step < 1.0)

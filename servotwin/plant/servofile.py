@@ -47,6 +47,14 @@ def _multiple(table: Table, key: str) -> Any:
     return table.number(key, 1.0, minimum=0.0)
 
 
+def _voltage(table: Table, key: str) -> Any:
+    return table.number(key, 0.0)
+
+
+def _release(table: Table, key: str) -> Any:
+    return table.number(key, 0.5, positive=True)
+
+
 def _count(table: Table, key: str) -> Any:
     return table.integer(key, minimum=2)
 
@@ -78,6 +86,8 @@ CONTROLLER = (
     Key("controller", "rate_limit_v_per_s", "rate_limit", _positive_or_none),
     Key("controller", "sample_rate_hz", "sample_rate", _positive_or_none),
     Key("controller", "tracking_time_s", "tracking_time", _positive_or_none),
+    Key("controller", "feedforward_v", "feedforward", _voltage),
+    Key("controller", "release_time_s", "release_time", _release),
 )
 
 

@@ -69,6 +69,8 @@ def take_tick(
         parameters.rate_step,
         parameters.loop_step,
         parameters.tracking_step,
+        parameters.feedforward,
+        parameters.release_step,
     )
     state = tick(now, state, drive.reference[k], y)
     x[port.voltage] = state.voltage
