@@ -9,7 +9,7 @@ from servotwin.hybrid.ensemble import run_ensemble
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.servo import Servo
 from servotwin.simulation import simulate
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.simulation.ensemble import simulate_ensemble, simulate_members
 
 DEGREE = np.pi / 180.0
 TABLE1 = Servo.preset("table1")
@@ -25,6 +25,30 @@ def test_members_are_runs() -> None:
             options = {"reference": 1e-3, "gap": gap, "tolerance": tolerance, "theta_d0": 0.02}
             alone = simulate(TABLE1, 20.0, sample_rate=100.0, **options).position
             assert np.abs(members[i, j] - alone).max() < 1e-12, (gap, tolerance)
+
+
+def test_members_with_servos_and_controllers_of_their_own_are_runs() -> None:
+    paper, rng = Servo.preset("paper"), np.random.default_rng(3)
+    servos = [paper.replace(k=1e4 * rng.uniform(0.85, 1.15), c=36.9 * rng.uniform(0.5, 1.5)) for _ in range(2)]
+    laws = [paper.controller, paper.controller.replace(Ki=0.0)]
+    gaps, tolerances = np.array([3.0, 12.0]) * DEGREE, [0.0, paper.tolerance_for(10.0 * DEGREE)]
+    outputs = simulate_members(
+        np.array(servos)[:, None, None, None],
+        np.array(laws)[:, None, None],
+        5.0,
+        reference=1e-3,
+        gap=gaps[:, None],
+        tolerance=tolerances,
+        outputs=("voltage", "theta_m", "position"),
+    )
+    assert {values.shape for values in outputs.values()} == {(2, 2, 2, 2, 501)}
+    for at in np.ndindex(2, 2, 2, 2):
+        servo, law, gap, tolerance = (v[i] for v, i in zip((servos, laws, gaps.tolist(), tolerances), at, strict=True))
+        options = {"reference": 1e-3, "gap": gap, "tolerance": tolerance or None, "controller": law}
+        alone = simulate(servo, 5.0, sample_rate=100.0, **options)
+        for name, values in outputs.items():
+            expected = getattr(alone, name)
+            assert np.abs(values[at] - expected).max() < 1e-9 * np.abs(expected).max(), (at, name)
 
 
 def test_threads_change_no_bit() -> None:

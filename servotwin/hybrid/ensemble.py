@@ -47,9 +47,11 @@ def run_members(
         modes[k] = mode
         events[k] = record.size[1]
         size = record.size[0]
-        sample_segments(
-            0, size, record.step, record.fraction, record.mode, record.state, outputs, stride, 0, scratch.change, out[k]
-        )
+        for o in range(len(out[k])):
+            one, row = Outputs(outputs.table[o], outputs.order[o], outputs.used[o]), out[k, o]
+            sample_segments(
+                0, size, record.step, record.fraction, record.mode, record.state, one, stride, 0, scratch.change, row
+            )
     return DONE, len(states)
 
 
@@ -62,7 +64,7 @@ def run_ensemble(
     rows: ArrayLike,
     threads: int | None = None,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """One output of every member at every sample.
+    """Outputs of every member at every sample.
 
     Parameters
     ----------
@@ -75,14 +77,14 @@ def run_ensemble(
         s.
     samples : int
         Samples per member, that of time 0 included.
-    rows : (n,) or (M, n) array
-        The output ``rows[mode] @ x``.
+    rows : (n,), (M, n) or (O, M, n) array
+        The output ``rows[mode] @ x``, or several of them.
     threads : int, optional
         As many as there are processors by default.
 
     Returns
     -------
-    output : (K, samples) array
+    output : (K, samples) or (K, O, samples) array
     events : (K,) array
         Events of each member.
 
@@ -94,8 +96,8 @@ def run_ensemble(
     starts, first_modes = _checked_starts(automaton, states, modes)
     step, divisor = search_step(automaton, sample_step)
     tables = tables_for(automaton, step)
-    outputs = output_table(tables, np.array(np.broadcast_to(rows, automaton.flows.shape[:2]), dtype=float), divisor)
-    out, events = np.empty((len(starts), samples)), np.zeros(len(starts), dtype=np.int64)
+    outputs = _output_tables(automaton, tables, rows, divisor)
+    out, events = np.empty((len(starts), len(outputs.table), samples)), np.zeros(len(starts), dtype=np.int64)
     workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
     # Members cost unequally: many small parts keep every worker busy to the end.
     size = max(1, len(starts) // (_PARTS_PER_WORKER * workers))
@@ -109,7 +111,14 @@ def run_ensemble(
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, parts))
-    return out, events
+    return (out if np.ndim(rows) == 3 else out[:, 0]), events
+
+
+def _output_tables(automaton: Automaton, tables: Tables, rows: ArrayLike, divisor: int) -> Outputs:
+    """The tables of every output, one above the other."""
+    full = np.array(np.broadcast_to(rows, (*np.shape(rows)[:-2], *automaton.flows.shape[:2])), dtype=float, ndmin=3)
+    parts = zip(*(output_table(tables, one, divisor) for one in full), strict=True)
+    return Outputs(*(np.stack(part) for part in parts))
 
 
 def _checked_starts(automaton: Automaton, states: ArrayLike, modes: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
