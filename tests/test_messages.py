@@ -14,7 +14,11 @@ from hypothesis import strategies as st
 from servotwin import messages
 from servotwin.messages import (
     Acknowledge,
+    Band,
+    Cause,
     Channel,
+    Fallback,
+    Gains,
     Hello,
     InvalidMessage,
     Message,
@@ -23,6 +27,7 @@ from servotwin.messages import (
     Update,
     Window,
     checksum,
+    codec,
     decode,
     decode_json,
     encode,
@@ -48,14 +53,18 @@ UPDATE = Update("axis-1", 3, 2, ("b0", 4), 20.0, 0.1, 0.01, (0.08, None), "OK", 
 RECEIPT = Receipt("axis-1", 3, True, 110_000, Reason.APPLIED, 3, "b0")
 HELLO = Hello("axis-1", "b0", 0.0, 5000.0, 0, 0.0, "paper")
 ACKNOWLEDGE = Acknowledge("axis-1", "b0", 4)
+GAINS = Gains(1377.7, 0.0, -135.1, 0.1, 0.5, 1.5, -0.03)
+FULL_UPDATE = msgspec.structs.replace(UPDATE, controller=GAINS, band=Band(5e-5, 2e-5, 0.1, 2.0))
+FALLBACK = Fallback("axis-1", "b0", 110_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 3, 4, 0.0, GAINS)
+MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE]
 
 
-@pytest.mark.parametrize("message", [window(), UPDATE, RECEIPT, HELLO, ACKNOWLEDGE])
+@pytest.mark.parametrize("message", MESSAGES)
 def test_messages_survive_the_bytes(message: Message) -> None:
     assert decode(encode(message)) == message
 
 
-@pytest.mark.parametrize("message", [UPDATE, RECEIPT, HELLO, ACKNOWLEDGE])
+@pytest.mark.parametrize("message", MESSAGES[1:])
 def test_parameter_messages_are_json_too(message: Any) -> None:
     text = encode_json(message)
     assert decode_json(text) == message
@@ -130,7 +139,7 @@ class Damage:
 DAMAGE = st.builds(Damage, st.floats(0, 1, exclude_max=True), st.integers(0, 255), st.integers(0, 3))
 
 
-@given(st.sampled_from([window(), UPDATE, RECEIPT, HELLO, ACKNOWLEDGE]), st.lists(DAMAGE, min_size=1, max_size=6))
+@given(st.sampled_from(MESSAGES), st.lists(DAMAGE, min_size=1, max_size=6))
 def test_damaged_messages_decode_or_are_refused(message: Message, damages: list[Damage]) -> None:
     for encoder, decoder in ((encode, decode), (msgspec.json.encode, decode_json)):
         data = bytearray(encoder(message))
@@ -167,7 +176,7 @@ def test_deep_nesting_in_an_ignored_field_is_refused() -> None:
 
 
 def test_size_is_limited_before_parsing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(messages, "_decoder", None)
+    monkeypatch.setattr(codec, "_decoder", None)
     with pytest.raises(InvalidMessage, match="at most 10 are allowed"):
         decode(b"x" * 11, limit=10)
 
@@ -233,6 +242,35 @@ def test_fields_out_of_range_are_refused(changes: dict[str, Any]) -> None:
 def test_updates_carry_finite_numbers_or_none(changes: dict[str, Any]) -> None:
     with pytest.raises(InvalidMessage):
         msgspec.structs.replace(UPDATE, **changes)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes"),
+    [
+        ("controller", {"Kp": math.nan}),
+        ("controller", {"Ki": math.inf}),
+        ("controller", {"Tf": 0.0}),
+        ("controller", {"enter": -0.1}),
+        ("controller", {"enter": 2.0}),
+        ("controller", {"feedforward": math.inf}),
+        ("band", {"error": -1e-9}),
+        ("band", {"error_rms": math.nan}),
+        ("band", {"effort": math.inf}),
+        ("band", {"settling": -1.0}),
+    ],
+)
+def test_gains_and_bands_are_in_range_or_refused(part: str, changes: dict[str, float]) -> None:
+    """Made here or decoded: what a constructor refuses is refused from the wire too."""
+    with pytest.raises(InvalidMessage):
+        msgspec.structs.replace(getattr(FULL_UPDATE, part), **changes)
+    raw = msgspec.msgpack.decode(encode(FULL_UPDATE))
+    raw[part].update(changes)
+    with pytest.raises(InvalidMessage, match=part if part == "band" else "gains"):
+        decode(msgspec.msgpack.encode(raw))
+
+
+def test_an_update_without_gains_and_band_does_not_mention_them() -> None:
+    assert set(msgspec.msgpack.decode(encode(UPDATE))) == {"type", *UPDATE.__struct_fields__} - {"controller", "band"}
 
 
 def test_an_unknown_schema_version_is_named() -> None:

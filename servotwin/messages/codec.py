@@ -1,0 +1,65 @@
+"""Messages to bytes and back, with every way in which bytes can be wrong turned into InvalidMessage."""
+
+from typing import TypeVar
+
+import msgspec
+
+from servotwin.messages.channels import checksum
+from servotwin.messages.checks import InvalidMessage, require
+from servotwin.messages.updates import Fallback, Receipt, Update
+from servotwin.messages.windows import Acknowledge, Hello, Window
+
+MAX_BYTES = 4 * 1024 * 1024
+"""Largest message that is looked at: 1 s of four channels at 5 kHz takes 40 kB."""
+
+ParameterMessage = Update | Receipt | Fallback | Hello | Acknowledge
+Message = Window | ParameterMessage
+_Decoded = TypeVar("_Decoded")
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
+_json_encoder = msgspec.json.Encoder()
+_json_decoder: msgspec.json.Decoder[ParameterMessage] = msgspec.json.Decoder(ParameterMessage)
+
+
+def encode(message: Message) -> bytes:
+    """The bytes that are sent (MessagePack)."""
+    return _encoder.encode(message)
+
+
+def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
+    """The message in these bytes.
+
+    Raises
+    ------
+    InvalidMessage
+        Too large (seen before anything is parsed), not MessagePack, unknown tag, bad field, wrong checksum.
+    """
+    message = _guarded(_decoder, data, limit)
+    if isinstance(message, Window):
+        require(message.crc == checksum(message.channels), "window checksum does not match its channels")
+    return message
+
+
+def encode_json(message: ParameterMessage) -> bytes:
+    """A parameter message as JSON."""
+    return _json_encoder.encode(message)
+
+
+def decode_json(data: bytes, limit: int = MAX_BYTES) -> ParameterMessage:
+    """The parameter message in this JSON text; raises InvalidMessage as `decode` does."""
+    return _guarded(_json_decoder, data, limit)
+
+
+def _guarded(
+    decoder: "msgspec.msgpack.Decoder[_Decoded] | msgspec.json.Decoder[_Decoded]", data: bytes, limit: int
+) -> _Decoded:
+    """Decode, with every way in which bytes can be wrong turned into InvalidMessage."""
+    require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed")
+    try:
+        return decoder.decode(data)
+    except InvalidMessage:
+        raise
+    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
+        raise InvalidMessage(f"message not understood: {error}") from None

@@ -1,0 +1,87 @@
+"""To the twin: windows and hellos; back: acknowledgements."""
+
+from math import isfinite
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from servotwin.messages.channels import Channel
+from servotwin.messages.checks import Count, Name, Text, all_finite, require
+
+
+class Window(Struct, frozen=True, tag="window/1"):
+    """A stretch of recorded samples, known by (servo, boot, sequence).
+
+    Attributes
+    ----------
+    start : float
+        Sample time of the first sample, s since the edge's boot.
+    rate : float
+        Hz.
+    channels : tuple of Channel
+        Equally long, names unique.
+    reference_changes : tuple of (float, float)
+        (sample time in s, new value in m) of changes inside the window.
+    parameter_version : int
+        In force when the window was cut.
+    model_version, reason : str
+        Which description of the servo the edge runs on; why the window was sent.
+    crc : int
+        `checksum(channels)`.
+    """
+
+    servo: Name
+    boot: Name
+    sequence: Count
+    start: float
+    rate: float
+    channels: Annotated[tuple[Channel, ...], Meta(min_length=1, max_length=32)]
+    reference_changes: Annotated[tuple[tuple[float, float], ...], Meta(max_length=4096)]
+    parameter_version: Count
+    model_version: Text
+    reason: Text
+    crc: Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+
+    def __post_init__(self) -> None:
+        require(isfinite(self.start), f"window start {self.start} s is not finite")
+        require(isfinite(self.rate) and self.rate > 0.0, f"window rate {self.rate} Hz is not positive")
+        require(all_finite(x for change in self.reference_changes for x in change), "a reference change is not finite")
+        require(len({c.samples for c in self.channels}) == 1, "window channels differ in length")
+        require(len({c.name for c in self.channels}) == len(self.channels), "window channel names repeat")
+
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """(servo, boot, sequence), unique for ever."""
+        return self.servo, self.boot, self.sequence
+
+    @property
+    def samples(self) -> int:
+        """Samples per channel."""
+        return self.channels[0].samples
+
+    def channel(self, name: str) -> Channel | None:
+        """The channel of that name, if it was recorded."""
+        return next((channel for channel in self.channels if channel.name == name), None)
+
+
+class Hello(Struct, frozen=True, tag="hello/1"):
+    """The edge introduces itself after a start or a reconnection; time is its sample time, s."""
+
+    servo: Name
+    boot: Name
+    time: float
+    rate: float
+    parameter_version: Count
+    tolerance: float
+    model_version: Text
+
+    def __post_init__(self) -> None:
+        require(all_finite((self.time, self.rate, self.tolerance)), "hello time, rate and tolerance must be finite")
+
+
+class Acknowledge(Struct, frozen=True, tag="ack/1"):
+    """The twin has this window safe; the edge may forget it."""
+
+    servo: Name
+    boot: Name
+    sequence: Count
