@@ -62,6 +62,8 @@ class Trajectory:
         Spacing of the samples in seconds. The search for events has a step of its own, set by the fastest eigenvalue.
     refine : int
         Divide the search step further (to check that nothing is missed).
+    first : int
+        The sample at which the start is; times and samples count from sample 0.
     """
 
     automaton: Automaton
@@ -69,6 +71,7 @@ class Trajectory:
     mode: int
     sample_step: float
     refine: int = 1
+    first: int = 0
     step: float = field(init=False)
     divisor: int = field(init=False)
     tables: Tables = field(init=False, repr=False)
@@ -86,7 +89,7 @@ class Trajectory:
         self.record = new_record(len(self.state))
         self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
-        self._at = np.array([0, self.mode, 0, 1], dtype=np.int64)
+        self._at = np.array([self.first * self.divisor, self.mode, 0, 1], dtype=np.int64)
         self._failure = ""
 
     @property
@@ -180,8 +183,8 @@ class Trajectory:
         (last - first,) array
         """
         stop = self.samples if last is None else last
-        if not 0 <= first <= stop <= self.samples:
-            raise InvalidInput(f"samples {first} .. {stop} are outside 0 .. {self.samples}")
+        if not self.first <= first <= stop <= self.samples:
+            raise InvalidInput(f"samples {first} .. {stop} are outside {self.first} .. {self.samples}")
         outputs = self._outputs(rows)
         result = np.empty(stop - first) if out is None else out
         if result.shape != (stop - first,):
@@ -196,8 +199,11 @@ class Trajectory:
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
         """The same output at any times within the run, right-continuous; ``(len(times),)``."""
         places = np.asarray(times, dtype=float) / self.step
-        if not np.all((places >= 0.0) & (places <= self._at[0] + self._place[0] + ON_GRID)):
-            raise InvalidInput(f"some of the times are outside 0 .. {self.time:.9g} s, the run so far")
+        begin = self.first * self.divisor
+        if not np.all((places >= begin) & (places <= self._at[0] + self._place[0] + ON_GRID)):
+            raise InvalidInput(
+                f"some of the times are outside {begin * self.step:.9g} .. {self.time:.9g} s, the run so far"
+            )
         r, size = self.record, int(self.record.size[0])
         starts = r.step[:size] + r.fraction[:size]
         segments = np.maximum(np.searchsorted(starts, places, side="right") - 1, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,23 +35,33 @@ class ContinuousEngine:
         if self.controller.rate_limit is not None:
             raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
         signals = {name: self._signal(name) for name in INPUTS}
-        reference, gap, tolerance = (degree(pieces) for pieces in signals.values())
-        shape = Shape(reference, gap, tolerance, self.inputs.tolerance is not None, self.noise is not None)
-        self.loop = continuous_loop(self.servo, self.controller, shape)
+        self.loop = continuous_loop(self.servo, self.controller, self._shape(self.controller))
         state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
                 state[index] = value
+        constants = {"input bias": self.inputs.input_bias, "friction": self.inputs.friction}
+        set_states(self.loop, state, constants | controller_constants(self.controller))
         if self.noise is not None:
-            state[self.loop.automaton.index("noise")] = self.noise.block(1)[0]
-        if self.controller.voltage_limit is not None:
-            state[self.loop.automaton.index("voltage limit")] = self.controller.voltage_limit
-        if self.controller.loop_filter_hz is not None:
-            state[self.loop.automaton.index("filtered")] = self.loop.rows["measured_position"][0] @ state
+            set_states(self.loop, state, {"noise": self.noise.block(1)[0]})
+        set_states(self.loop, state, {"filtered": self.loop.rows["measured_position"][0] @ state})
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
-        mode = self.loop.mode(start_zone(error, enter) if shape.dead_zone else "on")
+        mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
         self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
+
+    def _shape(self, controller: Controller) -> Shape:
+        reference, gap, tolerance = (degree(self._signal(name)) for name in INPUTS)
+        return Shape(
+            reference,
+            gap,
+            tolerance,
+            dead_zone=self.inputs.tolerance is not None,
+            noise=self.noise is not None,
+            bias=self.inputs.input_bias != 0.0,
+            friction=self.inputs.friction != 0.0,
+            feedforward=controller.feedforward != 0.0,
+        )
 
     def _signal(self, name: str) -> PiecewiseCubic:
         pieces: PiecewiseCubic | None = getattr(self.inputs, name)
@@ -108,6 +119,19 @@ def start_zone(error: float, enter: float) -> str:
     if abs(error) <= enter:
         return "inside"
     return "+" if error > 0.0 else "-"
+
+
+def controller_constants(controller: Controller) -> dict[str, float]:
+    """States that hold numbers of the controller."""
+    limit = {} if controller.voltage_limit is None else {"voltage limit": controller.voltage_limit}
+    return {"feedforward": controller.feedforward, **limit}
+
+
+def set_states(loop: ServoAutomaton, state: Array, values: Mapping[str, float]) -> None:
+    """Set those of the named states that the automaton has."""
+    for name, value in values.items():
+        if name in loop.automaton.names:
+            state[loop.automaton.index(name)] = value
 
 
 def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:

@@ -16,12 +16,15 @@ EVENT_TYPE = np.dtype([("time", float), ("kind", "U10"), ("side", np.int8), ("st
 
 @dataclass
 class Inputs:
-    """The inputs of a run as piecewise cubics, and the rate of its samples."""
+    """The inputs of a run as piecewise cubics, the rate of its samples, and what disturbs the plant all along (V
+    behind the controller, N m on the motor's shaft)."""
 
     reference: PiecewiseCubic
     gap: PiecewiseCubic
     tolerance: PiecewiseCubic | None
     sample_rate: float
+    input_bias: float = 0.0
+    friction: float = 0.0
 
     def times(self, first: int, last: int) -> Array:
         """Times of samples first .. last - 1, s."""
@@ -103,7 +106,7 @@ class Run:
 
     @property
     def voltage(self) -> Array:
-        """Voltage applied, V."""
+        """Voltage of the controller, V; an input bias comes on top of it."""
         return self._column("voltage")
 
     @property
@@ -132,6 +135,7 @@ class Run:
         """Table of (time s, kind, side, state_triggered), in time order.
 
         Kinds: contact and release of the backlash (with an elastic screw also hold: the motor stops at the flank),
+        stick and slip of the motor under friction (side: its direction; a reversal without a stop is both at once),
         enter and leave of the dead zone, saturate (side 0: ends; continuous law only), reference and parameter (jumps
         of the inputs). `state_triggered` is false for those two and for what they flip at once.
         """

@@ -28,7 +28,7 @@ from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, t
 from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.simulation.continuous import at_zero, plant_start
+from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.run import Inputs, quantised
 from servotwin.simulation.ticks import Drive, Output, Port, run_ticks, tick_and_record
 
@@ -52,12 +52,14 @@ class SampledEngine:
         assert self.controller.sample_rate is not None
         self.tick_every, self.record_every = _divide(self.controller.sample_rate, self.inputs.sample_rate)
         self.rate = self.inputs.sample_rate * self.record_every
-        self.plant = sampled_plant(self.servo, degree(self.inputs.gap))
+        bias, friction = self.inputs.input_bias, self.inputs.friction
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias != 0.0, friction != 0.0)
         step, searches = search_step(self.plant.automaton, 1.0 / self.rate)
         self.step, self.tables = step, tables_for(self.plant.automaton, step)
         self.state = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             self.state[index] = value
+        set_states(self.plant, self.state, {"input bias": bias, "friction": friction})
         self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
@@ -169,7 +171,7 @@ class SampledEngine:
 
     def _check(self, status: int) -> None:
         if status == ZENO:
-            raise ZenoError(f"the backlash changes mode without end at t = {self.base / self.rate:.9g} s")
+            raise ZenoError(f"the plant changes mode without end at t = {self.base / self.rate:.9g} s")
         if status == FULL:
             self.record = grown(self.record)
             room = len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE

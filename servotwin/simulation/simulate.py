@@ -55,11 +55,15 @@ class Simulation:
         On the measured position; a continuous controller sees it held from sample to sample.
     seed : int
         Of the noise.
+    input_bias : float
+        V, added to the voltage behind the controller and its limits.
+    friction : float
+        N m, Coulomb's on the motor's shaft, which sticks and slips; needs a rigid screw.
 
     Raises
     ------
     InvalidInput
-        For a negative gap or tolerance, or rates that do not divide one another.
+        For a negative gap, tolerance or friction, or rates that do not divide one another.
     """
 
     def __init__(
@@ -74,8 +78,11 @@ class Simulation:
         sample_rate: float = SAMPLE_RATE,
         noise: Noise | None = None,
         seed: int | np.random.Generator = 0,
+        input_bias: float = 0.0,
+        friction: float = 0.0,
     ) -> None:
         _check_times(duration, sample_rate)
+        _check_disturbances(input_bias, friction)
         self.servo = servo
         self.controller = servo.controller if controller is None else controller
         self.samples = round(duration * sample_rate) + 1
@@ -84,6 +91,8 @@ class Simulation:
             as_nonnegative(gap, duration, "gap", "rad"),
             None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
             sample_rate,
+            float(input_bias),
+            float(friction),
         )
         rng = np.random.default_rng(seed)
         self.engine: Engine
@@ -167,3 +176,10 @@ def _check_times(duration: float, sample_rate: float) -> None:
         raise InvalidInput(f"duration = {duration} s: must be positive and finite")
     if not (np.isfinite(sample_rate) and sample_rate > 0.0):
         raise InvalidInput(f"sample_rate = {sample_rate} Hz: must be positive and finite")
+
+
+def _check_disturbances(input_bias: float, friction: float) -> None:
+    if not np.isfinite(input_bias):
+        raise InvalidInput(f"input_bias = {input_bias} V: must be finite")
+    if not (np.isfinite(friction) and friction >= 0.0):
+        raise InvalidInput(f"friction = {friction} N m: must be finite and 0 or more")

@@ -1,0 +1,48 @@
+"""Names of the states of the servo's automaton, and the rows that pick them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+
+class Basis:
+    """The states by name."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        # Spare states that never move: the kernel's products run over whole vectors of the machine.
+        self.names = (*names, *(f"spare{i}" for i in range(-len(names) % 4)))
+
+    def __getitem__(self, name: str) -> int:
+        return self.names.index(name)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def row(self, name: str) -> Array:
+        """The row that picks a state; zero when there is no such state."""
+        row = np.zeros(len(self.names))
+        if name in self.names:
+            row[self[name]] = 1.0
+        return row
+
+    def positions(self, servo: Servo) -> Array:
+        """(n, states) rows of the masses' positions."""
+        chain = servo.chain()
+        first = self["chain0"]
+        rows = np.zeros((servo.n, len(self.names)))
+        rows[:, first : first + chain.A.shape[0]] = chain.C
+        rows[:, self["theta_d"]] += chain.D * servo.p
+        return rows
+
+
+def plant_names(servo: Servo) -> list[str]:
+    """States of motor, screw and structure."""
+    return ["current", "speed", "theta_m", "theta_d", *(f"chain{i}" for i in range(servo.chain().A.shape[0]))]
+
+
+def input_names(key: str, order: int) -> list[str]:
+    """An input that is a polynomial of degree `order`: its value and derivatives."""
+    return [key + "'" * k for k in range(order + 1)]
