@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapEstimate, GapStatus
-from servotwin.identify.trend import OffsetReading, Trend, TrendSettings, process_noise, transition, truncation
+from servotwin.identify.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.identify.trend import Trend, TrendSettings
+from servotwin.identify.trendmodel import process_noise, transition, truncation
 
 DEG = math.radians(1.0)
 SETTINGS = TrendSettings(
@@ -216,21 +217,89 @@ def test_what_does_not_count_says_so():
         assert "because" in after.reasons[0]
 
 
-def test_outliers_are_refused_until_they_are_the_rule():
-    settings = replace(SETTINGS, outlier_std=6.0, restart_after=3)
-    trend = Trend.start(0.0, settings)
+STEADY = replace(SETTINGS, outlier_std=6.0, rate_walk_rad_per_s_per_sqrt_s=1e-6)
+
+
+def steady() -> Trend:
+    """At 0.3 rad for 30 s."""
+    trend = Trend.start(0.0, STEADY)
     for k in range(4):
         trend = trend.update(seen(10.0 * k, 0.3, 0.001))
-    once = trend.update(seen(40.0, 0.8, 0.001))
-    assert once.gap == pytest.approx(0.3, abs=0.01)
-    assert once.refused == 1
-    assert "did not count" in once.reasons[0]
-    assert once.update(seen(50.0, 0.3, 0.001)).refused == 0
-    repaired = trend
-    for k in range(3):
-        repaired = repaired.update(seen(40.0 + 10.0 * k, 0.02, 0.001))
-    assert repaired.gap == pytest.approx(0.02, abs=1e-4)
+    return trend
+
+
+def test_an_outlier_moves_nothing_and_says_why():
+    once = steady().update(seen(40.0, 0.8, 0.001))
+    np.testing.assert_array_equal(once.mean, steady().predict(40.0).mean)
+    assert (once.refused, once.updates) == (1, 4)
+    assert "outlier" in once.reasons[0]
+    after = once.update(seen(50.0, 0.3, 0.001))
+    assert (after.refused, after.rival, after.reasons) == (0, None, ())
+
+
+def test_outliers_that_agree_are_a_change_of_the_machine():
+    """The second of them already counts; the pace of wear and its spread stay."""
+    repaired = steady().update(seen(40.0, 0.02, 0.001)).update(seen(50.0, 0.021, 0.001))
+    assert repaired.gap == pytest.approx(0.0205, abs=1e-3)
+    assert (repaired.refused, repaired.updates, repaired.rival) == (0, 6, None)
     assert "repair" in repaired.reasons[0]
+    assert repaired.rate_std < 2.0 * steady().rate_std
+    assert repaired.update(seen(60.0, 0.02, 0.001)).reasons == ()
+
+
+def test_outliers_that_disagree_stay_outliers():
+    """Each is measured against the one before it; a window that was expected ends it all."""
+    trend = steady()
+    for k, gap in enumerate((0.8, 0.1, 0.6, 0.05)):
+        trend = trend.update(seen(40.0 + 10.0 * k, gap, 0.001))
+        assert trend.refused == k + 1
+        assert trend.gap == pytest.approx(0.3, abs=0.01)
+    assert trend.update(seen(80.0, 0.3, 0.001)).refused == 0
+    assert trend.update(seen(80.0, 0.05, 0.001)).gap == pytest.approx(0.05, abs=0.005)
+
+
+def test_how_many_must_agree_is_a_setting():
+    one, three = (replace(steady(), settings=replace(STEADY, restart_after=n)) for n in (1, 3))
+    assert one.update(seen(40.0, 0.8, 0.001)).gap == pytest.approx(0.8, abs=1e-3)
+    for k in range(3):
+        assert three.refused == k
+        three = three.update(seen(40.0 + 10.0 * k, 0.8, 0.001))
+    assert three.gap == pytest.approx(0.8, abs=1e-3)
+    assert three.refused == 0
+
+
+def test_a_gap_read_by_the_carried_offset_is_one_equation():
+    """gap - 2 offset was seen: the same as least squares with that row; a hundred such windows teach no more of it."""
+    known = Trend.start(0.0, SETTINGS).update(seen(0.0, 0.3, 0.02), OffsetReading(0.1, 0.01))
+    std = math.hypot(2.0 * known.prior.offset_std, 1e-3)
+    lean = CarriedOffset(known.prior.offset, known.prior.offset_std, 2.0)
+    after = known.update(seen(0.0, 0.31, std), lean)
+    row, before = np.array([[1.0, 0.0, -2.0]]), np.linalg.inv(known.covariance)
+    covariance = np.linalg.inv(before + row.T @ row / 1e-6)
+    right = before @ known.mean + row[0] * (0.31 - 2.0 * known.prior.offset) / 1e-6
+    np.testing.assert_allclose(after.mean, covariance @ right, rtol=1e-7)
+    for _ in range(100):
+        after = after.update(seen(0.0, 0.31, std), lean)
+    free = np.linalg.inv(np.linalg.inv(known.covariance[np.ix_([0, 2], [0, 2])]) + np.outer([1, -2], [1, -2]) * 1e12)
+    assert after.covariance[0, 0] == pytest.approx(free[0, 0], rel=1e-3)
+
+
+def test_an_outlier_that_leans_on_the_offset_proves_no_change():
+    trend = steady().update(seen(40.0, 0.3, 0.001), OffsetReading(0.0, 0.001))
+    lean = CarriedOffset(0.0, 0.001, 2.0)
+    trend = trend.update(seen(50.0, 0.8, 0.003), lean)
+    assert (trend.refused, trend.rival) == (1, None)
+    assert trend.prior.gap == pytest.approx(0.3, abs=0.01)
+    assert trend.prior.offset_std == STEADY.offset_std_rad
+    assert "forgotten" in trend.reasons[1]
+
+
+def test_a_moved_encoder_costs_no_window():
+    trend = steady().update(seen(40.0, 0.3, 0.001), OffsetReading(0.0, 0.001))
+    moved = trend.update(seen(50.0, 0.3, 0.001), OffsetReading(0.2, 0.001))
+    assert (moved.refused, moved.updates) == (0, 6)
+    assert moved.prior.offset == pytest.approx(0.2, abs=1e-3)
+    assert "read anew" in moved.reasons[0]
 
 
 def test_a_prior_for_the_next_window():

@@ -10,6 +10,7 @@ import pytest
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.trend import TrendSettings
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Reason, Receipt, pack_channel
 from servotwin.plant.servo import Servo
@@ -117,6 +118,45 @@ def test_only_a_good_estimate_sets_parameters(status):
     assert next(iter(store.estimates.values())).status is status
 
 
+def measured(gaps: dict[float, float]):
+    """A fake estimator: the gap (rad) by the window's start (s), with a spread of 0.001 rad, always sure of itself."""
+
+    def estimate(window: Window, _expected: Expectation) -> GapEstimate:
+        gap = gaps[window.start]
+        return GapEstimate(gap, 1e-3, 1e-3, (gap - 2e-3, gap + 2e-3), GapStatus.OK, window.mid_time)
+
+    return estimate
+
+
+def fed(gaps: dict[float, float]):
+    """The updates that a twin sends for windows with these gaps, by their window's start, and its store."""
+    store = MemoryStore()
+    slow = TwinSettings(trend=TrendSettings.for_wear(0.1, 1000.0))
+    twin = Twin("axis", measured(gaps), eq_21, store, slow)
+    answers = {start: twin.receive(window_message(k, start), start)[1:] for k, start in enumerate(gaps)}
+    return {start: update.gap for start, answer in answers.items() for update in answer}, store
+
+
+def test_an_outlier_does_not_reach_the_controller_however_sure_the_estimate_is():
+    sent, store = fed({10.0: 0.1, 20.0: 0.1, 30.0: 0.4, 40.0: 0.1})
+    assert sent == {10.0: 0.1, 20.0: 0.1, 40.0: 0.1}
+    outlier = store.trends["axis", "boot-1", 2]
+    assert outlier.refused == 1
+    assert "being an outlier" in outlier.reasons[0]
+    assert store.estimates["axis", "boot-1", 2].ok
+
+
+def test_two_outliers_that_agree_are_a_real_change():
+    sent, store = fed({10.0: 0.1, 20.0: 0.1, 30.0: 0.4, 40.0: 0.4, 50.0: 0.4})
+    assert sent == {10.0: 0.1, 20.0: 0.1, 40.0: 0.4, 50.0: 0.4}
+    assert "starts afresh" in store.trends["axis", "boot-1", 3].reasons[0]
+
+
+def test_outliers_that_contradict_each_other_send_nothing():
+    sent, _ = fed({10.0: 0.1, 20.0: 0.1, 30.0: 0.4, 40.0: 0.2, 50.0: 0.6, 60.0: 0.1})
+    assert sent == {10.0: 0.1, 20.0: 0.1, 60.0: 0.1}
+
+
 def test_updates_follow_each_other_without_waiting_for_receipts():
     twin, _ = make()
     _, first = twin.receive(window_message(0, 10.0), 11.0)
@@ -184,7 +224,7 @@ def test_after_a_reboot_only_windows_of_the_new_boot_count():
     twin.receive(window_message(0, 10.0), 11.0)
     twin.receive(Hello("axis", "boot-2", 0.0, 100.0, 1, 0.0, "model"), 12.0)
     assert len(twin.receive(window_message(1, 99.0), 13.0)) == 1
-    _, update = twin.receive(window_message(0, 1.0, boot="boot-2", version=1), 14.0)
+    _, update = twin.receive(window_message(0, 9.0, boot="boot-2", version=1), 14.0)
     assert (update.version, update.base_version, update.window) == (2, 1, ("boot-2", 0))
     assert len(store.estimates) == 3
 

@@ -10,9 +10,11 @@ import pytest
 from servotwin.cosim import Loop, cosimulate, quantisation
 from servotwin.errors import InvalidInput
 from servotwin.identify import whitened
-from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.estimate import GapEstimate, GapStatus, OffsetReading
+from servotwin.identify.gap import estimate_gap
 from servotwin.identify.trend import TrendSettings
 from servotwin.scenario import Scenario
+from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.wear import Wear
 
@@ -163,11 +165,34 @@ def test_the_first_window_has_no_time_before_its_step():
 
 
 def test_a_calm_loop_does_not_show_its_gap_in_a_second_after_the_step():
+    """Not in the window alone; what the encoder's offset does for it is in test_carried.py."""
     loop = calm(1.0, 0.0)
-    large = [e for e in loop.estimates if e.time > 60.0]
-    assert {e.status for e in large} <= {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND, GapStatus.MODEL_MISMATCH}
-    assert all(e.reasons for e in large)
+    large = [decode_window(window) for window in loop.windows if window.start > 70.0]
+    alone = [estimate_gap(window, loop.scenario.servo) for window in large]
+    assert {e.status for e in alone} <= {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND, GapStatus.MODEL_MISMATCH}
+    assert all(e.reasons for e in alone)
     assert np.max(np.abs(errors_deg(loop)), initial=0.0) < 0.05
+
+
+def test_what_was_known_of_the_offset_ends_with_the_boot():
+    wear = worn()
+    assert wear.expect("boot-1", 120.0, 122.0).offset is None
+    wear.learn("boot-1", replace(seen(13.0, 120.0), offset=OffsetReading(0.3, 0.1 * STD)), 122.0)
+    mean, std = wear.expect("boot-1", 140.0, 142.0).offset
+    assert mean == pytest.approx(0.3, abs=1e-4)
+    assert 0.1 * STD < std < STD
+    assert wear.expect("boot-2", 1.0, 142.0).offset is None
+    assert wear.expect("boot-2", 1.0, 142.0).prior.gap == pytest.approx(math.radians(15.0), abs=math.radians(0.5))
+
+
+def test_an_outlier_is_not_what_is_expected_next():
+    wear = worn()
+    assert not wear.learn("boot-1", seen(40.0, 120.0), 122.0)
+    expected = wear.expect("boot-1", 140.0, 142.0)
+    assert math.degrees(expected.prior.gap) == pytest.approx(15.0, abs=0.3)
+    assert math.degrees(expected.previous) == pytest.approx(11.0)
+    assert wear.learn("boot-1", seen(41.0, 140.0), 142.0)
+    assert math.degrees(wear.expect("boot-1", 140.0, 142.0).previous) == pytest.approx(41.0)
 
 
 def test_a_dead_zone_hides_the_gap_of_a_calm_loop():

@@ -21,6 +21,32 @@ class GapStatus(StrEnum):
 
 
 @dataclass(frozen=True)
+class OffsetReading:
+    """The encoder's offset as one window shows it: value, standard deviation (rad), covariance with the gap (rad^2)."""
+
+    offset: float
+    std: float
+    covariance: float = 0.0
+
+
+@dataclass(frozen=True)
+class CarriedOffset:
+    """The encoder's offset from earlier windows, without which this one would not show the gap.
+
+    Attributes
+    ----------
+    offset, std : float
+        rad, as handed to the estimator.
+    slope : float
+        By how much the gap would be another per change of the offset.
+    """
+
+    offset: float
+    std: float
+    slope: float
+
+
+@dataclass(frozen=True)
 class GapEstimate:
     """The total gap as one window shows it.
 
@@ -48,6 +74,8 @@ class GapEstimate:
         Root mean square of the residual over the samples that count, m; NaN when nothing was fitted.
     evaluations : int
         Evaluations of the cost.
+    offset : OffsetReading or CarriedOffset, optional
+        What the window says of the encoder's offset, or what it was told of it; None: neither was asked.
     """
 
     gap: float
@@ -62,6 +90,7 @@ class GapEstimate:
     method: str = ""
     rms: float = math.nan
     evaluations: int = 0
+    offset: OffsetReading | CarriedOffset | None = None
 
     def __post_init__(self) -> None:
         # What the numbers libraries return becomes plain: estimates go into messages and logs.

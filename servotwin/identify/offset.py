@@ -1,28 +1,72 @@
-"""The encoder's offset as a window shows it, beside the gap that was found there.
+"""The encoder's offset as a window shows it, beside the gap; and the gap as one contact shows it, the offset known.
 
-Position / static gain less the screw's angle: what the encoder would have to be shifted by for both to agree at rest.
-It is a constant in the residual, so it costs nothing to read once the gap is known; what earlier windows tell of it
-lets later ones show the gap with one contact only.
+The offset is position / static gain less the screw's angle: what the encoder would have to be shifted by for both to
+agree at rest. It is a constant in the residual, so it costs nothing to read once the gap is known; what earlier windows
+tell of it lets later ones show the gap with one contact only. It is constant as long as the gap opens to both sides
+alike; `TrendSettings.offset_walk_rad_per_sqrt_s` is for wear on one flank.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.identify import whitened
 from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
 from servotwin.identify.core.normal import least_squares
 from servotwin.identify.core.response import response
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import OffsetReading
+from servotwin.identify.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.identify.whitened.channels import motor_angle
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
+_GAP, _CONSTANT = 0, 1  # rows of the columns
 
-def read_offset(window: Window, servo: Servo, estimate: GapEstimate) -> OffsetReading:
+
+def estimate_carrying(
+    window: Window,
+    servo: Servo,
+    prior: float | GapEstimate | None,
+    settings: whitened.Settings,
+    carried: tuple[float, float] | None,
+) -> GapEstimate:
+    """The gap from the window alone, or, where that shows too little of it, with the offset that earlier ones showed.
+
+    The estimate says what it knows of the offset, for the trend. A window that shows both sides of the gap is never
+    told of the offset, so that an encoder that has slipped cannot spoil it.
+
+    Parameters
+    ----------
+    window : Window
+    servo : Servo
+    prior : float or GapEstimate, optional
+        As for `estimate_gap`.
+    settings : whitened.Settings
+        With an `offset` of its own, nothing is carried and nothing read.
+    carried : (float, float), optional
+        Mean and standard deviation of the offset, rad.
+    """
+    alone = whitened.estimate(window, servo, prior, settings)
+    if settings.offset is not None:
+        return alone
+    if alone.ok:
+        return replace(alone, offset=read_offset(window, servo, alone, settings))
+    if carried is None or alone.status is GapStatus.MODEL_MISMATCH or not 0.0 < carried[1] < settings.largest_std:
+        return alone
+    helped = whitened.estimate(window, servo, prior, replace(settings, offset=carried))
+    if not helped.ok:
+        return alone
+    slope = _slope(_columns(window, servo, helped, settings))
+    return replace(helped, offset=CarriedOffset(*carried, slope))
+
+
+def read_offset(
+    window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings | None = None
+) -> OffsetReading:
     """The offset (rad) with its standard deviation and its covariance with the gap.
 
     Shape of the covariance: that of white noise; size: such that the gap's variance is the estimate's `std_total`
@@ -36,17 +80,32 @@ def read_offset(window: Window, servo: Servo, estimate: GapEstimate) -> OffsetRe
     if window.theta_m is None or not estimate.ok:
         missing = "theta_m" if window.theta_m is None else "an OK estimate"
         raise InvalidInput(f"{window.where}the encoder's offset needs {missing}")
-    model = response(servo, window.sample_rate)
-    first, home = float(window.theta_m[0]), float(window.position[0])
-    seen = contacts(window.theta_m - first, Gap(estimate.gap, estimate.theta_d0 - first))
-    rows = model.respond(seen[[SCREW, BY_GAP, BY_START]])
-    constant = np.full((1, window.theta_m.size), model.static_gain)
-    late = model.velocities(seen[[SCREW]])
-    columns = np.vstack([rows[1:2], constant, rows[2:], model.free(window.theta_m.size), late])
-    solved = least_squares(np.delete(columns, 0, axis=0), window.position - home - rows[0])
-    covariance = _scaled(least_squares(columns, rows[0]).root, estimate.std_total)
-    offset = float(solved.coefficients[0]) + home / model.static_gain - first
+    table = _columns(window, servo, estimate, settings or whitened.Settings())
+    residual, columns = table[0], table[1:]
+    gain = response(servo, window.sample_rate).static_gain
+    solved = least_squares(np.delete(columns, _GAP, axis=0), residual)
+    covariance = _scaled(least_squares(columns, residual).root, estimate.std_total)
+    offset = float(solved.coefficients[0]) + float(window.position[0]) / gain - float(window.theta_m[0])
     return OffsetReading(offset, math.sqrt(covariance[1, 1]), float(covariance[0, 1]))
+
+
+def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings) -> Array:
+    """(k, n) residual, its derivatives by gap and constant (per rad of offset), nuisances."""
+    model = response(servo, window.sample_rate)
+    angle = motor_angle(window, servo.encoder_resolution, settings)
+    first, home = float(angle[0]), float(window.position[0])
+    seen = contacts(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
+    rows = model.respond(seen[[SCREW, BY_GAP, BY_START]])
+    constant = np.full((1, angle.size), model.static_gain)
+    late = model.velocities(seen[[SCREW]])
+    return np.vstack([window.position - home - rows[0], rows[1:2], constant, rows[2:], model.free(angle.size), late])
+
+
+def _slope(table: Array) -> float:
+    """By how much the gap of the best fit changes per change of the offset."""
+    columns = table[1:]
+    answer = least_squares(np.delete(columns, _CONSTANT, axis=0), columns[_CONSTANT])
+    return -float(answer.coefficients[_GAP])
 
 
 def _scaled(root: Array, std: float) -> Array:

@@ -11,26 +11,29 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import NORMAL_95, GapEstimate, GapStatus, Interval
+from servotwin.identify.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, Interval, OffsetReading
 from servotwin.identify.passage import Passage, passage
+from servotwin.identify.trendmodel import (
+    GAP,
+    OFFSET,
+    RATE,
+    Reading,
+    bound_std,
+    process_noise,
+    reading,
+    transition,
+    truncation,
+)
 from servotwin.identify.trendsettings import TrendSettings
 from servotwin.plant.signals import Array
 
 __all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
 
-GAP, RATE, OFFSET = 0, 1, 2
-
-
-@dataclass(frozen=True)
-class OffsetReading:
-    """The encoder's offset as one window shows it: value, standard deviation (rad), covariance with the gap (rad^2)."""
-
-    offset: float
-    std: float
-    covariance: float = 0.0
+_OUTLIER = "the window did not count, being an outlier"
+_MOVED = "the encoder's offset is not what it was: it is read anew from this window"
+_DOUBTED = "the gap rested on the encoder's offset, which is forgotten until a window shows it again"
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,8 @@ class Trend:
         Outliers since the last window that counted.
     reasons : tuple of str
         Why the last window did not count, or counted otherwise than as a plain value.
+    rival : Trend or None
+        The state that outliers since then would make; it takes over once `restart_after` of them agree.
     """
 
     time: float
@@ -71,6 +76,7 @@ class Trend:
     updates: int = 0
     refused: int = 0
     reasons: tuple[str, ...] = ()
+    rival: Trend | None = None
 
     @classmethod
     def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:
@@ -92,9 +98,10 @@ class Trend:
             raise InvalidInput(f"trend: time {time:.9g} s lies before {self.time:.9g} s; windows must come in order")
         flow = transition(step)
         covariance = flow @ self.covariance @ flow.T + process_noise(step, self.settings)
-        return replace(self, time=float(time), mean=flow @ self.mean, covariance=covariance, reasons=())
+        rival = self.rival and self.rival.predict(time)
+        return replace(self, time=float(time), mean=flow @ self.mean, covariance=covariance, reasons=(), rival=rival)
 
-    def update(self, estimate: GapEstimate, offset: OffsetReading | None = None) -> Trend:
+    def update(self, estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None = None) -> Trend:
         """The state at the estimate's time, corrected by it.
 
         Only an OK estimate counts as a value. A lower bound counts one-sidedly: it moves the state only as far as the
@@ -103,52 +110,76 @@ class Trend:
         Parameters
         ----------
         estimate : GapEstimate
-        offset : OffsetReading, optional
-            The encoder's offset from the same window.
+        offset : OffsetReading or CarriedOffset, optional
+            The encoder's offset in the same window; None: the estimate's own.
         """
         ahead = self.predict(estimate.time)
         if estimate.ok:
-            return ahead._corrected(*_readings(estimate, offset))
+            return ahead._corrected(reading(estimate, offset or estimate.offset))
         if estimate.status is GapStatus.LOWER_BOUND and math.isfinite(estimate.gap):
             return ahead._bounded(estimate)
         because = "; ".join(estimate.reasons) or "no reason given"
         return replace(ahead, reasons=(f"the window did not count, being {estimate.status.value}: {because}",))
 
-    def _corrected(self, seen: Array, select: Array, noise: Array) -> Trend:
-        """Kalman update with the values `seen` (m,) = select (m, 3) state + noise; Joseph's form keeps it definite."""
-        surprise = seen - select @ self.mean
-        spread = select @ self.covariance @ select.T + noise
-        distance = math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
-        if distance > self.settings.outlier_std:
-            return self._refused(distance, seen, select, noise)
-        return self._joseph(surprise, select, noise, spread)
+    def without_offset(self) -> Trend:
+        """The same wear seen by an encoder of which nothing is known, as after it was homed anew."""
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[OFFSET] = covariance[OFFSET] = covariance[:, OFFSET] = 0.0
+        covariance[OFFSET, OFFSET] = self.settings.offset_std_rad**2
+        rival = self.rival and self.rival.without_offset()
+        return replace(self, mean=mean, covariance=covariance, rival=rival)
 
-    def _joseph(self, surprise: Array, select: Array, noise: Array, spread: Array) -> Trend:
+    def on_clock(self, time: float) -> Trend:
+        """The same state on a clock that now reads `time`, s."""
+        return replace(self, time=_time(time), rival=self.rival and self.rival.on_clock(time))
+
+    def _corrected(self, seen: Reading) -> Trend:
+        """Corrected by what was seen, unless the gap is an outlier; an offset that is one is read anew."""
+        distance = self._distance(seen.of_gap)
+        if distance > self.settings.outlier_std:
+            return self._refused(distance, seen)
+        if self._distance(seen) > self.settings.outlier_std:
+            return replace(self.without_offset()._joseph(seen), reasons=(_MOVED,))
+        return self._joseph(seen)
+
+    def _distance(self, seen: Reading) -> float:
+        """How far from the prediction, in standard deviations of both."""
+        surprise = seen.values - seen.select @ self.mean
+        spread = seen.select @ self.covariance @ seen.select.T + seen.noise
+        return math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
+
+    def _joseph(self, seen: Reading) -> Trend:
+        """Kalman update; Joseph's form keeps the covariance definite."""
+        select, noise = seen.select, seen.noise
+        spread = select @ self.covariance @ select.T + noise
         gain = np.linalg.solve(spread, select @ self.covariance).T
         left = np.eye(3) - gain @ select
         covariance = left @ self.covariance @ left.T + gain @ noise @ gain.T
-        mean = self.mean + gain @ surprise
-        return replace(self, mean=mean, covariance=_symmetric(covariance), updates=self.updates + 1, refused=0)
+        mean = self.mean + gain @ (seen.values - select @ self.mean)
+        counted = self.updates + 1
+        return replace(self, mean=mean, covariance=_symmetric(covariance), updates=counted, refused=0, rival=None)
 
-    def _refused(self, distance: float, seen: Array, select: Array, noise: Array) -> Trend:
-        """The prediction with one more refusal, or a fresh gap after too many of them."""
-        count = self.refused + 1
-        if count >= self.settings.restart_after:
-            return self._restarted(seen, select, noise, count)
+    def _refused(self, distance: float, seen: Reading) -> Trend:
+        """The prediction with one more refusal; or what the outliers say, once enough of them agree."""
         expected = f"{math.degrees(self.mean[GAP]):.4g} deg were expected"
         limit = f"{distance:.3g} standard deviations away, and {self.settings.outlier_std:.3g} are allowed"
-        return replace(self, refused=count, reasons=(f"the window did not count: {expected}, {limit}",))
+        refused = replace(self, refused=self.refused + 1, reasons=(f"{_OUTLIER}: {expected}, {limit}",))
+        if _leans_on_offset(seen):
+            return replace(refused.without_offset(), reasons=(*refused.reasons, _DOUBTED))
+        rival = self._rival(seen)
+        if rival.updates < self.settings.restart_after:
+            return replace(refused, rival=rival)
+        reason = f"outliers in a row that agree: {rival.updates}; the gap starts afresh, as after a crash or a repair"
+        return replace(rival, updates=self.updates + rival.updates, reasons=(reason,))
 
-    def _restarted(self, seen: Array, select: Array, noise: Array, count: int) -> Trend:
-        """Gap and offset forgotten, then corrected; the rate stays."""
+    def _rival(self, seen: Reading) -> Trend:
+        """The state that the outliers so far would make, were they right: of those that agree with this one."""
+        if self.rival is not None and self.rival._distance(seen.of_gap) <= self.settings.agreement_std:
+            return self.rival._corrected(seen)
         fresh = Trend.start(self.time, self.settings).covariance
         fresh[RATE, RATE] = self.covariance[RATE, RATE]
-        blank = replace(self, mean=np.array([0.0, self.mean[RATE], 0.0]), covariance=fresh)
-        surprise = seen - select @ blank.mean
-        again = blank._joseph(surprise, select, noise, select @ fresh @ select.T + noise)
-        return replace(
-            again, reasons=(f"{count} windows in a row disagreed: the gap starts afresh, as after a repair",)
-        )
+        mean = np.array([0.0, self.mean[RATE], 0.0])
+        return Trend(self.time, mean, fresh, self.settings)._joseph(seen)
 
     def _bounded(self, estimate: GapEstimate) -> Trend:
         """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
@@ -218,48 +249,9 @@ class Trend:
         return passage(self.mean[:OFFSET], covariance, gap, *walks)
 
 
-def transition(step: float) -> Array:
-    """(3, 3) matrix that carries the state on by `step` seconds."""
-    flow = np.eye(3)
-    flow[GAP, RATE] = step
-    return flow
-
-
-def process_noise(step: float, settings: TrendSettings) -> Array:
-    """(3, 3) covariance that `step` seconds of the random walks add: exact, so that steps can be split at will."""
-    gap, rate = settings.gap_walk_rad_per_sqrt_s**2, settings.rate_walk_rad_per_s_per_sqrt_s**2
-    noise = np.zeros((3, 3))
-    noise[GAP, GAP] = gap * step + rate * step**3 / 3.0
-    noise[GAP, RATE] = noise[RATE, GAP] = rate * step**2 / 2.0
-    noise[RATE, RATE] = rate * step
-    noise[OFFSET, OFFSET] = settings.offset_walk_rad_per_sqrt_s**2 * step
-    return noise
-
-
-def bound_std(estimate: GapEstimate) -> float:
-    """Spread (rad) of a lower bound, from the lower end of its 95 % interval."""
-    return max(0.0, estimate.gap - estimate.interval[0]) / NORMAL_95
-
-
-def truncation(margin: float) -> tuple[float, float]:
-    """(shift, shrinkage) of a standard normal that is known to exceed -margin: its mean, one less its variance."""
-    if math.isinf(margin):
-        return 0.0, 0.0
-    pull = math.exp(-0.5 * margin * margin - 0.5 * math.log(2.0 * math.pi) - float(log_ndtr(margin)))
-    return pull, min(1.0, max(0.0, pull * (pull + margin)))
-
-
-def _readings(estimate: GapEstimate, offset: OffsetReading | None) -> tuple[Array, Array, Array]:
-    """(values, which states they are of, covariance) of a window."""
-    variance = estimate.std_total**2
-    if not 0.0 <= variance < math.inf:
-        raise InvalidInput(f"trend: the estimate's std_total = {estimate.std_total!r} rad: must be finite")
-    if offset is None:
-        return np.array([estimate.gap]), np.eye(3)[:1], np.array([[variance]])
-    noise = np.array([[variance, offset.covariance], [offset.covariance, offset.std**2]])
-    if np.any(np.linalg.eigvalsh(noise) < 0.0) or not np.all(np.isfinite(noise)):
-        raise InvalidInput(f"trend: {offset} and std_total = {estimate.std_total!r} rad make no covariance matrix")
-    return np.array([estimate.gap, offset.offset]), np.eye(3)[[GAP, OFFSET]], noise
+def _leans_on_offset(seen: Reading) -> bool:
+    """Whether a gap was read by means of the carried offset."""
+    return bool(seen.select[0, OFFSET] != 0.0)
 
 
 def _symmetric(matrix: Array) -> Array:

@@ -28,8 +28,10 @@ class TrendSettings:
     outlier_std : float
         An estimate farther from the prediction than so many standard deviations is refused.
     restart_after : int
-        So many refusals in a row mean that the machine has changed (a new or re-adjusted screw): the gap then starts
-        afresh from the last of them.
+        So many outliers in a row that agree with each other mean that the machine has changed (a crash, a new or
+        re-adjusted screw): the gap then starts afresh from them.
+    agreement_std : float
+        Outliers agree when each is within so many standard deviations of what the ones before it predict.
 
     Raises
     ------
@@ -45,7 +47,8 @@ class TrendSettings:
     offset_walk_rad_per_sqrt_s: float = 0.0
     shared_error_rad: float = math.radians(0.02)
     outlier_std: float = 6.0
-    restart_after: int = 3
+    restart_after: int = 2
+    agreement_std: float = 3.0
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -10,6 +10,7 @@ from functools import partial
 from servotwin.errors import InvalidInput
 from servotwin.identify.estimate import GapEstimate, no_estimate
 from servotwin.identify.gap import estimate_gap, settings_of
+from servotwin.identify.offset import estimate_carrying
 from servotwin.identify.trend import Trend
 from servotwin.identify.whitened.estimator import Settings
 from servotwin.identify.window import Window
@@ -34,7 +35,8 @@ class Twin:
 
     A window is committed to the store, then acknowledged, then estimated, once: a second copy is only acknowledged.
     Windows may come in any order; every one is estimated, but only one that is newer than all before moves the
-    parameters, the trend and the starting point of the next estimate. Only an estimate whose status is OK does either.
+    parameters, the trend and the starting point of the next estimate. Only an estimate whose status is OK does either,
+    and one that the trend refuses as an outlier only once others agree with it.
 
     Parameters
     ----------
@@ -124,9 +126,7 @@ class Twin:
         self._versions.hear(message.boot, message.parameter_version)
         estimate = self.estimate(message, now)
         self._store.add_estimate(message, estimate)
-        counts = estimate.ok and self._versions.admits(message)
-        if counts:
-            self._wear.learn(message.boot, estimate, now)
+        counts = self._versions.admits(message) and self._wear.learn(message.boot, estimate, now)
         self._store.add_trend(message, self.trend)
         if not counts:
             return []
@@ -169,8 +169,8 @@ class Twin:
 def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     """The estimator that `settings` name, with a servo as its model.
 
-    The published one starts from the previous gap, as printed. The default one is told what the trend predicts, and
-    how fast the gap may grow within the window.
+    The published one starts from the previous gap, as printed. The default one is told what the trend predicts, how
+    fast the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
     given = settings_of(settings.method, settings.estimator)
 
@@ -178,7 +178,7 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
         if not isinstance(given, Settings):
             return estimate_gap(window, servo, settings.method, expected.previous, given)
         drift = given.gap_rate or expected.gap_rate(settings.trend)
-        return estimate_gap(window, servo, settings.method, expected.prior, replace(given, gap_rate=drift))
+        return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)
 
     return estimate
 

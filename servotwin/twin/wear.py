@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend, TrendSettings
@@ -29,6 +29,18 @@ class Expectation:
         """Where an estimator may start: the prediction, or the previous gap while there is none."""
         return self.previous if self.trend is None else self.trend.as_estimate()
 
+    @property
+    def offset(self) -> tuple[float, float] | None:
+        """Mean and standard deviation (rad) of the encoder's offset; None while no window of this boot showed it.
+
+        The offset is the middle between two contacts, the gap the distance: of the error that all windows share, which
+        does not average away, it has half.
+        """
+        if self.trend is None or self.trend.prior.offset_std >= self.trend.settings.offset_std_rad:
+            return None
+        known, shared = self.trend.prior, self.trend.settings.shared_error_rad
+        return known.offset, math.hypot(known.offset_std, 0.5 * shared)
+
     def gap_rate(self, settings: TrendSettings) -> float:
         """rad/s: root mean square of the growth to reckon with inside the window.
 
@@ -42,7 +54,8 @@ class Expectation:
 class Wear:
     """The trend of one servo, moved by accepted estimates in the order of their windows.
 
-    Sample time begins anew with each boot of the edge. What passed meanwhile is taken from the twin's own clock.
+    Sample time begins anew with each boot of the edge. What passed meanwhile is taken from the twin's own clock. What
+    was known of the encoder's offset is forgotten then, as the encoder may be homed elsewhere.
 
     Parameters
     ----------
@@ -65,17 +78,24 @@ class Wear:
         trend = self._on_clock(boot, time, now)
         return Expectation(self._previous, trend and trend.predict(max(time, trend.time)))
 
-    def learn(self, boot: str, estimate: GapEstimate, now: float) -> None:
-        """Take an accepted estimate; one that is not OK, or older than the trend, changes nothing."""
+    def learn(self, boot: str, estimate: GapEstimate, now: float) -> bool:
+        """Take an estimate; whether it counts.
+
+        One that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the reason
+        in the trend's `reasons`, until others agree with it.
+        """
         trend = self._on_clock(boot, estimate.time, now)
         if not estimate.ok or (trend is not None and estimate.time <= trend.time):
-            return
+            return False
         self.trend = (trend or Trend.start(estimate.time, self.settings)).update(estimate)
-        self._previous = estimate.gap
         self._boot, self._heard = boot, now
+        counts = self.trend.refused == 0
+        if counts:
+            self._previous = estimate.gap
+        return counts
 
     def _on_clock(self, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
         if self.trend is None or boot == self._boot:
             return self.trend
-        return replace(self.trend, time=time - max(0.0, now - self._heard))
+        return self.trend.without_offset().on_clock(time - max(0.0, now - self._heard))
