@@ -84,7 +84,7 @@ class FrictionOracle:
     def screw_rate(self, y: Array) -> float:
         return float(y[SPEED] - 0.5 * self.flank * self.gap_rate) if self.flank else 0.0
 
-    def _rate(self, time: float, y: Array) -> Array:
+    def _rate(self, _time: float, y: Array) -> Array:
         s, law, free = self.servo, self.servo.controller, self.servo.n - 1
         rate = np.zeros_like(y)
         rate[CURRENT] = (self.voltage(y) + self.bias - s.R * y[CURRENT] - s.k_B * y[SPEED]) / s.L
@@ -107,9 +107,9 @@ class FrictionOracle:
     def _of_motion(self) -> list:
         torque = self.servo.k_T
         if self.motion:
-            return [("stick", lambda t, y: -self.motion * y[SPEED], self._stop)]
+            return [("stick", lambda _t, y: -self.motion * y[SPEED], self._stop)]
         return [
-            ("slip", lambda t, y, s=s: s * torque * y[CURRENT] - self.friction, lambda t, y, s=s: self._start(s))
+            ("slip", lambda _t, y, s=s: s * torque * y[CURRENT] - self.friction, lambda _t, _y, s=s: self._start(s))
             for s in (1, -1)
         ]
 
@@ -139,7 +139,7 @@ class FrictionOracle:
         if self.flank and not self.motion:
             return []  # the screw's rate is the gap's alone: see _lose_contact_if_stuck
         if self.flank:
-            return [("release", lambda t, y: -self.flank * self.screw_rate(y), self._release)]
+            return [("release", lambda _t, y: -self.flank * self.screw_rate(y), self._release)]
         return [
             (
                 "contact",
@@ -149,7 +149,7 @@ class FrictionOracle:
             for s in (1, -1)
         ]
 
-    def _release(self, time: float, y: Array) -> None:
+    def _release(self, _time: float, _y: Array) -> None:
         self.flank = 0
 
     def _touch(self, side: int, time: float, y: Array) -> None:
@@ -161,9 +161,9 @@ class FrictionOracle:
             return []
         if self.zone:
             side = self.zone
-            return [("enter", lambda t, y: self.tolerance - side * self.error(y), lambda t, y: self._zone(0))]
+            return [("enter", lambda _t, y: self.tolerance - side * self.error(y), lambda _t, _y: self._zone(0))]
         return [
-            ("leave", lambda t, y, s=s: s * self.error(y) - self.tolerance, lambda t, y, s=s: self._zone(s))
+            ("leave", lambda _t, y, s=s: s * self.error(y) - self.tolerance, lambda _t, _y, s=s: self._zone(s))
             for s in (1, -1)
         ]
 

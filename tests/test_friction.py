@@ -1,10 +1,12 @@
 """Coulomb friction on the motor's shaft: closed forms, scipy as an oracle, invariants; stuck on a flank while the gap
 changes."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
+from friction_oracle import FrictionOracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -15,7 +17,6 @@ from servotwin.plant.automaton import Shape, continuous_loop, sampled_plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SquareWave
 from servotwin.simulation import Run, Simulation, simulate
-from friction_oracle import FrictionOracle
 
 PAPER = Servo.preset("paper")
 OPEN_LOOP = PAPER.controller.replace(Kp=0.0, Ki=0.0, Kd=0.0)
@@ -115,7 +116,7 @@ def test_the_closed_loop_agrees_with_scipy(
 def test_a_stuck_motor_pushes_the_screw_only_while_the_gap_shrinks(rate: float | None) -> None:
     """The screw is the play's, clamped by a gap that breathes around a motor that never turns (facts E3, E4)."""
     widths = np.radians([10.0, 4.0, 10.0, 2.0, 6.0])
-    ramps = [[a, 0.0, 3.0 * (b - a), -2.0 * (b - a)] for a, b in zip(widths, widths[1:], strict=False)]
+    ramps = [[a, 0.0, 3.0 * (b - a), -2.0 * (b - a)] for a, b in itertools.pairwise(widths)]
     gap = PiecewiseCubic([0.0, 1.0, 2.0, 3.0, 4.0], [*ramps, [widths[-1], 0.0, 0.0, 0.0]])
     law = OPEN_LOOP.replace(sample_rate=rate)
     for start in (1.0, -1.0):
@@ -171,7 +172,7 @@ def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
     assert np.array_equal(grips.side[0::2][: len(grips) // 2], grips.side[1::2])
     times = np.concatenate([[0.0], grips.time, [np.inf]])
     slack = 1e-12 * np.abs(run.theta_m).max()
-    for k, (begin, end) in enumerate(zip(times, times[1:], strict=False)):
+    for k, (begin, end) in enumerate(itertools.pairwise(times)):
         moved = np.diff(run.theta_m[(run.time >= begin) & (run.time < end)])
         if k % 2:
             assert np.all(grips.side[k - 1] * moved >= -slack)
