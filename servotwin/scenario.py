@@ -13,7 +13,7 @@ from typing import Any
 
 from servotwin import scenariofile
 from servotwin.control.controller import Controller
-from servotwin.edge.guard import Parameters
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import shortest_window

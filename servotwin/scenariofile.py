@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from servotwin.control.controller import Controller
-from servotwin.edge.guard import Limits
+from servotwin.edge.limits import Limits
 from servotwin.errors import InvalidInput
 from servotwin.identify import settingsfile
 from servotwin.identify.gap import METHODS

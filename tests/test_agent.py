@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.edge.agent import MAX_CHANGES, Agent, Outgoing
-from servotwin.edge.guard import Limits, Parameters
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox

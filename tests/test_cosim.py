@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servotwin.cosim import Loop, cosimulate, quantisation
-from servotwin.edge.guard import Limits
+from servotwin.edge.limits import Limits
 from servotwin.identify.estimate import GapStatus
 from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servotwin.cosim import Cosimulation
-from servotwin.edge.guard import Limits
+from servotwin.edge.limits import Limits
 from servotwin.identify import paper
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.link.session import Retry

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from servotwin.clock import VirtualClock
 from servotwin.edge.agent import Agent, Outgoing
-from servotwin.edge.guard import Limits, Parameters
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.session import Retry

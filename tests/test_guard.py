@@ -8,14 +8,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from servotwin.edge.guard import Instant, Limits, Parameters, decide, judge
+from servotwin.edge.guard import Instant, judge
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.switch import Rules, Switch, offer
 from servotwin.errors import InvalidInput
-from servotwin.messages import Reason, Update
+from servotwin.messages import Reason, Receipt, Update
 
 HERE = Instant("axis-1", "b0", 110_000, 5000.0)
 CURRENT = Parameters(2, 0.9e-4, 0.0, ("b0", 0), 15_000)
 LIMITS = Limits(minimum=0.2e-4, maximum=3e-4, max_step=1e-4, lifetime_s=10.0, interval_s=5.0)
 UPDATE = Update("axis-1", 3, 2, ("b0", 1), 20.0, 0.1, 0.01, (0.08, 0.12), "OK", 1e-4, 60.0)
+
+
+def decide(update: Update, current: Parameters, limits: Limits, here: Instant) -> tuple[Parameters, Receipt]:
+    """What is in force after the update, and the receipt, where nothing has to wait."""
+    step = offer(Switch(current), update, Rules(limits), here, None)
+    (receipt,) = step.said
+    assert isinstance(receipt, Receipt)
+    return step.state.current, receipt
 
 
 def test_a_good_update_is_applied_at_the_next_sample() -> None:

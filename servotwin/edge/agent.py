@@ -1,7 +1,8 @@
 """The edge's agent: samples and messages in, messages out; its clock is sample time.
 
-It records, cuts a window after each change of the reference, repeats it until the twin acknowledges it, and lets the
-guard decide about updates. It does not control: whoever ticks the law asks `parameters` before each sample.
+It records, cuts a window after each change of the reference, repeats it until the twin acknowledges it, and lets its
+supervisor decide about parameters. It does not control: whoever ticks the law asks `parameters` before each sample, or
+`controller` where updates may set gains, and carries its state over by `servotwin.control.law.transfer`.
 """
 
 from array import array
@@ -10,9 +11,12 @@ from itertools import chain, pairwise
 from math import ceil, inf
 from typing import NamedTuple
 
-from servotwin.edge.guard import Instant, decide
+from servotwin.control.controller import Controller
+from servotwin.edge.parameters import Parameters, with_gains
 from servotwin.edge.recorder import Floats, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings
+from servotwin.edge.store import Store
+from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Sender
@@ -55,19 +59,34 @@ class Agent:
     settings : AgentSettings
     outbox : Outbox, optional
         In memory by default.
+    store : Store, optional
+        Of the last parameters that were proved; without one each boot begins as configured.
     """
 
-    def __init__(self, settings: AgentSettings, outbox: Outbox | None = None) -> None:
+    def __init__(self, settings: AgentSettings, outbox: Outbox | None = None, store: Store | None = None) -> None:
         self.settings = settings
         self.outbox = MemoryOutbox() if outbox is None else outbox
-        self.parameters = settings.parameters
         self.windows_cut = 0
         self._sender = Sender(self.outbox, settings.retry)
-        self._recorder = Recorder(tuple(CHANNELS), settings.window_samples + 1)
+        self._recorder = Recorder(tuple(CHANNELS), max(settings.window_samples + 1, settings.period_samples))
+        self._supervisor = Supervisor(settings, self._recorder, store)
+        if self.outbox.pending():
+            self._supervisor.asked(0.0)
         self._reference = settings.reference
         self._first: int | None = None
         self._unusable: Counter[str] = Counter()
         self._deadline = self._next_deadline()
+
+    @property
+    def parameters(self) -> Parameters:
+        """In force from the next sample on."""
+        return self._supervisor.parameters
+
+    @property
+    def controller(self) -> Controller | None:
+        """The controller with the gains in force; None where updates set the tolerance only."""
+        configured = self.settings.controller
+        return None if configured is None else with_gains(configured, self.parameters.gains)
 
     @property
     def samples(self) -> int:
@@ -116,12 +135,12 @@ class Agent:
     def receive(self, message: Message) -> list[Outgoing]:
         """Take a message from the twin; returns what is to be sent now. Messages not meant for an edge are ignored."""
         if isinstance(message, Update):
-            here = Instant(self.settings.servo, self.settings.boot, self.samples, self.settings.sample_rate)
-            self.parameters, receipt = decide(message, self.parameters, self.settings.limits, here)
-            return [Outgoing(self.samples, receipt)]
+            said = self._supervisor.offer(message)
+            self._heard(message.servo)
+            return [Outgoing(self.samples, each) for each in said]
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self._sender.acknowledged(message)
-            self._deadline = self._next_deadline()
+            self._heard(message.servo)
         return []
 
     def hello(self) -> Hello:
@@ -137,6 +156,12 @@ class Agent:
         last = self._reference
         return next((k + 1 for k in range(done, stop) if reference[k] != last), stop)
 
+    def _heard(self, servo: str) -> None:
+        """The twin said something."""
+        if servo == self.settings.servo:
+            self._supervisor.answered(self.time, more=bool(self.outbox.pending()))
+        self._deadline = self._next_deadline()
+
     def _reference_changed(self, reference: float) -> None:
         """The sample just absorbed brought a new reference."""
         self._reference = reference
@@ -149,9 +174,10 @@ class Agent:
         if self._first is not None and self.samples >= self._first + self.settings.window_samples:
             self._cut(self._first, "reference")
             self._first = None
-        due = [Outgoing(self.samples, window) for window in self._sender.due(self.time)]
+        sent = [Outgoing(self.samples, window) for window in self._sender.due(self.time)]
+        sent += [Outgoing(self.samples, said) for said in self._supervisor.look()]
         self._deadline = self._next_deadline()
-        return due
+        return sent
 
     def _cut(self, first: int, reason: str) -> None:
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
@@ -161,6 +187,7 @@ class Agent:
             self._unusable["sample not finite"] += 1
         else:
             self._sender.offer(window, self.time)
+            self._supervisor.asked(self.time)
 
     def _window(self, first: int, sequence: int, reason: str) -> Window:
         signals = self._recorder.cut(first, first + self.settings.window_samples)
@@ -193,8 +220,10 @@ class Agent:
 
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
-        complete = inf if self._first is None else self._first + self.settings.window_samples
+        wanted = self._supervisor.next_look
+        if self._first is not None:
+            wanted = min(wanted, self._first + self.settings.window_samples)
         due = self._sender.next_time
         if due is None:
-            return complete
-        return min(complete, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))
+            return wanted
+        return min(wanted, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))

@@ -4,10 +4,42 @@ import re
 from dataclasses import dataclass, field
 from math import inf, isfinite
 
-from servotwin.edge.guard import Limits, Parameters
+from servotwin.control.controller import Controller
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.verdict import FallbackSet
+from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.session import Retry
-from servotwin.messages import NAME_PATTERN
+from servotwin.messages import NAME_PATTERN, Gains
+
+
+@dataclass(frozen=True, slots=True)
+class Supervision:
+    """How the edge looks after itself.
+
+    Parameters
+    ----------
+    fallback : FallbackSet, optional
+        What it falls back to; None: it does not.
+    watch : WatchSettings, optional
+        What counts as evidence against the parameters in force; None: nothing that the loop does.
+    period_s : float
+        How often it looks; a whole number of the watch's slots, at least one.
+    """
+
+    fallback: FallbackSet | None = None
+    watch: WatchSettings | None = field(default_factory=WatchSettings)
+    period_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.period_s < inf:
+            raise InvalidInput(f"supervision period_s = {self.period_s!r} s: must be finite and greater than 0")
+
+    def period_samples(self, rate: float) -> int:
+        """Samples from one look to the next, at `rate` Hz."""
+        slot = 1 if self.watch is None else max(1, round(self.watch.slot_s * rate))
+        return slot * max(1, round(self.period_s * rate / slot))
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +66,12 @@ class AgentSettings:
         Before the first sample, m; the first sample is a change when it differs.
     model_version : str
         Description of the servo the edge runs on.
+    controller : Controller, optional
+        As configured: what updates start from, and the limits and filters that they do not change. None: updates set
+        the tolerance only.
+    own : Gains, optional
+        The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
+    supervision : Supervision
     """
 
     servo: str
@@ -47,6 +85,9 @@ class AgentSettings:
     fine_angle: bool = False
     reference: float = 0.0
     model_version: str = ""
+    controller: Controller | None = None
+    own: Gains | None = None
+    supervision: Supervision = field(default_factory=Supervision)
 
     def __post_init__(self) -> None:
         for key in ("servo", "boot"):
@@ -61,6 +102,9 @@ class AgentSettings:
         if not 0 <= self.pre_trigger_samples < self.window_samples:
             allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
+        fallback = self.supervision.fallback
+        if self.controller is None and fallback is not None and fallback.gains is not None:
+            raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
 
     @property
     def window_samples(self) -> int:
@@ -71,6 +115,11 @@ class AgentSettings:
     def pre_trigger_samples(self) -> int:
         """Samples before the change."""
         return round(self.pre_trigger_s * self.sample_rate)
+
+    @property
+    def period_samples(self) -> int:
+        """Samples from one look of the supervisor to the next."""
+        return self.supervision.period_samples(self.sample_rate)
 
 
 def _check_whole(key: str, seconds: float, rate: float) -> None:

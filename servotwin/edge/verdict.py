@@ -1,0 +1,49 @@
+"""What the edge falls back to, and on what evidence."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import NamedTuple
+
+from servotwin.errors import InvalidInput
+from servotwin.messages import Band, Cause, Gains
+
+
+class Verdict(NamedTuple):
+    """Evidence against the parameters in force: m, V or s, as the cause says."""
+
+    cause: Cause
+    measured: float
+    allowed: float
+
+
+@dataclass(frozen=True, slots=True)
+class FallbackSet:
+    """Parameters that hold for every gap in the servo's stated range.
+
+    Parameters
+    ----------
+    tolerance : float
+        m; 0: no dead zone.
+    gains : Gains, optional
+        None: the gains stay.
+    band : Band, optional
+        What the loop stays within under them.
+    silence_s : float
+        The twin may leave a window unanswered this long before the edge falls back; inf: for ever.
+    refuse_s : float
+        Updates are refused this long after the first fallback, twice as long after each further one.
+    """
+
+    tolerance: float
+    gains: Gains | None = None
+    band: Band | None = None
+    silence_s: float = inf
+    refuse_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.tolerance < inf:
+            raise InvalidInput(f"fallback tolerance = {self.tolerance!r} m: must be finite and at least 0")
+        if not self.silence_s > 0.0:
+            raise InvalidInput(f"fallback silence_s = {self.silence_s!r} s: must be greater than 0")
+        if not 0.0 <= self.refuse_s < inf:
+            raise InvalidInput(f"fallback refuse_s = {self.refuse_s!r} s: must be finite and at least 0")

@@ -1,0 +1,107 @@
+"""Bounds on gains: the box around the servo's own, and how fast they may move in it."""
+
+from math import inf, nan
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from servotwin.control import Controller
+from servotwin.edge.guard import Instant, judge
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters, gains_of
+from servotwin.errors import InvalidInput
+from servotwin.messages import Gains, Reason, Update
+
+OWN = gains_of(Controller(Kp=1000.0, Ki=20000.0, Kd=-100.0, Tf=0.1))
+
+
+def update(gains: Gains, tolerance: float = 1e-4) -> Update:
+    known = (None, None, (None, None))
+    return Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", tolerance, 60.0, gains)
+
+
+def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0, tolerance: float = 1e-4) -> Reason:
+    current = Parameters(tolerance=1e-4, gains=old)
+    here = Instant("axis-1", "b0", round(seconds * 1000), 1000.0)
+    return judge(update(gains, tolerance), current, limits, here, OWN)
+
+
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ({}, True),
+        ({"Kp": 4000.0}, True),
+        ({"Kp": 4001.0}, False),
+        ({"Kp": 250.0}, True),
+        ({"Kp": 249.0}, False),
+        ({"Kp": -1000.0}, False),
+        ({"Ki": 0.0}, True),
+        ({"Ki": 80001.0}, False),
+        ({"Ki": -1.0}, False),
+        ({"Kd": -401.0}, False),
+        ({"Kd": 100.0}, False),
+        ({"Kd": 0.0}, False),
+        ({"Tf": 0.5}, False),
+        ({"leave": 4.0}, True),
+        ({"leave": 4.1}, False),
+        ({"feedforward": -0.25}, True),
+        ({"feedforward": 0.26}, False),
+    ],
+)
+def test_gains_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
+    expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(OWN, **changes), Limits()) is expected
+
+
+def test_a_servo_without_integral_action_gets_none() -> None:
+    own = replace(OWN, Ki=0.0)
+    assert not Limits().allows_gains(replace(own, Ki=1e-6), own)
+    assert Limits().allows_gains(own, own)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "allowed"),
+    [
+        ({}, {"Kp": 2000.0}, True),
+        ({}, {"Kp": 2001.0}, False),
+        ({}, {"Kp": 499.0}, False),
+        ({}, {"Ki": 0.0}, True),  # calmer: at once
+        ({"Ki": 0.0}, {"Ki": 10000.0}, True),  # twice the box's lower edge
+        ({"Ki": 0.0}, {"Ki": 10001.0}, False),
+        ({}, {"feedforward": 0.2}, True),
+    ],
+)
+def test_one_update_changes_gains_by_a_factor_at_most(
+    old: dict[str, float], new: dict[str, float], allowed: bool
+) -> None:
+    reason = judged(replace(OWN, **new), Limits(gain_step=2.0), replace(OWN, **old))
+    assert reason is (Reason.APPLIED if allowed else Reason.GAINS_STEP_TOO_LARGE)
+
+
+def test_the_allowed_factor_grows_with_time() -> None:
+    limits = Limits(gain_rate=1.1)
+    faster = replace(OWN, Kp=1200.0)
+    assert judged(faster, limits, seconds=9.0) is Reason.APPLIED
+    current = Parameters(tolerance=1e-4, gains=OWN, sample=8200)
+    here = Instant("axis-1", "b0", 10_000, 1000.0)  # 1.1 ** 1.8 = 1.187
+    assert judge(update(faster), current, limits, here, OWN) is Reason.GAINS_STEP_TOO_LARGE
+    assert Limits(gain_rate=1e300).allows_gains_step(OWN, replace(OWN, Kp=4000.0), OWN, 9e9)
+
+
+def test_the_tolerance_has_a_speed_limit() -> None:
+    limits = Limits(max_rate=1e-5)
+    assert judged(OWN, limits, tolerance=1.9e-4) is Reason.APPLIED
+    assert judged(OWN, limits, tolerance=2.1e-4) is Reason.STEP_TOO_LARGE
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"gain_factor": 0.9}, {"gain_step": 0.0}, {"gain_rate": nan}, {"feedforward": -0.1}, {"feedforward": nan},
+        {"patience_s": -1.0}, {"patience_s": inf}, {"max_rate": 0.0},
+    ],
+)  # fmt: skip
+def test_bad_limits_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput, match="limits"):
+        Limits(**values)
