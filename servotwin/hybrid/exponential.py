@@ -1,50 +1,129 @@
-"""Matrix exponentials in extended precision, kept as ``exp(A t) - I``.
+"""Matrix exponentials kept as ``exp(A t) - I``, each entry a double and what rounding left of it.
 
 A step is applied as ``x += P @ x``: the rounding of a stored ``exp(A t)`` would be the same in every step and
-accumulate; that of ``P`` is smaller by the size of the step.
+accumulate; that of ``P`` is smaller by the size of the step. Sums carry their remainders along; products of two
+deviations are plain, because they are smaller than the deviations themselves.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import matrix_balance
 
-Long = NDArray[np.longdouble]
-_TERMS = 24
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.flow import product
+
+# More orders than any series of a matrix of norm 1/4 has terms above rounding.
+_MOST_TERMS = 40
+# Terms below this part of the sum do not change it.
+_SMALL = 2.0**-60
+# Veltkamp's constant splits a double into halves whose products are exact.
+_SPLIT = 2.0**27 + 1.0
 
 
-def expm1(flow: NDArray[np.float64], time: float) -> Long:
+class Powers(NamedTuple):
+    """``exp(A t) - I`` (the base) and ``exp(A j t) - I`` for the present j, row-major and flat: values and remainders,
+    with working memory; each ``(n * n,)``."""
+
+    base: Array
+    base_low: Array
+    power: Array
+    power_low: Array
+    term: Array
+    change: Array
+
+
+def new_powers(states: int) -> Powers:
+    """Working memory for matrices of so many states."""
+    return Powers(*np.zeros((6, states * states)))
+
+
+@verbatim
+def _sum(a: float, b: float) -> tuple[float, float]:
+    """Sum and what rounding left of it."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+@verbatim
+def _product(a: float, b: float) -> tuple[float, float]:
+    """Product and what rounding left of it."""
+    result = a * b
+    big = _SPLIT * a
+    a_high = big - (big - a)
+    big = _SPLIT * b
+    b_high = big - (big - b)
+    a_low, b_low = a - a_high, b - b_high
+    return result, a_low * b_low - (((result - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+@verbatim
+def _third(a: float, a_low: float, b: float, b_low: float, c: float) -> tuple[float, float]:
+    """``a + b + c`` with remainders."""
+    total, left = _sum(a, b)
+    total, more = _sum(total, c)
+    return _sum(total, (a_low + b_low) + (left + more))
+
+
+@inlined
+def _multiply(a: Array, b: Array, n: int, out: Array) -> None:
+    """``out = a @ b``."""
+    for i in range(n):
+        product(b, 0, n, n, a[i * n : (i + 1) * n], out[i * n : (i + 1) * n])
+
+
+@inlined
+def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None:
+    """The first power of ``flow[base:]``, ``(n, n)`` flat, over a time in which no eigenvalue turns far: its Taylor
+    series."""
+    for i in range(n * n):
+        p.power[i], p.power_low[i] = _product(flow[base + i], time)
+        p.base[i] = p.term[i] = p.power[i]
+    for order in range(2, _MOST_TERMS):
+        _multiply(p.term, p.base, n, p.change)
+        open_terms = 0
+        for i in range(n * n):
+            p.term[i] = p.change[i] / order
+            p.power[i], p.power_low[i] = _third(p.power[i], p.power_low[i], p.term[i], 0.0, 0.0)
+            open_terms += abs(p.term[i]) > _SMALL * abs(p.power[i])
+        if open_terms == 0:
+            break
+    rebase(n, p)
+
+
+@inlined
+def rebase(n: int, p: Powers) -> None:
+    """The present power becomes the base: what comes next are powers of it."""
+    for i in range(n * n):
+        p.base[i], p.base_low[i] = p.power[i], p.power_low[i]
+
+
+@inlined
+def next_power(n: int, p: Powers) -> None:
+    """One base more: ``exp(A (j + 1) t) - I = B + P + B P``."""
+    _multiply(p.base, p.power, n, p.change)
+    for i in range(n * n):
+        p.power[i], p.power_low[i] = _third(p.base[i], p.base_low[i], p.power[i], p.power_low[i], p.change[i])
+
+
+@bare
+def _expm1(flow: Array, n: int, time: float, halvings: int, p: Powers) -> None:
+    start_powers(flow, 0, n, time * 0.5**halvings, p)
+    for _ in range(halvings):
+        next_power(n, p)
+        rebase(n, p)
+
+
+def expm1(flow: Array, time: float) -> Array:
     """``exp(flow * time) - I`` of an ``(n, n)`` matrix, by scaling, Taylor series and squaring of the deviation from
     one."""
-    balanced, (scale, _) = matrix_balance(flow, permute=False, separate=True)
-    matrix = balanced.astype(np.longdouble) * np.longdouble(time)
-    halvings = max(0, int(np.ceil(np.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300)))) + 2)
-    matrix = matrix / np.longdouble(2) ** halvings
-    term, result = matrix, matrix.copy()
-    for order in range(2, _TERMS):
-        term = term @ matrix / np.longdouble(order)
-        result += term
-    for _ in range(halvings):
-        result = 2 * result + result @ result
-    return np.asarray(scale[:, None] * result / scale[None, :], dtype=np.longdouble)
-
-
-def powers(step: Long, count: int) -> Long:
-    """``(I + step)**j - I`` for j = 1 .. count, ``(count, n, n)``."""
-    result = [step]
-    while len(result) < count:
-        result.append(result[-1] + step + result[-1] @ step)
-    return np.array(result)
-
-
-def taylor_rows(row: NDArray[np.float64], flow: NDArray[np.float64], time: float, terms: int) -> Long:
-    """Rows ``row @ (flow*time)**k / k!``, k = 0 .. terms - 1: the Taylor series of ``row @ x(t)`` over `time`.
-
-    `row` is ``(n,)`` or ``(r, n)``; the result is ``(terms, n)`` or ``(terms, r, n)``.
-    """
-    scaled = flow.astype(np.longdouble) * np.longdouble(time)
-    rows = [row.astype(np.longdouble)]
-    for order in range(1, terms):
-        rows.append(rows[-1] @ scaled / np.longdouble(order))
-    return np.array(rows)
+    n, powers = len(flow), new_powers(len(flow))
+    balanced = matrix_balance(flow, permute=False)[0]
+    size = float(np.abs(balanced).sum(axis=1).max()) * abs(time)
+    halvings = max(0, int(np.ceil(np.log2(max(size, 1e-300)))) + 2)
+    _expm1(np.array(flow, dtype=float).ravel(), n, float(time), halvings, powers)
+    return powers.power.reshape(n, n)

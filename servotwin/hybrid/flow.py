@@ -117,13 +117,13 @@ def advance(table: Array, base: int, x: Array, change: Array) -> None:
 def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: Scratch) -> None:
     """Advance by ``fraction`` of a step: a tabled part, then a short Taylor series."""
     n = np.uint64(t.states)
-    n2 = t.states * t.states
+    n2, flow = t.states * t.states, t.flow_of[mode]
     part = min(int(fraction * PARTS), PARTS - 1)
     rest = fraction * PARTS - part
     if part > 0:
-        advance(t.jump_part, (mode * PARTS + part) * n2, x, scratch.change)
+        advance(t.jump_part, (flow * PARTS + part) * n2, x, scratch.change)
     terms = scratch.terms
-    tall_product(t.flow_part, mode * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
+    tall_product(t.flow_part, flow * n2 * PART_TERMS, t.states * PART_TERMS, t.states * PART_TERMS, x, terms)
     for i in range(n):
         change = 0.0
         at = np.uint64(PART_TERMS) * n + i
@@ -151,7 +151,7 @@ def advance_clean(
         positive += out[r] + abs(out[np.uint64(values) + r]) > 0.0
     clean = wanted if positive == 0 else clean_intervals(out, guards, nodes + 1, wanted)
     if clean > 0:
-        advance(jumps, (mode * nodes + clean - 1) * t.states * t.states, x, scratch.change)
+        advance(jumps, (t.flow_of[mode] * nodes + clean - 1) * t.states * t.states, x, scratch.change)
     return clean
 
 

@@ -28,8 +28,8 @@ def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
     few."""
     n, modes = tables.states, len(tables.guard_count)
     # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
-    fine = tables.jump_fine.reshape(modes, NODES_FINE, n, n)
-    coarse = tables.jump_coarse.reshape(modes, NODES_COARSE, n, n)
+    fine = tables.jump_fine.reshape(-1, NODES_FINE, n, n)[tables.flow_of]
+    coarse = tables.jump_coarse.reshape(-1, NODES_COARSE, n, n)[tables.flow_of]
     eights = rows[:, None] + np.einsum("mjki,mi->mjk", coarse[:, :-1], rows)
     starts = np.concatenate([rows[:, None], eights], axis=1)
     ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
@@ -98,15 +98,16 @@ def evaluate(
     n2 = t.states * t.states
     for k in range(len(segments)):
         m = mode[segments[k]]
+        flow = t.flow_of[m]
         for i in range(t.states):
             x[i] = state[segments[k], i]
         whole = int(offsets[k])
         eights, ones = min(whole // NODES_FINE, NODES_COARSE), 0
         ones = min(whole - eights * NODES_FINE, NODES_FINE)
         if eights > 0:
-            advance(t.jump_coarse, (m * NODES_COARSE + eights - 1) * n2, x, scratch.change)
+            advance(t.jump_coarse, (flow * NODES_COARSE + eights - 1) * n2, x, scratch.change)
         if ones > 0:
-            advance(t.jump_fine, (m * NODES_FINE + ones - 1) * n2, x, scratch.change)
+            advance(t.jump_fine, (flow * NODES_FINE + ones - 1) * n2, x, scratch.change)
         advance_fraction(t, m, x, offsets[k] - whole, scratch)
         total = 0.0
         for i in range(t.states):

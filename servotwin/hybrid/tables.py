@@ -8,14 +8,12 @@ means "the cubic does not leave the mode", and one product settles a whole block
 
 from __future__ import annotations
 
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.exponential import Long, expm1, powers, taylor_rows
 
 NODES_COARSE = 16
 NODES_FINE = 8
@@ -33,21 +31,22 @@ LASTING_STEP = 0.25
 
 
 class Tables(NamedTuple):
-    """Flat tables; `M` modes, `n` states, `G` guards per mode (padded with rows of -0)."""
+    """Flat tables; `M` modes, `n` states, `G` guards per mode (padded with rows of 0), `F` different flows."""
 
     states: int
     guards: int
     guard_count: NDArray[np.int64]  # (M,) guards of each mode
     target: NDArray[np.int64]  # (M, G)
     has_reset: NDArray[np.bool_]  # (M, G)
+    flow_of: NDArray[np.int64]  # (M,) which of the F flows
     reset: Array  # M * G * n * n, transposed: reset - I
     coarse: Array  # M * n * padded(G * 34): values, then thirds of the slopes, at 17 nodes 8 steps apart
     fine: Array  # M * n * padded(G * 18): the same at 9 nodes one step apart
     taylor: Array  # M * G * n * TERMS
-    jump_coarse: Array  # M * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
-    jump_fine: Array  # M * 8 * n * n, transposed
-    jump_part: Array  # M * 32 * n * n, transposed: exp(A j step / 32) - I
-    flow_part: Array  # M * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
+    jump_coarse: Array  # F * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
+    jump_fine: Array  # F * 8 * n * n, transposed
+    jump_part: Array  # F * 32 * n * n, transposed: exp(A j step / 32) - I
+    flow_part: Array  # F * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside Bernstein rows over one step
     rows: Array  # M * G * n
     sizes: Array  # M * G * TERMS * n: sum over the orders of abs(taylor), those of each derivative's own series
@@ -63,88 +62,50 @@ def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
     return sample_step / divisor, divisor
 
 
-def build_tables(automaton: Automaton, step: float) -> Tables:
-    """All tables of `automaton` for one search step in seconds."""
+def empty_tables(automaton: Automaton) -> Tables:
+    """Tables with the structure of `automaton` and room for its numbers."""
     n, modes = len(automaton.names), automaton.modes
-    guards = max(1, *(len(mode.guards) for mode in modes))
-    count = np.array([len(mode.guards) for mode in modes])
-    target = np.zeros((len(modes), guards), dtype=np.int64)
-    has_reset = np.zeros((len(modes), guards), dtype=bool)
-    reset = np.zeros((len(modes), guards, n, n))
-    rows = np.zeros((len(modes), guards, n))
+    guards, count = max(1, *(len(mode.guards) for mode in modes)), len(modes)
+    flow_of = shared_flows(automaton.flows)
+    flows = int(flow_of.max()) + 1
+    target = np.zeros((count, guards), dtype=np.int64)
+    has_reset = np.zeros((count, guards), dtype=bool)
     for m, mode in enumerate(modes):
         for g, guard in enumerate(mode.guards):
-            target[m, g], rows[m, g] = guard.target, guard.row
-            if guard.reset is not None:
-                has_reset[m, g], reset[m, g] = True, (np.asarray(guard.reset) - np.eye(n)).T
-    parts = zip(
-        *(_mode_tables(automaton.flows[m], rows[m], step, len(modes[m].guards)) for m in range(len(modes))), strict=True
-    )
-    flat = [aligned(np.array(part, dtype=float).ravel()) for part in parts]
-    coarse, fine, taylor, jump_coarse, jump_fine, jump_part, flow_part, single = flat
-    orders = np.abs(taylor.reshape(len(modes), guards, n, TERMS))
+            target[m, g], has_reset[m, g] = guard.target, guard.reset is not None
+    sizes = {
+        "reset": count * guards * n * n,
+        "coarse": count * n * padded(2 * guards * (NODES_COARSE + 1)),
+        "fine": count * n * padded(2 * guards * (NODES_FINE + 1)),
+        "taylor": count * guards * n * TERMS,
+        "jump_coarse": flows * NODES_COARSE * n * n,
+        "jump_fine": flows * NODES_FINE * n * n,
+        "jump_part": flows * PARTS * n * n,
+        "flow_part": flows * PART_TERMS * n * n,
+        "single": count * n * (n + 4 * guards),
+        "rows": count * guards * n,
+        "sizes": count * guards * TERMS * n,
+        "changes": count * guards * n,
+    }
     return Tables(
         states=n,
         guards=guards,
-        guard_count=count,
+        guard_count=np.array([len(mode.guards) for mode in modes]),
         target=target,
         has_reset=has_reset,
-        reset=reset.ravel(),
-        coarse=coarse,
-        fine=fine,
-        taylor=taylor,
-        jump_coarse=jump_coarse,
-        jump_fine=jump_fine,
-        jump_part=jump_part,
-        flow_part=flow_part,
-        single=single,
-        rows=rows.ravel(),
-        sizes=np.einsum("kj,mgij->mgki", _binomials(), orders).ravel(),
-        changes=(orders[..., 1:].sum(axis=3) + 1e-12 * orders[..., 0]).ravel(),
-        bernstein=_bernstein_of_taylor().ravel(),
+        flow_of=flow_of,
+        bernstein=aligned(_bernstein_of_taylor().ravel()),
+        **{name: aligned(np.zeros(size)) for name, size in sizes.items()},
     )
 
 
-def _binomials() -> Array:
-    """``[k, j]`` is "j over k": the terms of the k-th derivative's own series in those of the function's."""
-    return np.array([[float(comb(j, k)) for j in range(TERMS)] for k in range(TERMS)])
-
-
-def _mode_tables(flow: Array, rows: Array, step: float, count: int) -> tuple[Long, ...]:
-    unit = expm1(flow, step)
-    fine = powers(unit, NODES_FINE)
-    coarse = powers(fine[-1], NODES_COARSE)
-    part = np.concatenate([np.zeros((1, *flow.shape), np.longdouble), powers(expm1(flow, step / PARTS), PARTS - 1)])
-    taylor = np.array([taylor_rows(row, flow, step, TERMS).T for row in rows])
-    slopes = rows @ flow
-    return (
-        _node_rows(rows, slopes * (NODES_FINE * step), coarse, count),
-        _node_rows(rows, slopes * step, fine, count),
-        taylor,
-        coarse.transpose(0, 2, 1),
-        fine.transpose(0, 2, 1),
-        part.transpose(0, 2, 1),
-        taylor_rows(np.eye(len(flow)), flow, step / PARTS, PART_TERMS + 1)[1:].reshape(-1, len(flow)).T,
-        np.hstack([unit.T, _step_rows(rows, slopes * step, unit)]),
-    )
-
-
-def _node_rows(rows: Array, slopes: Array, deviations: Long, count: int) -> Long:
-    """Values, then thirds of the slopes, of the first `count` guards at nodes 0, 1, ... (`deviations`), padded to the
-    columns that all the guards need."""
-    node = np.concatenate([np.zeros((1, *deviations[0].shape), np.longdouble), deviations])
-    parts = [part[:count, None] + np.einsum("gi,kij->gkj", part[:count], node) for part in (rows, slopes / 3)]
-    table = np.concatenate(parts).reshape(-1, rows.shape[1]).T
-    result = np.zeros((len(table), padded(2 * len(rows) * len(node))), dtype=np.longdouble)
-    result[:, : table.shape[1]] = table
-    return result
-
-
-def _step_rows(rows: Array, slopes: Array, unit: Long) -> Long:
-    """Bernstein rows of every guard over one step, ``(n, G * 4)``."""
-    later, later_slopes = rows + rows @ unit, slopes + slopes @ unit
-    bernstein = [rows, rows + slopes / 3, later - later_slopes / 3, later]
-    return np.stack(bernstein, axis=1).reshape(-1, rows.shape[1]).T
+def shared_flows(flows: Array) -> NDArray[np.int64]:
+    """(M,) which of the different flows each of the (..., M, n, n) is, counted in the order in which they appear."""
+    result: list[int] = []
+    for m in range(flows.shape[-3]):
+        same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))
+        result.append(next((result[k] for k in same), max(result, default=-1) + 1))
+    return np.array(result)
 
 
 def padded(rows: int) -> int:

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.build import build_tables
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import FULL, ZENO, Record, follow_schedule, grown, new_record
 from servotwin.hybrid.output import Outputs, evaluate, output_table, sample_segments
-from servotwin.hybrid.tables import Tables, build_tables, search_step
+from servotwin.hybrid.tables import Tables, search_step
 
 # Jumps this close to a search step, in steps, are taken on it.
 ON_GRID = 1e-9

@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from numbers import Real
 from pathlib import Path
@@ -195,11 +196,17 @@ class Servo:
 
     def chain(self) -> Chain:
         """Matrices of the structure (Eqs 9-13)."""
-        return chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
+        return self._matrices[0]
 
     def motor(self) -> tuple[Array, Array, Array]:
         """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
-        return motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
+        return self._matrices[1]
+
+    @cached_property
+    def _matrices(self) -> tuple[Chain, tuple[Array, Array, Array]]:
+        """Structure and motor, computed once: an automaton asks for them dozens of times."""
+        structure = chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
+        return structure, motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
 
     def G1(self) -> LinearSystem:
         """Voltage to the unloaded motor's angle (Eq 8)."""

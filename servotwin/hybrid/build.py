@@ -1,0 +1,222 @@
+"""Filling the tables of an automaton: compiled, without the GIL, into memory that the next automaton can use again."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.exponential import Powers, new_powers, next_power, rebase, start_powers
+from servotwin.hybrid.flow import product
+from servotwin.hybrid.tables import (
+    NODES_COARSE,
+    NODES_FINE,
+    PART_TERMS,
+    PARTS,
+    TERMS,
+    VECTOR,
+    Tables,
+    empty_tables,
+)
+
+
+class Numbers(NamedTuple):
+    """What distinguishes automata of one structure, flat: everything that is not a table of theirs yet."""
+
+    flows: Array  # M * n * n
+    rows: Array  # M * G * n: guards
+    resets: Array  # M * G * n * n
+
+
+class Workspace(NamedTuple):
+    """Working memory of `fill_tables`."""
+
+    powers: Powers
+    slopes: Array  # M * G * n: thirds of the guards' slopes over a second
+    slope: Array
+    row: Array
+    next_row: Array
+    orders: Array
+
+
+def new_workspace(tables: Tables) -> Workspace:
+    """Working memory to fill `tables`."""
+    n = tables.states
+    slope, row, next_row = np.zeros((3, n))
+    return Workspace(new_powers(n), np.zeros(len(tables.rows)), slope, row, next_row, np.zeros(TERMS * n))
+
+
+def numbers_of(automaton: Automaton, guards: int) -> Numbers:
+    """The numbers of one automaton, padded to so many guards a mode."""
+    n, modes = len(automaton.names), automaton.modes
+    rows, resets = np.zeros((len(modes), guards, n)), np.zeros((len(modes), guards, n, n))
+    for m, mode in enumerate(modes):
+        for g, guard in enumerate(mode.guards):
+            rows[m, g] = guard.row
+            if guard.reset is not None:
+                resets[m, g] = guard.reset
+    return Numbers(automaton.flows.ravel(), rows.ravel(), resets.ravel())
+
+
+def build_tables(automaton: Automaton, step: float) -> Tables:
+    """All tables of `automaton` for one search step in seconds."""
+    tables = empty_tables(automaton)
+    fill_tables(tables, numbers_of(automaton, tables.guards), step, new_workspace(tables))
+    return tables
+
+
+@bare
+def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
+    """Tables of the automaton with these numbers; `t` has its structure."""
+    _fill_guards(t, numbers, w)
+    modes = len(t.guard_count)
+    flow = 0
+    for m in range(modes):
+        if t.flow_of[m] == flow:
+            _fill_flow(t, numbers, flow, m, step, w)
+            flow += 1
+    for m in range(modes):
+        for g in range(t.guards):
+            _fill_series(t, numbers, m, g, step, w)
+        _fill_single(t, m)
+
+
+@inlined
+def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
+    """Rows, slopes and resets."""
+    n = t.states
+    for i in range(len(t.rows)):
+        t.rows[i] = numbers.rows[i]
+    for m in range(len(t.guard_count)):
+        for g in range(t.guard_count[m]):
+            at = (m * t.guards + g) * n
+            product(numbers.flows, m * n * n, n, n, t.rows[at : at + n], w.slopes[at : at + n])
+            for i in range(n):
+                w.slopes[at + i] /= 3.0
+                for j in range(n):
+                    t.reset[(at + j) * n + i] = numbers.resets[(at + i) * n + j] - (i == j)
+
+
+@inlined
+def _store(p: Powers, n: int, table: Array, base: int) -> None:
+    """The present power, transposed."""
+    for i in range(n):
+        for j in range(n):
+            table[base + j * n + i] = p.power[i * n + j]
+
+
+@inlined
+def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
+    """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
+    n, p = t.states, w.powers
+    _fill_orders(t, numbers, flow, mode, step, w)
+    start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
+    base = flow * PARTS * n * n
+    for i in range(n * n):
+        t.jump_part[base + i] = 0.0
+    for j in range(1, PARTS):
+        _store(p, n, t.jump_part, base + j * n * n)
+        next_power(n, p)
+    _fill_nodes(t, t.fine, t.jump_fine, NODES_FINE, flow, step, w)
+    _fill_nodes(t, t.coarse, t.jump_coarse, NODES_COARSE, flow, step * NODES_FINE, w)
+
+
+@inlined
+def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
+    """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
+    n, stride = t.states, t.states * PART_TERMS
+    base, source = flow * n * stride, mode * n * n
+    for i in range(n):
+        for j in range(n):
+            w.powers.term[j] = numbers.flows[source + i * n + j] * (step / PARTS)
+        for k in range(PART_TERMS):
+            for j in range(n):
+                t.flow_part[base + j * stride + k * n + i] = w.powers.term[j]
+            product(numbers.flows, source, n, n, w.powers.term[:n], w.next_row)
+            for j in range(n):
+                w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
+
+
+@inlined
+def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, spacing: float, w: Workspace) -> None:
+    """One scale: the present power becomes its base; its powers, and the guards at its nodes."""
+    n, p = t.states, w.powers
+    rebase(n, p)
+    for j in range(nodes):
+        if j > 0:
+            next_power(n, p)
+        _store(p, n, jumps, (flow * nodes + j) * n * n)
+        for m in range(len(t.guard_count)):
+            if t.flow_of[m] == flow:
+                for g in range(t.guard_count[m]):
+                    _fill_guard(t, table, nodes, m, g, j + 1, spacing, w)
+
+
+@inlined
+def _fill_guard(
+    t: Tables, table: Array, nodes: int, mode: int, g: int, node: int, spacing: float, w: Workspace
+) -> None:
+    """A guard's value and a third of its slope at a node, and at node 0 together with node 1."""
+    n, count = t.states, t.guard_count[mode]
+    stride = (2 * t.guards * (nodes + 1) + VECTOR - 1) // VECTOR * VECTOR
+    at = mode * n * stride + g * (nodes + 1) + node
+    thirds = count * (nodes + 1)
+    guard = (mode * t.guards + g) * n
+    row = t.rows[guard : guard + n]
+    for j in range(n):
+        w.slope[j] = w.slopes[guard + j] * spacing
+    product(w.powers.power, 0, n, n, row, w.row)
+    product(w.powers.power, 0, n, n, w.slope, w.next_row)
+    for j in range(n):
+        table[at + j * stride] = row[j] + w.row[j]
+        table[at + j * stride + thirds] = w.slope[j] + w.next_row[j]
+        if node == 1:
+            table[at + j * stride - 1] = row[j]
+            table[at + j * stride + thirds - 1] = w.slope[j]
+
+
+@inlined
+def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w: Workspace) -> None:
+    """A guard's Taylor series over a step, the sizes of all the terms that enter it and each of its derivatives."""
+    n = t.states
+    at = mode * t.guards + g
+    for i in range(n):
+        w.row[i] = t.rows[at * n + i]
+        t.changes[at * n + i] = 1e-12 * abs(w.row[i])
+    for k in range(TERMS):
+        for i in range(n):
+            t.taylor[(at * n + i) * TERMS + k] = w.row[i]
+            w.orders[k * n + i] = abs(w.row[i])
+            if k > 0:
+                t.changes[at * n + i] += abs(w.row[i])
+        product(numbers.flows, mode * n * n, n, n, w.row, w.next_row)
+        for i in range(n):
+            w.row[i] = w.next_row[i] * (step / (k + 1))
+    for k in range(TERMS):
+        # Partial sums from the end: the k-th time they are the terms of the k-th derivative's own series.
+        for j in range(TERMS - 2, k - 1, -1):
+            for i in range(n):
+                w.orders[j * n + i] += w.orders[(j + 1) * n + i]
+        for i in range(n):
+            t.sizes[(at * TERMS + k) * n + i] = w.orders[k * n + i]
+
+
+@inlined
+def _fill_single(t: Tables, mode: int) -> None:
+    """One step: the flow's first power, and every guard's Bernstein rows from its values and slopes at both ends."""
+    n, stride = t.states, t.states + 4 * t.guards
+    count, nodes = t.guard_count[mode], NODES_FINE + 1
+    width = (2 * t.guards * nodes + VECTOR - 1) // VECTOR * VECTOR
+    for j in range(n):
+        at, source = (mode * n + j) * stride, (mode * n + j) * width
+        for r in range(n):
+            t.single[at + r] = t.jump_fine[(t.flow_of[mode] * NODES_FINE * n + j) * n + r]
+        for g in range(count):
+            value, third = source + g * nodes, source + (count + g) * nodes
+            to = at + n + 4 * g
+            t.single[to] = t.fine[value]
+            t.single[to + 1] = t.fine[value] + t.fine[third]
+            t.single[to + 2] = t.fine[value + 1] - t.fine[third + 1]
+            t.single[to + 3] = t.fine[value + 1]

@@ -1,0 +1,93 @@
+"""The kernel's tables against their definitions, and filled again for other numbers."""
+
+import numpy as np
+import pytest
+from test_exponential import exact, off
+
+from servotwin.hybrid.automaton import Automaton
+from servotwin.hybrid.build import build_tables, fill_tables, new_workspace, numbers_of
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, PARTS, TERMS, Tables, search_step
+from servotwin.plant.automaton import Shape, continuous_loop
+from servotwin.plant.servo import Servo
+
+SHAPES = [Shape(), Shape(dead_zone=False), Shape(gap=3), Shape(dead_zone=False, bias=True, feedforward=True)]
+
+
+def loop(shape: Shape, **changes: float) -> tuple[Automaton, float]:
+    """The paper's loop and its search step for 100 samples a second."""
+    servo = Servo.preset("paper").replace(**changes)
+    automaton = continuous_loop(servo, servo.controller, shape).automaton
+    return automaton, search_step(automaton, 0.01)[0]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_jumps_are_exponentials(shape: Shape) -> None:
+    automaton, step = loop(shape)
+    tables, n = build_tables(automaton, step), len(automaton.names)
+    parts = tables.jump_part.reshape(-1, PARTS, n, n)
+    fine = tables.jump_fine.reshape(-1, NODES_FINE, n, n)
+    assert not parts[:, 0].any()
+    for flow, which in zip(automaton.flows, tables.flow_of, strict=True):
+        for j in (1, 2, 17, PARTS - 1):
+            assert off(parts[which, j].T, exact(flow, j * step / PARTS, 30)) < 2e-15, j
+        assert off(fine[which, 0].T, exact(flow, step)) < 1e-14
+
+
+def test_every_scale_begins_where_the_finer_one_ends() -> None:
+    automaton, step = loop(Shape())
+    tables, n = build_tables(automaton, step), len(automaton.names)
+    fine = tables.jump_fine.reshape(-1, NODES_FINE, n, n)
+    coarse = tables.jump_coarse.reshape(-1, NODES_COARSE, n, n)
+    assert np.array_equal(fine[:, -1], coarse[:, 0])
+    one = np.eye(n) + coarse[:, 0].transpose(0, 2, 1)
+    for j in range(NODES_COARSE):
+        expected = np.linalg.matrix_power(one, j + 1) - np.eye(n)
+        assert np.abs(coarse[:, j].transpose(0, 2, 1) - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_equal_flows_are_kept_once() -> None:
+    """With a constant gap both flanks flow alike, and both sides of the dead zone always do."""
+    kept = [tuple(build_tables(*loop(shape)).flow_of.tolist()) for shape in SHAPES[:3]]
+    assert kept[1] == (0, 1, 0)
+    assert [len(set(flows)) for flows in kept] == [4, 2, 6]
+
+
+def test_series_of_a_guard() -> None:
+    """Its values along the flow by the polynomial, and sizes and changes that bound it."""
+    automaton, step = loop(Shape())
+    tables, n = build_tables(automaton, step), len(automaton.names)
+    taylor = tables.taylor.reshape(len(automaton.modes), tables.guards, n, TERMS)
+    sizes = tables.sizes.reshape(len(automaton.modes), tables.guards, TERMS, n)
+    for m, mode in enumerate(automaton.modes):
+        for g, guard in enumerate(mode.guards):
+            row = np.asarray(guard.row, dtype=float)
+            end = row + row @ exact(automaton.flows[m], step)
+            assert np.abs(taylor[m, g].sum(axis=1) - end).max() <= 1e-13 * np.abs(taylor[m, g]).sum(axis=1).max()
+            derivative = np.abs(taylor[m, g]) * np.arange(TERMS)
+            assert np.allclose(sizes[m, g, 0], np.abs(taylor[m, g]).sum(axis=1), rtol=1e-13, atol=0.0)
+            assert np.allclose(sizes[m, g, 1], derivative.sum(axis=1), rtol=1e-13, atol=0.0)
+
+
+def test_terms_of_a_part() -> None:
+    automaton, step = loop(Shape())
+    tables, n = build_tables(automaton, step), len(automaton.names)
+    terms = tables.flow_part.reshape(-1, n, PART_TERMS, n)
+    for flow, which in zip(automaton.flows, tables.flow_of, strict=True):
+        expected = flow * (step / PARTS)
+        assert np.allclose(terms[which, :, 0].T, expected, rtol=1e-15, atol=0.0)
+        assert np.allclose(terms[which, :, 1].T, expected @ expected / 2.0, rtol=1e-13, atol=1e-25)
+        assert np.abs(terms[which].sum(axis=1).T - exact(flow, step / PARTS, 30)).max() < 1e-9
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_filled_again_they_are_as_new(shape: Shape) -> None:
+    """Nothing of what the tables held before stays."""
+    (first, step), (second, other) = loop(shape), loop(shape, k=1.1e4, c=20.0, Ki=3e3)
+    fresh, reused = build_tables(second, other), build_tables(first, step)
+    assert not same(fresh, reused)
+    fill_tables(reused, numbers_of(second, reused.guards), other, new_workspace(reused))
+    assert same(fresh, reused)
+
+
+def same(one: Tables, other: Tables) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
