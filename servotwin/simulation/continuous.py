@@ -16,6 +16,7 @@ from servotwin.plant.noise import NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.run import Inputs, quantised
+from servotwin.simulation.swap import Place, swapped
 
 _NOISE_BLOCK = 4096
 
@@ -32,10 +33,10 @@ class ContinuousEngine:
     noise: NoiseSource | None = None
 
     def __post_init__(self) -> None:
-        if self.controller.rate_limit is not None:
-            raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
+        _refuse_rate_limit(self.controller)
         signals = {name: self._signal(name) for name in INPUTS}
-        self.loop = continuous_loop(self.servo, self.controller, self._shape(self.controller))
+        self.past: list[tuple[ServoAutomaton, Trajectory]] = []
+        self.loop = self._automaton(self.controller)
         state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
@@ -50,9 +51,9 @@ class ContinuousEngine:
         mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
         self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
 
-    def _shape(self, controller: Controller) -> Shape:
+    def _automaton(self, controller: Controller, offset: bool = False) -> ServoAutomaton:
         reference, gap, tolerance = (degree(self._signal(name)) for name in INPUTS)
-        return Shape(
+        shape = Shape(
             reference,
             gap,
             tolerance,
@@ -61,7 +62,9 @@ class ContinuousEngine:
             bias=self.inputs.input_bias != 0.0,
             friction=self.inputs.friction != 0.0,
             feedforward=controller.feedforward != 0.0,
+            offset=offset,
         )
+        return continuous_loop(self.servo, controller, shape)
 
     def _signal(self, name: str) -> PiecewiseCubic:
         pieces: PiecewiseCubic | None = getattr(self.inputs, name)
@@ -102,16 +105,43 @@ class ContinuousEngine:
         """A constant tolerance from now on."""
         self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
 
+    def set_controller(self, controller: Controller, tolerance: float | None) -> None:
+        """Another controller from now on, the voltage going on where it is; a constant tolerance unless None."""
+        _refuse_rate_limit(controller)
+        values = controller_constants(controller)
+        if tolerance is not None:
+            names = [name for name in self.loop.automaton.names if name.startswith("tolerance")]
+            values |= dict.fromkeys(names, 0.0) | {"tolerance": tolerance}
+        now, index = Place(self.loop, self.trajectory.state, self.trajectory.mode), self.index
+        place = swapped(now, controller, values, lambda offset: self._automaton(controller, offset))
+        self.past.append((self.loop, self.trajectory))
+        self.controller, self.loop = controller, place.loop
+        step = 1.0 / self.inputs.sample_rate
+        self.trajectory = Trajectory(place.loop.automaton, place.state, place.mode, step, self.refine, index)
+        self.trajectory.advance(index)
+
     def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1."""
-        if name == "measured_position":
-            sensed = self.trajectory.sampled(self.loop.rows[name], first, last)
-            return quantised(sensed, self.servo.position_resolution)
-        return self.trajectory.sampled(self.loop.rows[name], first, last)
+        pieces = [*self.past, (self.loop, self.trajectory)]
+        ends = [trajectory.first for _, trajectory in pieces[1:]] + [last]
+        parts = []
+        for (loop, trajectory), end in zip(pieces, ends, strict=True):
+            begin, end = max(first, trajectory.first), min(end, last)
+            if begin < end:
+                parts.append(trajectory.sampled(loop.rows[name], begin, end))
+        values = np.concatenate(parts) if parts else np.empty(0)
+        return quantised(values, self.servo.position_resolution) if name == "measured_position" else values
 
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Time, kind, side, and whether the state (not a jump) triggered it."""
-        return [(time, kind, side, not forced) for time, kind, side, forced in self.trajectory.events()]
+        trajectories = [*(trajectory for _, trajectory in self.past), self.trajectory]
+        found = [event for trajectory in trajectories for event in trajectory.events()]
+        return [(time, kind, side, not forced) for time, kind, side, forced in found]
+
+
+def _refuse_rate_limit(controller: Controller) -> None:
+    if controller.rate_limit is not None:
+        raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
 
 
 def start_zone(error: float, enter: float) -> str:

@@ -66,6 +66,7 @@ class SampledEngine:
         self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
         self.parameters = self.controller.law(None)
         self.source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
+        self.drawn = np.zeros(0)
         self.port = self._make_port(searches)
         total = (self.samples - 1) * self.record_every + 1
         ticks = -(-total // self.tick_every)
@@ -129,8 +130,15 @@ class SampledEngine:
             zero = tolerance == 0.0
             enter = np.where(zero, -1.0, self.controller.enter * tolerance)
             leave = np.where(zero, -1.0, self.controller.leave * tolerance)
-        noise = np.zeros(count) if self.source is None else self.source.block(count)
-        return Drive(first, self.inputs.reference.on(times), noise, enter, leave)
+        return Drive(first, self.inputs.reference.on(times), self._noise(count), enter, leave)
+
+    def _noise(self, count: int) -> Array:
+        """Noise of the next ticks; those that a change of controller looked at are `drawn` already."""
+        if self.source is None:
+            return np.zeros(count)
+        values = np.concatenate([self.drawn, self.source.block(max(count - self.drawn.size, 0))])
+        self.drawn = values[count:]
+        return values[:count]
 
     def _run(self, end: int) -> None:
         while self.base < end:
@@ -179,6 +187,23 @@ class SampledEngine:
 
     def set_tolerance(self, _tolerance: float) -> None:
         """Nothing to do: the ticks to come read the inputs."""
+
+    def set_controller(self, controller: Controller, tolerance: float | None) -> None:
+        """Another controller from the tick that is due on, its voltage at that tick the same; a constant tolerance
+        unless None."""
+        tick = -(-self.base // self.tick_every)
+        time = tick / self.tick_rate
+        planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
+        self.drawn = noise = self._noise(1)
+        measured = float(self.plant.rows["position"][0] @ self.state + noise[0])
+        self.law_state = law.transfer(
+            self.controller.law(planned),
+            controller.law(planned if tolerance is None else tolerance),
+            self.law_state,
+            float(self.inputs.reference.value(time)),
+            float(quantised(np.array(measured), self.servo.position_resolution)),
+        )
+        self.controller, self.parameters = controller, controller.law(None)
 
     def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1; at the present one, before its tick, the voltage is still the

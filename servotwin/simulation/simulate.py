@@ -27,6 +27,7 @@ class Engine(Protocol):
     def index(self) -> int: ...
     def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
+    def set_controller(self, controller: Controller, tolerance: float | None) -> None: ...
     def channel(self, name: str, first: int, last: int) -> Array: ...
     def events(self) -> list[tuple[float, str, int, bool]]: ...
 
@@ -123,12 +124,43 @@ class Simulation:
 
     def set_tolerance(self, tolerance: float) -> None:
         """A new dead-zone half-width (m) from the present sample on; it replaces whatever was planned."""
+        self._check_tolerance(tolerance)
+        self.inputs.retune(self.time, tolerance)
+        self.engine.set_tolerance(tolerance)
+
+    def set_controller(self, controller: Controller, tolerance: float | None = None) -> None:
+        """Another controller from the present sample on, without a jump of the voltage.
+
+        Parameters
+        ----------
+        controller : Controller
+            As continuous or sampled as the one before, at the same rate. What it would give less or more at this
+            instant becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
+        tolerance : float, optional
+            m, a new dead-zone half-width, which replaces whatever was planned; None keeps that.
+
+        Raises
+        ------
+        InvalidInput
+            For another sample rate, or a tolerance that is negative or that this simulation cannot have.
+        """
+        if controller.sample_rate != self.controller.sample_rate:
+            rates = (_described(law.sample_rate) for law in (self.controller, controller))
+            raise InvalidInput("controller sample_rate: a running simulation cannot go from {} to {}".format(*rates))
+        if tolerance is not None:
+            self._check_tolerance(tolerance)
+        if controller == self.controller and tolerance is None:
+            return
+        self.engine.set_controller(controller, tolerance)
+        self.controller = controller
+        if tolerance is not None:
+            self.inputs.retune(self.time, tolerance)
+
+    def _check_tolerance(self, tolerance: float) -> None:
         if self.inputs.tolerance is None:
             raise InvalidInput("this simulation has no dead zone: start it with tolerance=0.0 to set one later")
         if not (np.isfinite(tolerance) and tolerance >= 0.0):
             raise InvalidInput(f"tolerance = {tolerance} m: must be finite and 0 or more")
-        self.inputs.retune(self.time, tolerance)
-        self.engine.set_tolerance(tolerance)
 
     def measured(self, name: str, first: int, last: int) -> Array:
         """What a sensor or the law gave at samples first .. last - 1.
@@ -169,6 +201,10 @@ def simulate(servo: Servo, duration: float, **options: Any) -> Run:
     simulation = Simulation(servo, duration, **options)
     simulation.advance(simulation.samples - 1)
     return simulation.run()
+
+
+def _described(sample_rate: float | None) -> str:
+    return "continuous" if sample_rate is None else f"sampled at {sample_rate} Hz"
 
 
 def _check_times(duration: float, sample_rate: float) -> None:
