@@ -13,8 +13,8 @@ from typing import Any
 
 from servotwin import scenariofile
 from servotwin.control.controller import Controller
-from servotwin.edge.parameters import Parameters
-from servotwin.edge.settings import AgentSettings
+from servotwin.edge.parameters import Parameters, gains_of
+from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
@@ -64,6 +64,11 @@ class Scenario:
         Edge to twin, and back.
     twin : TwinSettings
         Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
+    supervision : Supervision, optional
+        How the edge looks after itself; then updates may set gains too, in a box around the servo's own, and every
+        change leaves the voltage where it is. None: updates set the tolerance, at once, and the edge trusts them.
+    input_bias, friction : float
+        What disturbs the plant: V on its input, and N m of Coulomb friction on the motor's shaft.
 
     Raises
     ------
@@ -84,6 +89,9 @@ class Scenario:
     uplink: LinkSettings = field(default_factory=LinkSettings)
     downlink: LinkSettings = field(default_factory=LinkSettings)
     twin: TwinSettings = field(default_factory=TwinSettings)
+    supervision: Supervision | None = None
+    input_bias: float = 0.0
+    friction: float = 0.0
 
     def __post_init__(self) -> None:
         if not re.fullmatch(NAME_PATTERN, self.name):
@@ -182,6 +190,9 @@ class Scenario:
             limits=r.limits,
             parameters=Parameters(tolerance=self.start_tolerance),
             model_version=self.servo.version,
+            controller=None if self.supervision is None else self.law,
+            own=None if self.supervision is None else gains_of(self.servo.controller),
+            supervision=self.supervision or Supervision(),
         )
 
     def seed_of(self, source: str) -> int:

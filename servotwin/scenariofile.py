@@ -7,16 +7,20 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from servotwin.control.controller import Controller
+from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import gains_of
+from servotwin.edge.settings import Supervision
 from servotwin.errors import InvalidInput
 from servotwin.identify import settingsfile
 from servotwin.identify.gap import METHODS
 from servotwin.identify.trend import TrendSettings
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
+from servotwin.messages import Gains
 from servotwin.plant import servofile
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
@@ -25,6 +29,7 @@ from servotwin.tomltable import Table, given
 from servotwin.twin.settings import TwinSettings
 
 MM = 1e-3
+_GAINS = [key for key in servofile.CONTROLLER if key.symbol in Gains.__struct_fields__]
 DEG = math.pi / 180.0
 
 
@@ -75,8 +80,10 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "gap": _read(table, "gap", _gap),
         "recording": _read(table, "recording", _recording),
         "twin": _read(table, "twin", _twin),
+        **_read(table, "disturbances", _disturbances),
     }
     values["controller"] = _read(table, "controller", lambda t: _controller(t, servo.controller))
+    values["supervision"] = _supervision(table, values["controller"] or servo.controller)
     values["noise"] = _read(table, "noise", _noise) if "noise" in table.values else None
     values["uplink"], values["downlink"] = _read(table, "link", _links)
     table.table("noise")
@@ -214,7 +221,7 @@ def _recording(table: Table) -> Recording:
         pre_trigger=table.number("pre_trigger_s", None, minimum=0.0),
         fine_angle=table.boolean("fine_angle", default.fine_angle),
         retry=_retry(table, default.retry),
-        limits=_read(table, "limits", _limits),
+        limits=_read(table, "limits", edgefile.limits),
     )
 
 
@@ -226,14 +233,23 @@ def _retry(table: Table, default: Retry) -> Retry:
     )
 
 
-def _limits(table: Table) -> Limits:
-    return Limits(
-        minimum=table.number("minimum_mm", 0.0, minimum=0.0) * MM,
-        maximum=table.number("maximum_mm", math.inf, minimum=0.0, infinite=True) * MM,
-        max_step=table.number("max_step_mm", math.inf, positive=True, infinite=True) * MM,
-        lifetime_s=table.number("lifetime_s", math.inf, positive=True, infinite=True),
-        interval_s=table.number("interval_s", 0.0, minimum=0.0),
-    )
+def _supervision(table: Table, controller: Controller) -> Supervision | None:
+    """[edge]: updates may set gains, and the edge looks after itself; without it, they set the tolerance only."""
+    if "edge" not in table.values:
+        return None
+
+    def gains(inner: Table) -> Gains:
+        changed = given(inner, {key.name: (key.symbol, key.read) for key in _GAINS})
+        return gains_of(controller.replace(**changed))
+
+    return cast(Supervision, _read(table, "edge", lambda inner: edgefile.supervision(inner, gains)))
+
+
+def _disturbances(table: Table) -> dict[str, float]:
+    return {
+        "input_bias": table.number("input_bias_v", 0.0),
+        "friction": table.number("friction_n_m", 0.0, minimum=0.0),
+    }
 
 
 def _twin(table: Table) -> TwinSettings:

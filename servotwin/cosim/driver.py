@@ -15,11 +15,12 @@ from functools import partial
 from typing import Protocol
 
 from servotwin.clock import Event, VirtualClock
+from servotwin.control.controller import Controller
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.recorder import Floats
 from servotwin.link.simulated import SimulatedLink
-from servotwin.messages import Message, Receipt, Update, decode, encode
+from servotwin.messages import Fallback, Message, Receipt, Update, decode, encode
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run, Simulation
 from servotwin.twin.store import MemoryStore
@@ -74,6 +75,9 @@ class Machine(Protocol):
     def set_tolerance(self, tolerance: float) -> None:
         """A new dead zone (m) from the present sample on."""
 
+    def set_controller(self, controller: Controller, tolerance: float) -> None:
+        """Another controller and dead zone (m) from the present sample on, the voltage unchanged by it."""
+
 
 class Cosimulation:
     """Machine, agent, link and twin, and the clock that connects them; `advance` it until it is `done`."""
@@ -88,6 +92,8 @@ class Cosimulation:
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
+        self.fallbacks: list[Fallback] = []
+        self._in_force = self.agent.parameters
         self._wake: Event | None = None
 
     @property
@@ -105,7 +111,9 @@ class Cosimulation:
         first, stop = self.machine.index, self._next_stop()
         self.machine.advance(stop)
         blocks = (self.machine.measured(name, first, stop) for name in CHANNELS)
-        for outgoing in self.agent.absorb_block(*blocks):
+        sent = self.agent.absorb_block(*blocks)
+        self._retune()
+        for outgoing in sent:
             time = outgoing.sample / self.scenario.recording.sample_rate
             self.clock.schedule(max(time, self.clock.now), partial(self._send_up, outgoing))
         while (due := self.clock.next_time) is not None and self._sample_at(due) <= stop:
@@ -121,6 +129,7 @@ class Cosimulation:
             trends=tuple(self.store.trends.values()),
             updates=tuple(self.store.updates),
             receipts=tuple(self.receipts),
+            fallbacks=tuple(self.fallbacks),
             messages=tuple(sorted(self._transmissions(), key=lambda m: (m.sent, m.direction, m.serial, m.copy))),
             accounts=self._accounts(),
         )
@@ -142,15 +151,27 @@ class Cosimulation:
     def _send_up(self, outgoing: Outgoing) -> None:
         if isinstance(outgoing.message, Receipt):
             self.receipts.append(outgoing.message)
+        elif isinstance(outgoing.message, Fallback):
+            self.fallbacks.append(outgoing.message)
         self.link.up.send(encode(outgoing.message))
 
     def _at_edge(self, data: bytes) -> None:
         """Bytes arrive at the machine."""
-        version = self.agent.parameters.version
-        for outgoing in self.agent.receive(decode(data)):
+        sent = self.agent.receive(decode(data))
+        self._retune()
+        for outgoing in sent:
             self._send_up(outgoing)
-        if self.agent.parameters.version != version:
-            self.machine.set_tolerance(self.agent.parameters.tolerance)
+
+    def _retune(self) -> None:
+        """Let the machine run on what the agent has put in force."""
+        wanted, controller = self.agent.parameters, self.agent.controller
+        if wanted is self._in_force:
+            return
+        self._in_force = wanted
+        if controller is None:
+            self.machine.set_tolerance(wanted.tolerance)
+        else:
+            self.machine.set_controller(controller, wanted.tolerance)
 
     def _at_twin(self, data: bytes) -> None:
         """Bytes arrive at the twin; one that is switched off lets them lie."""
@@ -196,4 +217,6 @@ def simulation_of(scenario: Scenario) -> Simulation:
         sample_rate=scenario.recording.sample_rate,
         noise=scenario.noise,
         seed=scenario.seed_of("noise"),
+        input_bias=scenario.input_bias,
+        friction=scenario.friction,
     )

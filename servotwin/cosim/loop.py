@@ -10,7 +10,7 @@ from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.passage import Passage
 from servotwin.identify.trend import Trend
 from servotwin.link.simulated import Fate
-from servotwin.messages import Message, Receipt, Update, Window, decode
+from servotwin.messages import Fallback, Message, Receipt, Update, Window, decode
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run
 
@@ -66,6 +66,8 @@ class Loop:
         Every version that the twin gave out.
     receipts : tuple of messages.Receipt
         Every decision of the edge, in its order (repeated answers included).
+    fallbacks : tuple of messages.Fallback
+        When and why the edge left the twin's parameters.
     messages : tuple of Transmission
         Every copy of every message, in the order of sending.
     accounts : Counter
@@ -79,6 +81,7 @@ class Loop:
     trends: tuple[Trend | None, ...]
     updates: tuple[Update, ...]
     receipts: tuple[Receipt, ...]
+    fallbacks: tuple[Fallback, ...]
     messages: tuple[Transmission, ...]
     accounts: Counter[str]
 

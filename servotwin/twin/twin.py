@@ -8,17 +8,20 @@ from dataclasses import replace
 from functools import partial
 
 from servotwin.errors import InvalidInput
+from servotwin.identify import whitened
+from servotwin.identify.disturbance import Disturbance, disturbance, nothing_known
 from servotwin.identify.estimate import GapEstimate, no_estimate
 from servotwin.identify.gap import estimate_gap, settings_of
 from servotwin.identify.offset import estimate_carrying
 from servotwin.identify.trend import Trend
-from servotwin.identify.whitened.estimator import Settings
 from servotwin.identify.window import Window
-from servotwin.messages import Acknowledge, Hello, InvalidMessage, Message, Receipt, Update, finite
+from servotwin.messages import Acknowledge, Fallback, Hello, InvalidMessage, Message, Receipt, Update, finite
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.redesign.policy import PaperPolicy, Redesign
+from servotwin.redesign.evidence import UNASKED, Evidence
+from servotwin.redesign.policy import PaperPolicy, Policy, Redesign
 from servotwin.twin.decode import decode_window
+from servotwin.twin.inforce import InForce, Settings, gains_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
@@ -26,8 +29,8 @@ from servotwin.twin.wear import Expectation, Wear
 
 Estimator = Callable[[Window, Expectation], GapEstimate]
 """(window, what is known before it) -> estimate."""
-Policy = Callable[[GapEstimate, float | None], Redesign]
-"""(estimate, gap of the last redesign in rad or None) -> what to do."""
+Observer = Callable[[Window], Disturbance]
+"""window -> input bias and noise."""
 
 
 class Twin:
@@ -44,31 +47,53 @@ class Twin:
         Whose messages it takes.
     estimator : callable
         (identify.Window, Expectation) -> GapEstimate.
-    policy : callable
-        (estimate, gap of the last redesign in rad, or None) -> Redesign (Eq 21).
+    policy : Policy
+        Makes a setting of the evidence; where it raises InvalidInput, there is none.
     store : Store
         Evidence; `add_window` has to return only when the window is safe.
     settings : TwinSettings
+    observer : callable, optional
+        identify.Window -> Disturbance; None: nobody looks.
+    start : InForce, optional
+        What the edge runs before the first update.
     """
 
     def __init__(
-        self, servo: str, estimator: Estimator, policy: Policy, store: Store, settings: TwinSettings | None = None
+        self,
+        servo: str,
+        estimator: Estimator,
+        policy: Policy,
+        store: Store,
+        settings: TwinSettings | None = None,
+        observer: Observer | None = None,
+        start: InForce | None = None,
     ) -> None:
         self.servo = servo
         self.settings = settings or TwinSettings()
-        self._estimator, self._policy, self._store = estimator, policy, store
-        self._versions = Versions()
+        self._estimator, self._policy, self._store, self._observer = estimator, policy, store, observer
+        self._versions, self._known = Versions(), Settings({0: start or InForce()})
         self._wear = Wear(self.settings.initial_gap, self.settings.trend)
         self._tuned_for: float | None = None
         self._sent_at, self._attempts = -math.inf, 0
 
     @classmethod
     def of(
-        cls, name: str, servo: Servo, store: Store, settings: TwinSettings, estimator: Estimator | None = None
+        cls,
+        name: str,
+        servo: Servo,
+        store: Store,
+        settings: TwinSettings,
+        estimator: Estimator | None = None,
+        start: InForce | None = None,
     ) -> Twin:
-        """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs."""
-        policy = PaperPolicy(settings.k_dz, settings.smoothing)
-        return cls(name, estimator or estimator_of(servo, settings), partial(policy.redesign, servo), store, settings)
+        """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs.
+
+        Without `start` the edge is taken to begin with the servo's own controller.
+        """
+        policy = PaperPolicy(servo, settings.k_dz, settings.smoothing)
+        begins = start or InForce(servo.controller)
+        chosen = estimator or estimator_of(servo, settings)
+        return cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins)
 
     @property
     def trend(self) -> Trend | None:
@@ -90,6 +115,11 @@ class Twin:
         if isinstance(message, Receipt):
             self._store.add_receipt(message)
             return self._send(self._versions.settle(message), now)
+        if isinstance(message, Fallback):
+            self._versions.left(message)
+            return []
+        if isinstance(message, Fallback):
+            return self._fallen_back(message)
         if isinstance(message, Hello):
             self._versions.hear(message.boot, message.parameter_version)
             return []
@@ -117,6 +147,15 @@ class Twin:
         except InvalidInput as error:
             return _nothing(message, str(error))
 
+    def observe(self, message: WindowMessage) -> Disturbance:
+        """What a window says about input bias and noise; where it cannot be used at all, nothing and why."""
+        if self._observer is None:
+            return UNASKED
+        try:
+            return self._observer(decode_window(message))
+        except InvalidInput as error:
+            return nothing_known(math.nan, str(error))
+
     def _window(self, message: WindowMessage, now: float) -> list[Message]:
         new = self._store.add_window(message)
         acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
@@ -124,20 +163,48 @@ class Twin:
 
     def _learn(self, message: WindowMessage, now: float) -> list[Message]:
         self._versions.hear(message.boot, message.parameter_version)
-        estimate = self.estimate(message, now)
+        estimate, disturbed = self.estimate(message, now), self.observe(message)
         self._store.add_estimate(message, estimate)
-        counts = self._versions.admits(message) and self._wear.learn(message.boot, estimate, now)
+        self._store.add_disturbance(message, disturbed)
+        why_not = self._refusal(message, estimate, now)
         self._store.add_trend(message, self.trend)
-        if not counts:
-            return []
-        redesign = self._policy(estimate, self._tuned_for)
+        redesign = Redesign(None, math.nan, why_not) if why_not else self._redesign(estimate, disturbed)
+        self._store.add_redesign(message, redesign)
         if redesign.tolerance is None:
             return []
         self._tuned_for = redesign.gap
-        return self._send(self._versions.issue(self._draft(message, estimate, redesign.tolerance)), now)
+        return self._send(self._versions.issue(self._draft(message, estimate, redesign)), now)
 
-    def _draft(self, message: WindowMessage, estimate: GapEstimate, tolerance: float) -> Update:
+    def _refusal(self, message: WindowMessage, estimate: GapEstimate, now: float) -> str:
+        """Why no parameters may stand on a window; empty where they may, and the trend has learnt from it."""
+        if not self._versions.admits(message):
+            return "the window is not newer than what the parameters stand on, or of an earlier boot"
+        if not estimate.ok:
+            return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
+        if self._wear.learn(message.boot, estimate, now):
+            return ""
+        return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
+
+    def _redesign(self, estimate: GapEstimate, disturbed: Disturbance) -> Redesign:
+        now = self._known.of(self._versions.in_force)
+        evidence = Evidence(estimate, disturbed, self.trend, now.controller, now.tolerance)
+        try:
+            return self._policy.redesign(evidence, self._tuned_for)
+        except InvalidInput as error:
+            return Redesign(None, math.nan, str(error))
+
+    def _fallen_back(self, message: Fallback) -> list[Message]:
+        """The edge has left what this twin gave it: nothing made before is sent again."""
+        self._store.add_fallback(message)
+        if self._versions.hear(message.boot, message.parameter_version):
+            self._known.fall_back(message)
+            self._versions.give_up()
+            self._tuned_for = None
+        return []
+
+    def _draft(self, message: WindowMessage, estimate: GapEstimate, redesign: Redesign) -> Update:
         """An update but for its version and base."""
+        assert redesign.tolerance is not None
         low, high = estimate.interval
         return Update(
             servo=self.servo,
@@ -149,14 +216,17 @@ class Twin:
             std=finite(estimate.std_total),
             interval=(finite(low), finite(high)),
             status=estimate.status.value,
-            tolerance=tolerance,
+            tolerance=redesign.tolerance,
             not_after=message.start + self.settings.validity,
+            controller=None if redesign.controller is None else gains_of(redesign.controller),
+            band=redesign.band,
         )
 
     def _send(self, update: Update | None, now: float) -> list[Message]:
         if update is None:
             return []
         self._store.add_update(update)
+        self._known.issue(update)
         self._attempts = 0
         return self._again(now)
 
@@ -175,7 +245,7 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     given = settings_of(settings.method, settings.estimator)
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        if not isinstance(given, Settings):
+        if not isinstance(given, whitened.Settings):
             return estimate_gap(window, servo, settings.method, expected.previous, given)
         drift = given.gap_rate or expected.gap_rate(settings.trend)
         return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)
