@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from servotwin.identify.trend import TrendSettings
 from servotwin.identify.window import Window
 from servotwin.messages import Acknowledge, Hello, InvalidMessage, Reason, Receipt, pack_channel
 from servotwin.plant.servo import Servo
+from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.twin.decode import decode_channel, decode_window
 from servotwin.twin.settings import TwinSettings
@@ -40,13 +40,24 @@ def known_gap(window: Window, _expected: Expectation) -> GapEstimate:
     return GapEstimate(gap, 0.0, 0.0, (gap, gap), GapStatus.OK, window.mid_time)
 
 
-def eq_21(estimate: GapEstimate, _previous: float | None) -> Redesign:
-    return Redesign(PITCH * estimate.gap, estimate.gap, "")
+class Rule:
+    """A policy of one line."""
+
+    def __init__(self, rule):
+        self.rule, self.asked = rule, []
+
+    def redesign(self, evidence: Evidence, tuned_for: float | None) -> Redesign:
+        self.asked.append((evidence, tuned_for))
+        return self.rule(evidence)
+
+
+def eq_21() -> Rule:
+    return Rule(lambda evidence: Redesign(PITCH * evidence.estimate.gap, evidence.estimate.gap, ""))
 
 
 def make(estimator=known_gap, **settings):
     store = MemoryStore()
-    return Twin("axis", estimator, eq_21, store, TwinSettings(**settings)), store
+    return Twin("axis", estimator, eq_21(), store, TwinSettings(**settings)), store
 
 
 def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):
@@ -85,7 +96,7 @@ def test_the_window_is_safe_before_it_is_acknowledged():
         def add_window(self, _):
             raise OSError("disk full")
 
-    twin = Twin("axis", known_gap, eq_21, Broken())
+    twin = Twin("axis", known_gap, eq_21(), Broken())
     with pytest.raises(OSError, match="disk full"):
         twin.receive(window_message(), 0.0)
 
@@ -132,7 +143,7 @@ def fed(gaps: dict[float, float]):
     """The updates that a twin sends for windows with these gaps, by their window's start, and its store."""
     store = MemoryStore()
     slow = TwinSettings(trend=TrendSettings.for_wear(0.1, 1000.0))
-    twin = Twin("axis", measured(gaps), eq_21, store, slow)
+    twin = Twin("axis", measured(gaps), eq_21(), store, slow)
     answers = {start: twin.receive(window_message(k, start), start)[1:] for k, start in enumerate(gaps)}
     return {start: update.gap for start, answer in answers.items() for update in answer}, store
 
@@ -288,12 +299,12 @@ def test_decoding_equals_the_edges_own():
 
 def test_the_policy_smooths_from_the_gap_it_last_tuned_for():
     servo = Servo.preset("paper")
-    twin = Twin("axis", known_gap, partial(PaperPolicy(smoothing=0.5).redesign, servo), MemoryStore())
+    twin = Twin("axis", known_gap, PaperPolicy(servo, smoothing=0.5), MemoryStore())
     updates = [twin.receive(window_message(k, 10.0 * k), 0.0)[1] for k in (1, 2, 3)]
     assert [update.tolerance / servo.p for update in updates] == pytest.approx([0.1, 0.15, 0.225])
     assert [update.gap for update in updates] == pytest.approx([0.1, 0.2, 0.3])
 
 
 def test_a_policy_may_leave_the_controller_alone():
-    twin = Twin("axis", known_gap, lambda _e, _p: Redesign(None, math.nan, "quiet"), MemoryStore())
+    twin = Twin("axis", known_gap, Rule(lambda _: Redesign(None, math.nan, "quiet")), MemoryStore())
     assert len(twin.receive(window_message(1, 10.0), 0.0)) == 1

@@ -1,13 +1,16 @@
-"""The paper's redesign: a dead zone as wide as the estimated gap (Eq 21)."""
+"""What a policy is, and the paper's: a dead zone as wide as the estimated gap (Eq 21)."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
+from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapEstimate
+from servotwin.messages import Band
 from servotwin.plant.servo import Servo
+from servotwin.redesign.evidence import Evidence
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,26 @@ class Redesign:
         Total gap, rad, that the tolerance was made for; NaN without one.
     reason : str
         Why the controller is left as it is; empty otherwise.
+    controller : Controller, optional
+        Whose gains are to be set, with the thresholds of the dead zone and the feedforward; its limits and rates stay
+        the edge's. None: the gains stay.
+    band : Band, optional
+        What the loop is predicted to stay within.
     """
 
     tolerance: float | None
     gap: float
     reason: str
+    controller: Controller | None = None
+    band: Band | None = None
+
+
+class Policy(Protocol):
+    """Makes a setting of evidence."""
+
+    def redesign(self, evidence: Evidence, tuned_for: float | None) -> Redesign:
+        """What to do; `tuned_for` is the gap (rad) of the last redesign, None before the first."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -35,6 +53,8 @@ class PaperPolicy:
 
     Parameters
     ----------
+    servo : Servo
+        For its pitch.
     k_dz : float
         Tolerances per gap (the paper's is one).
     smoothing : float
@@ -47,6 +67,7 @@ class PaperPolicy:
         A value is outside its range.
     """
 
+    servo: Servo
     k_dz: float = 1.0
     smoothing: float = 0.0
 
@@ -56,20 +77,12 @@ class PaperPolicy:
         if not 0.0 <= self.smoothing < 1.0:
             raise InvalidInput(f"policy smoothing = {self.smoothing!r}: must be at least 0 and below 1")
 
-    def redesign(self, servo: Servo, estimate: GapEstimate, previous_gap: float | None = None) -> Redesign:
-        """The tolerance for an estimate.
-
-        Parameters
-        ----------
-        servo : Servo
-            For its pitch.
-        estimate : GapEstimate
-        previous_gap : float, optional
-            rad, the gap of the last redesign; None: there was none, so nothing is smoothed.
-        """
+    def redesign(self, evidence: Evidence, tuned_for: float | None = None) -> Redesign:
+        """The tolerance for an estimate; smoothed only where there was a gap (rad) to tune for before."""
+        estimate = evidence.estimate
         if not estimate.ok:
             because = f": {'; '.join(estimate.reasons)}" if estimate.reasons else ""
             return Redesign(None, math.nan, f"the estimate is {estimate.status.value}{because}")
-        kept = self.smoothing if previous_gap is not None else 0.0
-        gap = (1.0 - kept) * estimate.gap + kept * (previous_gap or 0.0)
-        return Redesign(servo.tolerance_for(gap, self.k_dz), gap, "")
+        kept = self.smoothing if tuned_for is not None else 0.0
+        gap = (1.0 - kept) * estimate.gap + kept * (tuned_for or 0.0)
+        return Redesign(self.servo.tolerance_for(gap, self.k_dz), gap, "")

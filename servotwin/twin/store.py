@@ -1,13 +1,15 @@
-"""Where a twin keeps its evidence: window -> estimate -> update -> receipt."""
+"""Where a twin keeps its evidence: window -> estimate -> redesign -> update -> receipt."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
-from servotwin.messages import Receipt, Update, Window
+from servotwin.messages import Fallback, Receipt, Update, Window
+from servotwin.redesign.policy import Redesign
 
 Identity = tuple[str, str, int]
 """(servo, boot, sequence) of a window."""
@@ -24,8 +26,16 @@ class Store(Protocol):
         """Keep what was estimated from a window."""
         ...
 
+    def add_disturbance(self, window: Window, disturbance: Disturbance) -> None:
+        """Keep input bias and noise as a window shows them."""
+        ...
+
     def add_trend(self, window: Window, trend: Trend | None) -> None:
         """Keep what is known of the wear after a window; None: nothing yet."""
+        ...
+
+    def add_redesign(self, window: Window, redesign: Redesign) -> None:
+        """Keep what was made of a window; where that is nothing, why."""
         ...
 
     def add_update(self, update: Update) -> None:
@@ -36,6 +46,10 @@ class Store(Protocol):
         """Keep what the edge says it did."""
         ...
 
+    def add_fallback(self, fallback: Fallback) -> None:
+        """Keep what the edge did by itself."""
+        ...
+
 
 @dataclass
 class MemoryStore:
@@ -43,9 +57,12 @@ class MemoryStore:
 
     windows: dict[Identity, Window] = field(default_factory=dict)
     estimates: dict[Identity, GapEstimate] = field(default_factory=dict)
+    disturbances: dict[Identity, Disturbance] = field(default_factory=dict)
     trends: dict[Identity, Trend | None] = field(default_factory=dict)
+    redesigns: dict[Identity, Redesign] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
+    fallbacks: list[Fallback] = field(default_factory=list)
 
     def add_window(self, window: Window) -> bool:
         """Keep a window under its identity; False when it was there already."""
@@ -57,9 +74,17 @@ class MemoryStore:
         """Keep what was estimated from a window."""
         self.estimates[window.identity] = estimate
 
+    def add_disturbance(self, window: Window, disturbance: Disturbance) -> None:
+        """Keep bias and noise."""
+        self.disturbances[window.identity] = disturbance
+
     def add_trend(self, window: Window, trend: Trend | None) -> None:
         """Keep the trend after a window."""
         self.trends[window.identity] = trend
+
+    def add_redesign(self, window: Window, redesign: Redesign) -> None:
+        """Keep what was made of a window."""
+        self.redesigns[window.identity] = redesign
 
     def add_update(self, update: Update) -> None:
         """Keep an update."""
@@ -68,3 +93,7 @@ class MemoryStore:
     def add_receipt(self, receipt: Receipt) -> None:
         """Keep a receipt."""
         self.receipts.append(receipt)
+
+    def add_fallback(self, fallback: Fallback) -> None:
+        """Keep a fallback."""
+        self.fallbacks.append(fallback)

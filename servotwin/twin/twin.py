@@ -116,9 +116,6 @@ class Twin:
             self._store.add_receipt(message)
             return self._send(self._versions.settle(message), now)
         if isinstance(message, Fallback):
-            self._versions.left(message)
-            return []
-        if isinstance(message, Fallback):
             return self._fallen_back(message)
         if isinstance(message, Hello):
             self._versions.hear(message.boot, message.parameter_version)
@@ -196,9 +193,8 @@ class Twin:
     def _fallen_back(self, message: Fallback) -> list[Message]:
         """The edge has left what this twin gave it: nothing made before is sent again."""
         self._store.add_fallback(message)
-        if self._versions.hear(message.boot, message.parameter_version):
+        if self._versions.left(message):
             self._known.fall_back(message)
-            self._versions.give_up()
             self._tuned_for = None
         return []
 

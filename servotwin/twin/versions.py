@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from servotwin.messages import Fallback, Reason, Receipt, Update, Window
+from servotwin.messages import Reason, Receipt, Update, Window
 
 
 @dataclass
@@ -68,11 +68,6 @@ class Versions:
         if receipt.reason is Reason.BASE_MISMATCH or self.in_force > refused.version:
             return self._number(refused, self.in_force)
         return None
-
-    def left(self, fallback: Fallback) -> None:
-        """Note that the edge left what it ran: an update on its way to that will be refused and is not waited for."""
-        if self.hear(fallback.boot, fallback.parameter_version):
-            self.pending = None
 
     def give_up(self) -> None:
         """Stop waiting for a receipt."""

@@ -1,0 +1,37 @@
+"""What a policy decides on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servotwin.control.controller import Controller
+from servotwin.identify.disturbance import Disturbance, nothing_known
+from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.trend import Trend
+
+UNASKED = nothing_known(float("nan"), "nobody looked")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One window's answer, and what is known beside it.
+
+    Attributes
+    ----------
+    estimate : GapEstimate
+        Of the gap in the middle of the window.
+    disturbance : Disturbance
+        Input bias and noise in the same window.
+    trend : Trend or None
+        Gap and wear from all windows that counted, this one included.
+    controller : Controller or None
+        In force at the edge as last told; None: set by somebody else than this twin.
+    tolerance : float or None
+        Half-width of the dead zone in force, m; None: not known.
+    """
+
+    estimate: GapEstimate
+    disturbance: Disturbance = UNASKED
+    trend: Trend | None = None
+    controller: Controller | None = None
+    tolerance: float | None = None
