@@ -15,7 +15,8 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.identify import whitened
-from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.identify.core.between import polygon
+from servotwin.identify.core.contacts import BY_GAP, BY_START, SCREW, Gap
 from servotwin.identify.core.normal import least_squares
 from servotwin.identify.core.response import response
 from servotwin.identify.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
@@ -94,7 +95,7 @@ def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whit
     model = response(servo, window.sample_rate)
     angle = motor_angle(window, servo.encoder_resolution, settings)
     first, home = float(angle[0]), float(window.position[0])
-    seen = contacts(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
+    seen = polygon(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
     rows = model.respond(seen[[SCREW, BY_GAP, BY_START]])
     constant = np.full((1, angle.size), model.static_gain)
     late = model.velocities(seen[[SCREW]])

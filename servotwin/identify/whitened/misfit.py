@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.hybrid.compiled import bare
-from servotwin.identify.core.contacts import Gap, follow, follow_screw
+from servotwin.identify.core.between import trace
+from servotwin.identify.core.contacts import Gap
 from servotwin.identify.core.decimation import Decimation
 from servotwin.identify.core.projection import remove
 from servotwin.identify.core.response import Response
@@ -74,16 +75,16 @@ class Misfit:
 
     def cost(self, point: Point) -> float:
         """Squared length of the residual."""
-        screw = np.empty_like(self.theta_m)
-        follow_screw(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
-        row = self.position - self.reduce(self.response.respond(screw[None]))[0]
+        screw = np.empty((1, self.theta_m.size))
+        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
+        row = self.position - self.reduce(self.response.respond(screw))[0]
         remove(self.basis, len(self.basis), row)
         return float(row @ row)
 
     def slopes(self, point: Point) -> Slopes:
         """Residual and derivatives at a point."""
         seen = np.empty((4, self.theta_m.size))
-        follow(self.theta_m, *point.screw(self.theta_m[0], self.rate), seen)
+        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), seen)
         mix_places(seen, point.gap, point.place)
         rows = self.reduce(self.response.respond(seen[:3]))
         rows[0] -= self.position

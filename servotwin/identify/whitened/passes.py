@@ -13,7 +13,7 @@ from servotwin.identify.core.projection import spread
 from servotwin.identify.core.whitening import Autoregression, burg
 from servotwin.identify.whitened.misfit import Misfit, Point
 from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.whitened.search import Fit, continued, descend, off_the_plain, search
+from servotwin.identify.whitened.search import Fit, continued, descend, in_contact, off_the_plain, search
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
@@ -101,8 +101,9 @@ def refine(
     for number in range(passes):
         noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
         misfit = reduction.misfit(noise, fit.point)
-        starts = [fit.point, *(points if number == passes - 1 else [])]
-        fit = best_of(misfit, starts, largest, tolerance)
+        last = number == passes - 1
+        fit = best_of(misfit, [fit.point, *([*points, *in_contact(fit.point)] if last else [])], largest, tolerance)
+        fit = off_the_plain(misfit, fit, largest, tolerance) if last else fit
         evaluations += fit.evaluations
     rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
     return Found(reduction, misfit, fit, noise, rows, evaluations)

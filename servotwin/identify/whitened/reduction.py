@@ -12,7 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from servotwin.identify.core.contacts import BY_RATE, contacts
+from servotwin.identify.core.between import polygon
+from servotwin.identify.core.contacts import BY_RATE
 from servotwin.identify.core.decimation import Decimation, decimation
 from servotwin.identify.core.projection import orthonormal
 from servotwin.identify.core.response import Response
@@ -81,7 +82,7 @@ class Reduction:
 
     def table(self, point: Point) -> Array:
         """(k, m) residual, derivatives of the response by gap and place, nuisances; not whitened."""
-        seen = contacts(self.theta_m, point.screw(0.0))
+        seen = polygon(self.theta_m, point.screw(0.0))
         mix_places(seen, point.gap, point.place)
         rows = self.response.respond(seen if self.growth else seen[:BY_RATE])
         rows = np.vstack([rows, self.response.velocities(seen[:1])]) if self.skew else rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -106,17 +107,23 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
 
 
 def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
-    """On with both; and again from within, if the screw would have begun in contact.
+    """On with both; and again from within, if the screw would have begun in contact, or from there, if close to it.
 
-    There its place has no derivative, because the contact undoes it at once; that says nothing of a little further in.
+    In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
+    in. And from a little further in, where the motor only just began to move, next to nothing leads there.
     """
     ends = [descend(misfit, fit.point, largest, tolerance)]
-    if abs(ends[0].point.place) == 1.0:
-        starts = [ends[0].point._replace(place=share * ends[0].point.place) for share in _WITHIN]
-        ends += [descend(misfit, start, largest, tolerance, _SHORT) for start in starts]
+    point = ends[0].point
+    inside = [point._replace(place=share * point.place) for share in _WITHIN] if abs(point.place) == 1.0 else []
+    ends += [descend(misfit, start, largest, tolerance, _SHORT) for start in (*inside, *in_contact(point))]
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
     return Fit(best.point, best.slopes, evaluations, best.converged)
+
+
+def in_contact(point: Point) -> list[Point]:
+    """The point with the screw in the contact that it is close to, if it is and does not begin there."""
+    return [point._replace(place=math.copysign(1.0, point.place))] if _WITHIN[-1] <= abs(point.place) < 1.0 else []
 
 
 def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
