@@ -8,10 +8,13 @@ import numpy as np
 
 from servotwin.identify.core.decimation import Decimation
 from servotwin.identify.core.normal import least_squares
-from servotwin.identify.core.whitening import Autoregression, burg
-from servotwin.identify.joint.model import JUMP, MOTOR_START, JointModel
+from servotwin.identify.core.projection import orthonormal
+from servotwin.identify.core.whitening import Autoregression, recursion
+from servotwin.identify.joint.model import MOTOR_START, JointModel
 from servotwin.identify.joint.search import Stand
 from servotwin.plant.signals import Array
+
+_LEAST = 1e-300
 
 
 def noise_left(
@@ -30,15 +33,42 @@ def noise_left(
     if not np.any(left):
         return Autoregression.white(1.0)
     if not put:
-        return burg(left[None], order)
+        return likeliest(left[None], table, order)
     rest = rows[0] - solved.coefficients @ rows[1:]
     scale = math.sqrt(float(rest @ rest) / max(1, rest.size - len(solved.root)))
     taken = scale * math.sqrt(len(solved.root)) * (solved.root @ table[1:])
-    return burg(np.vstack([left + taken, left - taken]), order)
+    return likeliest(np.vstack([left + taken, left - taken]), table, order)
+
+
+def likeliest(series: Array, table: Array, most: int) -> Autoregression:
+    """The autoregression by Burg's method of equally likely series (s, n), its order the likeliest for what was fitted.
+
+    The likelihood is the restricted one, that of the data `table[0]` off what the columns `table[1:]` can explain. The
+    plain one prefers orders that model the hole which the fit itself left in the noise, and spreads come out too small.
+    """
+    predictors, power = recursion(series, min(most, series.shape[1] // 4))
+    spreads = np.sqrt(np.maximum(power, _LEAST))
+    orders = [Autoregression(predictors[:n, :n].copy(), spreads[:n]) for n in range(1, power.size + 1)]
+    rows = np.vstack([table[:1], orthonormal(table[1:])])
+    return min(orders, key=lambda noise: restricted(noise, rows))
+
+
+def restricted(noise: Autoregression, rows: Array) -> float:
+    """Minus twice the restricted log-likelihood of rows[0] off rows[1:], and the corrected Akaike penalty.
+
+    The level of the noise is free.
+    """
+    size, white = rows.shape[1], noise.whiten(rows)
+    left = white[0] - least_squares(white[1:], white[0]).coefficients @ white[1:]
+    degrees, count = max(1, size - len(white) + 1), noise.order + 1
+    level = degrees * math.log(max(float(left @ left) / degrees, _LEAST))
+    spreads = noise.spread[np.minimum(np.arange(size), noise.order)]
+    information = float(np.linalg.slogdet(white[1:] @ white[1:].T)[1])
+    likelihood = 2.0 * float(np.log(spreads).sum()) + level + information
+    return likelihood + 2.0 * count * size / max(1, size - count - 1)
 
 
 def _kept(model: JointModel, table: Array) -> Array:
-    """The rows without those of parameters that are known well beforehand and take little away."""
+    """The rows without those of the motor's start, which is over in milliseconds and takes little away."""
     first = len(table) - len(model.names)
-    known = [first + i for i, name in enumerate(model.names) if name in MOTOR_START or name.startswith(JUMP)]
-    return np.delete(table, known, axis=0)
+    return np.delete(table, [first + i for i, name in enumerate(model.names) if name in MOTOR_START], axis=0)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.identify.core.projection import spread
 from servotwin.identify.joint.model import JointModel, Reduce
 from servotwin.plant.signals import Array
 
+Flags: TypeAlias = NDArray[np.bool_]
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9
 _SINGULAR = 1e-8  # of a derivative's length: what the others leave of it below this is nothing
 _SMALL_GAIN = 1e-6  # of the cost: a step that gains less is the last; whitened, far below one standard deviation
@@ -25,7 +28,7 @@ class Known:
     mean: Array
     spread: Array
 
-    def vague(self, kept: Array) -> Known:
+    def vague(self, kept: Flags) -> Known:
         """The bounds alone, and parameters that are not `kept` (P,) held at their means: for a first search."""
         lowest, highest = np.where(kept, self.lowest, self.mean), np.where(kept, self.highest, self.mean)
         return Known(lowest, highest, self.mean, np.full_like(self.spread, np.inf))
@@ -61,6 +64,9 @@ class Stand:
         return covariance
 
 
+Evaluate: TypeAlias = Callable[[Array], Stand]
+
+
 def stand(model: JointModel, point: Array, known: Known, reduce: Reduce) -> Stand:
     """Evaluate at a point."""
     slopes = model.slopes(dict(zip(model.names, point.tolist(), strict=True)), reduce)
@@ -69,14 +75,14 @@ def stand(model: JointModel, point: Array, known: Known, reduce: Reduce) -> Stan
     return Stand(point, np.concatenate([slopes.residual, prior]), jacobian)
 
 
-def descend(model: JointModel, start: Array, known: Known, reduce: Reduce, tolerance: Array, steps: int = 40) -> Stand:
+def descend(evaluate: Evaluate, start: Array, known: Known, tolerance: Array, steps: int = 40) -> Stand:
     """From a start (P,) to the nearest minimum; it ends when a step is below `tolerance` (P,) in each."""
-    here, damping = stand(model, np.clip(start, known.lowest, known.highest), known, reduce), _FIRST_DAMPING
+    here, damping = evaluate(np.clip(start, known.lowest, known.highest)), _FIRST_DAMPING
     for count in range(2, steps):
         trial = np.clip(here.point + _step(here, known, damping), known.lowest, known.highest)
         if np.all(np.abs(trial - here.point) <= tolerance):
             return replace(here, evaluations=count, converged=True)
-        ahead = stand(model, trial, known, reduce)
+        ahead = evaluate(trial)
         if ahead.cost < here.cost:
             gained, here, damping = here.cost - ahead.cost, ahead, max(0.1 * damping, _LEAST_DAMPING)
             if gained <= _SMALL_GAIN * ahead.cost:

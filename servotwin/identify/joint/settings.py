@@ -38,6 +38,8 @@ class JointSettings:
         Estimates with a larger statistical spread are refused.
     model_error_rad : float
         What the model's remaining error is taken to add to the spread, in `std_total`.
+    numeric_error_rad : float
+        What sampling and rounding leave, in `std` already: it counts where there is next to no noise.
     unexplained : float
         Residual over variation of the position (rms both) above which the model does not belong to the window.
     inflation : float
@@ -55,6 +57,7 @@ class JointSettings:
     contact_travel_rad: float = math.radians(0.5)
     largest_std_rad: float = math.radians(0.25)
     model_error_rad: float = math.radians(0.02)
+    numeric_error_rad: float = math.radians(2e-4)
     unexplained: float = 0.5
     inflation: float = 1.4
     noise_order: int = 30
