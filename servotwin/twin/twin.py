@@ -193,7 +193,8 @@ class Twin:
     def _fallen_back(self, message: Fallback) -> list[Message]:
         """The edge has left what this twin gave it: nothing made before is sent again."""
         self._store.add_fallback(message)
-        if self._versions.left(message):
+        if self._versions.hear(message.boot, message.parameter_version):
+            self._versions.give_up()
             self._known.fall_back(message)
             self._tuned_for = None
         return []
