@@ -37,7 +37,8 @@ def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0
         ({"Kp": 249.0}, False),
         ({"Kp": -1000.0}, False),
         ({"Ki": 0.0}, True),
-        ({"Ki": 80001.0}, False),
+        ({"Ki": 20000.0}, True),
+        ({"Ki": 20001.0}, False),
         ({"Ki": -1.0}, False),
         ({"Kd": -401.0}, False),
         ({"Kd": 100.0}, False),
@@ -52,6 +53,11 @@ def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0
 def test_gains_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
     expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
     assert judged(replace(OWN, **changes), Limits()) is expected
+
+
+def test_integral_action_has_a_bound_of_its_own() -> None:
+    assert judged(replace(OWN, Ki=1000.0), Limits(integral_factor=0.05)) is Reason.APPLIED
+    assert judged(replace(OWN, Ki=1001.0), Limits(integral_factor=0.05)) is Reason.GAINS_OUT_OF_BOUNDS
 
 
 def test_a_servo_without_integral_action_gets_none() -> None:
@@ -100,6 +106,7 @@ def test_the_tolerance_has_a_speed_limit() -> None:
     [
         {"gain_factor": 0.9}, {"gain_step": 0.0}, {"gain_rate": nan}, {"feedforward": -0.1}, {"feedforward": nan},
         {"patience_s": -1.0}, {"patience_s": inf}, {"max_rate": 0.0},
+        {"integral_factor": -1.0},
     ],
 )  # fmt: skip
 def test_bad_limits_are_refused(values: dict[str, Any]) -> None:

@@ -5,10 +5,16 @@ import math
 
 import pytest
 
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import gains_of
+from servotwin.edge.settings import Supervision
+from servotwin.edge.verdict import FallbackSet
+from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.identify import paper, settingsfile, whitened
 from servotwin.identify.trend import TrendSettings
 from servotwin.link.simulated import LinkSettings
+from servotwin.messages import Band, Gains
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples, SCurve, SquareWave, Step
@@ -345,3 +351,72 @@ def test_a_controller_that_cannot_run_is_refused(tmp_path, controller, said):
 )
 def test_what_would_not_fit_into_memory_is_refused(tmp_path, text, said):
     assert said in refusal(tmp_path, text)
+
+
+EDGE = (
+    SHORT
+    + """
+[recording.limits]
+patience_s = 2.0
+gain_factor = 2.5
+integral_factor = 0.05
+feedforward_v = 0.1
+maximum_mm = 0.2
+[edge]
+period_s = 0.1
+[edge.watch]
+margin = 1.5
+error_floor_mm = 0.02
+[edge.fallback]
+ki_v_per_m_s = 0.0
+feedforward_v = 0.01
+silence_s = 60.0
+[edge.fallback.band]
+error_mm = 0.1
+error_rms_mm = 0.08
+effort_v = 0.2
+settling_s = 2.0
+[disturbances]
+input_bias_v = -0.1
+friction_n_m = 0.002
+"""
+)
+
+
+def test_the_edge_looks_after_itself_as_a_scenario_says(tmp_path):
+    scenario = load(tmp_path, EDGE)
+    agent, own = scenario.agent_settings(), gains_of(Servo.preset("paper").controller)
+    assert agent.controller == scenario.law
+    assert agent.own == own
+    assert agent.limits == Limits(
+        maximum=0.2e-3, patience_s=2.0, gain_factor=2.5, integral_factor=0.05, feedforward=0.1
+    )
+    calm = Gains(own.Kp, 0.0, own.Kd, own.Tf, feedforward=0.01)
+    fallback = FallbackSet(0.0, calm, Band(1e-4, 8e-5, 0.2, 2.0), silence_s=60.0)
+    assert agent.supervision == Supervision(fallback, WatchSettings(margin=1.5, error_floor=2e-5), 0.1)
+    assert (scenario.input_bias, scenario.friction) == (-0.1, 0.002)
+
+
+def test_without_an_edge_table_updates_set_the_tolerance_only(tmp_path):
+    scenario = load(tmp_path, SHORT)
+    assert scenario.supervision is None
+    assert scenario.agent_settings().controller is None
+    watchful = load(tmp_path, SHORT + "[edge]\nwatched = false\n")
+    assert watchful.agent_settings().supervision == Supervision(watch=None)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[edge]\nperiod_s = 0.0\n", "period_s"),
+        ("[edge.watch]\nmargin = 0.5\n", "margin"),
+        ("[edge.watch]\nmargins = 2.0\n", "margins"),
+        ("[edge.fallback]\nki = 0.0\n", "ki"),
+        ("[edge.fallback]\nsilence_s = -1.0\n", "silence_s"),
+        ("[edge.fallback.band]\nerror_mm = 0.1\n", "error_rms_mm"),
+        ("[recording.limits]\ngain_factor = 0.5\n", "gain_factor"),
+        ("[disturbances]\nfriction_n_m = -1.0\n", "friction_n_m"),
+    ],
+)
+def test_bad_supervision_is_named(tmp_path, text, words):
+    assert words in refusal(tmp_path, SHORT + text)

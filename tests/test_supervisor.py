@@ -84,7 +84,7 @@ def test_without_a_fallback_set_nothing_is_watched() -> None:
 
 def test_after_a_fallback_a_good_update_counts_again() -> None:
     agent = Agent(agent_settings())
-    fallback = fallbacks(feed(agent, 20.0, amplitude=9e-5))[0]
+    fallback = fallbacks(feed(agent, 20.0, amplitude=4e-4))[0]
     late = update(5, fallback.parameter_version, agent.time - 0.5)
     (answer,) = agent.receive(late)
     assert isinstance(answer.message, Receipt)
@@ -177,3 +177,12 @@ def test_the_period_is_whole_slots() -> None:
     assert Supervision(watch=None, period_s=1e-9).period_samples(1000.0) == 1
     with pytest.raises(InvalidInput, match="period_s"):
         Supervision(period_s=0.0)
+
+
+def test_no_prediction_excuses_what_is_not_certified() -> None:
+    agent = Agent(agent_settings())
+    generous = replace(update(1, 0, 0.0), band=Band(1.0, 1.0, 5.0, 1e6))
+    agent.receive(generous)
+    (fallback,) = fallbacks(feed(agent, 10.0, amplitude=3.3e-4, frequency=0.9))
+    assert fallback.cause is Cause.LIMIT_CYCLE
+    assert fallback.allowed == pytest.approx(math.sqrt(2.0) * 2e-4)

@@ -23,6 +23,7 @@ from servotwin.link.simulated import SimulatedLink
 from servotwin.messages import Fallback, Message, Receipt, Update, decode, encode
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run, Simulation
+from servotwin.twin.inforce import InForce
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Estimator, Twin
 
@@ -79,16 +80,41 @@ class Machine(Protocol):
         """Another controller and dead zone (m) from the present sample on, the voltage unchanged by it."""
 
 
-class Cosimulation:
-    """Machine, agent, link and twin, and the clock that connects them; `advance` it until it is `done`."""
+class Remote(Protocol):
+    """What answers the edge: a `Twin`, or one that means harm in a test."""
 
-    def __init__(self, scenario: Scenario, machine: Machine, estimator: Estimator | None = None) -> None:
+    def receive(self, message: Message, now: float) -> list[Message]:
+        """What to send after a message that arrived at `now` (s)."""
+
+    def next_wake(self) -> float | None:
+        """When `wake` is due, s; None: nothing is waited for."""
+
+    def wake(self, now: float) -> list[Message]:
+        """What to send without having been asked."""
+
+
+class Cosimulation:
+    """Machine, agent, link and twin, and the clock that connects them; `advance` it until it is `done`.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    machine : Machine
+    estimator : callable, optional
+        Replaces the twin's own.
+    twin : Remote, optional
+        Replaces the twin that the scenario describes.
+    """
+
+    def __init__(
+        self, scenario: Scenario, machine: Machine, estimator: Estimator | None = None, twin: Remote | None = None
+    ) -> None:
         self.scenario = scenario
         self.clock = VirtualClock()
         self.machine = machine
         self.agent = Agent(scenario.agent_settings())
         self.store = MemoryStore()
-        self.twin = Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
+        self.twin = twin or Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []

@@ -29,8 +29,9 @@ class Limits:
     max_rate : float
         Largest change of the tolerance per second since the last update, m/s.
     gain_factor : float
-        Kp, Kd and Tf stay within this factor of the servo's own, either way; Ki and `leave` within this factor from
-        above, since less of either makes the loop calmer.
+        Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above.
+    integral_factor : float
+        Largest Ki, in the servo's own: integral action is what makes a loop with a gap cycle. 0: none.
     gain_step, gain_rate : float
         Largest factor by which one update may change a gain, and by how much per second since the last update. Ki may
         fall at once. A gain counts as at least the box's lower edge, so that Ki can leave zero.
@@ -48,6 +49,7 @@ class Limits:
     interval_s: float = 0.0
     max_rate: float = inf
     gain_factor: float = 4.0
+    integral_factor: float = 1.0
     gain_step: float = inf
     gain_rate: float = inf
     feedforward: float = 0.25
@@ -67,8 +69,9 @@ class Limits:
         for name in _TIMES:
             if not 0.0 <= getattr(self, name) < inf:
                 raise InvalidInput(f"limits {name} = {getattr(self, name)!r} s: must be at least 0")
-        if not self.feedforward >= 0.0:
-            raise InvalidInput(f"limits feedforward = {self.feedforward!r} V: must be at least 0")
+        for name in ("integral_factor", "feedforward"):
+            if not getattr(self, name) >= 0.0:
+                raise InvalidInput(f"limits {name} = {getattr(self, name)!r}: must be at least 0")
 
     def allows_tolerance(self, tolerance: float) -> bool:
         """Whether a tolerance (m) is in bounds."""
@@ -80,7 +83,7 @@ class Limits:
 
     def allows_gains(self, gains: Gains, own: Gains) -> bool:
         """Whether gains lie in the box around the servo's own."""
-        scaled = all(_in_box(name, getattr(gains, name), getattr(own, name), self.gain_factor) for name in _SCALED)
+        scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
@@ -93,11 +96,10 @@ class Limits:
             for name in _SCALED
         )
 
-
-def _in_box(name: str, value: float, own: float, factor: float) -> bool:
-    size = abs(value)
-    lowest = 0.0 if name == "Ki" else abs(own) / factor
-    return value * own >= 0.0 and lowest <= size <= abs(own) * factor
+    def _in_box(self, name: str, value: float, own: float) -> bool:
+        if name == "Ki":
+            return value * own >= 0.0 and abs(value) <= abs(own) * self.integral_factor
+        return value * own >= 0.0 and abs(own) <= self.gain_factor * abs(value) <= self.gain_factor**2 * abs(own)
 
 
 def _in_step(name: str, old: float, new: float, smallest: float, factor: float) -> bool:

@@ -34,6 +34,7 @@ LIMITS: Mapping[str, Reader] = {
     "interval_s": ("interval_s", _number),
     "patience_s": ("patience_s", _number),
     "gain_factor": ("gain_factor", _number),
+    "integral_factor": ("integral_factor", _number),
     "gain_step_factor": ("gain_step", _number),
     "gain_factor_per_s": ("gain_rate", _number),
     "feedforward_v": ("feedforward", _number),

@@ -16,6 +16,18 @@ class Verdict(NamedTuple):
     allowed: float
 
 
+def judged_by(predicted: Band | None, certified: Band | None) -> Band | None:
+    """What the loop is held to: error and settling are certified at worst, the effort is what its gains predict."""
+    if predicted is None or certified is None:
+        return predicted or certified
+    return Band(
+        min(predicted.error, certified.error),
+        min(predicted.error_rms, certified.error_rms),
+        predicted.effort,
+        min(predicted.settling, certified.settling),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class FallbackSet:
     """Parameters that hold for every gap in the servo's stated range.
@@ -27,7 +39,8 @@ class FallbackSet:
     gains : Gains, optional
         None: the gains stay.
     band : Band, optional
-        What the loop stays within under them.
+        What the loop stays within under them: certified for the servo. No update may do worse in error and settling,
+        whatever it predicts.
     silence_s : float
         The twin may leave a window unanswered this long before the edge falls back; inf: for ever.
     refuse_s : float
