@@ -148,3 +148,10 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     assert doubted.gap == pytest.approx(GAP, abs=0.1 * DEG)
     assert "forgotten" in doubted.reasons[1]
     assert doubted.prior.offset_std == doubted.settings.offset_std_rad
+
+
+def test_a_loop_tells_bias_and_reason_for_every_window():
+    assert len(loop().disturbances) == len(loop().redesigns) == len(loop().estimates) == 10
+    for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):
+        assert (redesign.tolerance is not None) == estimate.ok == (redesign.reason == "")
+    assert {len(d.reasons) for d in loop().disturbances if not d.known} <= {1}

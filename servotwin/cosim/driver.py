@@ -114,7 +114,8 @@ class Cosimulation:
         self.machine = machine
         self.agent = Agent(scenario.agent_settings())
         self.store = MemoryStore()
-        self.twin = twin or Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator)
+        start = InForce(scenario.law, scenario.start_tolerance)
+        self.twin = twin or Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator, start)
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
@@ -152,7 +153,9 @@ class Cosimulation:
             run=run,
             windows=tuple(self.store.windows.values()),
             estimates=tuple(self.store.estimates.values()),
+            disturbances=tuple(self.store.disturbances.values()),
             trends=tuple(self.store.trends.values()),
+            redesigns=tuple(self.store.redesigns.values()),
             updates=tuple(self.store.updates),
             receipts=tuple(self.receipts),
             fallbacks=tuple(self.fallbacks),

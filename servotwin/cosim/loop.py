@@ -6,11 +6,13 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass
 
+from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.passage import Passage
 from servotwin.identify.trend import Trend
 from servotwin.link.simulated import Fate
 from servotwin.messages import Fallback, Message, Receipt, Update, Window, decode
+from servotwin.redesign.policy import Redesign
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run
 
@@ -60,8 +62,12 @@ class Loop:
         As decoded by the twin, each once, in the order of arrival.
     estimates : tuple of GapEstimate
         One for each window.
+    disturbances : tuple of Disturbance
+        Input bias and noise, one for each window.
     trends : tuple of Trend or None
         Gap and rate of wear as the twin knew them after each window; None before the first accepted estimate.
+    redesigns : tuple of Redesign
+        What was made of each window, or why nothing was.
     updates : tuple of messages.Update
         Every version that the twin gave out.
     receipts : tuple of messages.Receipt
@@ -78,7 +84,9 @@ class Loop:
     run: Run
     windows: tuple[Window, ...]
     estimates: tuple[GapEstimate, ...]
+    disturbances: tuple[Disturbance, ...]
     trends: tuple[Trend | None, ...]
+    redesigns: tuple[Redesign, ...]
     updates: tuple[Update, ...]
     receipts: tuple[Receipt, ...]
     fallbacks: tuple[Fallback, ...]
