@@ -6,22 +6,12 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined
-from servotwin.hybrid.flow import Scratch, dot, dot_sizes, product
+from servotwin.hybrid.flow import Scratch, dot, dot_sizes, product, rounding
 from servotwin.hybrid.polynomial import CUBIC_ERROR, first_positive, fourth_derivative_bound
 from servotwin.hybrid.tables import PIECES, TERMS, Tables
 
-# A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero. Each
-# derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
-# two modes agree on the sign of the same quantity.
-SIGNIFICANT = 1e-13
 # A coefficient below this part of the largest one: 24 of them are below its rounding.
 NEGLIGIBLE = 1e-18
-
-
-@inlined
-def rounding(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
-    """What of a guard's Taylor coefficient (in steps) may be rounding."""
-    return SIGNIFICANT * dot_sizes(t.sizes, ((mode * t.guards + guard) * TERMS + order) * t.states, x)
 
 
 @inlined

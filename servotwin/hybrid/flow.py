@@ -11,6 +11,11 @@ from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
 from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, aligned, padded
 
+# A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero. Each
+# derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
+# two modes agree on the sign of the same quantity.
+SIGNIFICANT = 1e-13
+
 
 class Scratch(NamedTuple):
     """Working memory of one run."""
@@ -106,6 +111,12 @@ def dot_sizes(table: Array, base: int, x: Array) -> float:
 
 
 @inlined
+def rounding(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
+    """What of a guard's Taylor coefficient (in steps) may be rounding."""
+    return SIGNIFICANT * dot_sizes(t.sizes, ((mode * t.guards + guard) * TERMS + order) * t.states, x)
+
+
+@inlined
 def advance(table: Array, base: int, x: Array, change: Array) -> None:
     """``x += P @ x`` with the transposed ``(n, n)`` matrix at `base`."""
     product(table, base, x.size, x.size, x, change)
@@ -149,21 +160,25 @@ def advance_clean(
     positive = 0
     for r in range(np.uint64(values)):
         positive += out[r] + abs(out[np.uint64(values) + r]) > 0.0
-    clean = wanted if positive == 0 else clean_intervals(out, guards, nodes + 1, wanted)
+    clean = wanted if positive == 0 else clean_intervals(t, mode, x, out, nodes + 1, wanted)
     if clean > 0:
         advance(jumps, (t.flow_of[mode] * nodes + clean - 1) * t.states * t.states, x, scratch.change)
     return clean
 
 
 @inlined
-def clean_intervals(out: Array, guards: int, rows: int, wanted: int) -> int:
-    """Number of intervals, at most `wanted`, before the first in which some guard may become positive."""
-    clean, thirds = wanted, guards * rows
-    for g in range(guards):
+def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wanted: int) -> int:
+    """Number of intervals, at most `wanted`, before the first in which some guard may become positive.
+
+    More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
+    """
+    clean, thirds = wanted, t.guard_count[mode] * rows
+    for g in range(t.guard_count[mode]):
+        least = rounding(t, mode, g, 0, x)
         for k in range(clean):
             at = g * rows + k
             begin, end = out[at], out[at + 1]
-            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > 0.0:
+            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > least:
                 clean = k
                 break
     return clean
