@@ -120,6 +120,22 @@ def test_a_window_with_two_contacts_is_never_told_of_the_offset():
     assert told.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
 
 
+def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
+    """However sure it is: an offset that is right does not change what is left over."""
+    window, true = noisy(stretch(5.0, 1.2), 1), whitened.estimate
+
+    def lost(window, servo, prior, settings):
+        found = true(window, servo, prior, settings)
+        return found if settings.offset is None else replace(found, gap=found.gap + DEG, rms=100.0 * found.rms)
+
+    known = (0.0, 0.01 * DEG)
+    assert estimate_carrying(window, SERVO, None, whitened.Settings(), known).ok
+    monkeypatch.setattr(whitened, "estimate", lost)
+    refused = estimate_carrying(window, SERVO, None, whitened.Settings(), known)
+    assert refused.status in REFUSED
+    assert "times as much is left over" in refused.reasons[-1]
+
+
 def test_what_is_known_too_badly_is_not_carried():
     window = noisy(stretch(5.0, 1.2), 1)
     for known in (None, (0.0, 0.1 * DEG)):

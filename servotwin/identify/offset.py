@@ -26,6 +26,9 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 _GAP, _CONSTANT = 0, 1  # rows of the columns
+# An offset that is right leaves what was left without it. A search that lost its way in the narrow valley which the
+# offset makes was sure of gaps 1 deg off, and left a hundred times as much.
+_WORSE = 3.0
 
 
 def estimate_carrying(
@@ -61,6 +64,11 @@ def estimate_carrying(
     helped = whitened.estimate(window, servo, prior, replace(settings, offset=carried))
     if not helped.ok:
         return alone
+    if helped.rms > _WORSE * alone.rms:
+        worse = (
+            f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
+        )
+        return replace(alone, reasons=(*alone.reasons, worse))
     slope = _slope(_columns(window, servo, helped, settings))
     return replace(helped, offset=CarriedOffset(*carried, slope))
 
