@@ -10,7 +10,6 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SquareWave
 from servotwin.simulation import Simulation, simulate
-from servotwin.simulation.continuous import ContinuousEngine
 
 DEGREE = np.pi / 180.0
 PAPER = Servo.preset("paper")
@@ -156,17 +155,3 @@ def test_measured_so_far(controller: object) -> None:
             assert np.abs(part - whole.measured(name)[last:index]).max() <= 1e-13 * np.abs(whole.measured(name)).max()
         last = index
     assert live.time == 0.5
-
-
-def test_a_loop_at_rest_is_passed_in_whole_blocks() -> None:
-    """Where a guard is zero to within rounding nothing is searched: a motor at rest on a flank stands at its guard."""
-    own = PAPER.controller
-    calm = own.replace(Ki=0.0, Kp=0.6 * own.Kp, Kd=0.6 * own.Kd)
-    run = Simulation(PAPER, 60.0, calm, 1e-3, gap=40.0 * DEGREE, sample_rate=50.0)
-    run.advance(40 * 50)
-    engine = run.engine
-    assert isinstance(engine, ContinuousEngine)
-    before = int(engine.trajectory.record.size[0])
-    run.advance(60 * 50)
-    blocks = 20.0 / (128 * engine.trajectory.step)
-    assert int(engine.trajectory.record.size[0]) - before < 2 * blocks
