@@ -22,7 +22,8 @@ def watched(
     error: Signal, voltage: Signal = lambda _: 0.0, seconds: float = 20.0, band: Band | None = BAND, **settings: Any
 ) -> tuple[float, Verdict] | None:
     """Time of the first verdict, and the verdict; the reference steps once, at 1 s."""
-    watch = Watch(WatchSettings(**settings), RATE, 0.0, band)
+    watch = Watch(WatchSettings(**settings), RATE)
+    watch.restart(band, 0)
     for first in range(0, round(seconds * RATE), BLOCK):
         times = [k / RATE for k in range(first, first + BLOCK)]
         reference = [1e-3 if t >= 1.0 else 0.0 for t in times]
@@ -118,12 +119,45 @@ def test_a_moving_reference_is_never_judged() -> None:
     watch = Watch(WatchSettings(), RATE, 0.0, BAND)
     for first in range(0, 20_000, BLOCK):
         reference = [math.sin((first + k) / RATE) for k in range(BLOCK)]
-        assert watch.see(first, reference, [0.0] * BLOCK, [9.0] * BLOCK) is None
+        position = [0.7 * math.sin((first + k) / RATE - 0.9) for k in range(BLOCK)]
+        assert watch.see(first, reference, position, [9.0] * BLOCK) is None
     assert not watch.proven
 
 
+def test_a_loop_that_runs_away_is_stopped_before_it_should_have_settled() -> None:
+    result = watched(lambda t: 1e-3 * math.exp(5.0 * (t - 1.0)) * (t >= 1.0), band=None)
+    assert result is None
+    watch = Watch(WatchSettings(), RATE, 0.0, BAND)
+    verdicts = []
+    for first in range(0, 2000, BLOCK):
+        times = [(first + k) / RATE for k in range(BLOCK)]
+        reference = [1e-3 * (t >= 1.0) for t in times]
+        position = [(t >= 1.0) * (1e-3 - 1e-3 * math.exp(5.0 * (t - 1.0))) for t in times]
+        verdicts.append(watch.see(first, reference, position, [0.0] * BLOCK))
+    caught = next(k for k, verdict in enumerate(verdicts) if verdict is not None)
+    verdict = verdicts[caught]
+    assert verdict is not None
+    assert verdict.allowed == pytest.approx(1.25e-4 + 1.3e-3)
+    assert 1.0 + math.log(1.425) / 5.0 < (caught + 1) * BLOCK / RATE < 1.25
+
+
+def test_new_parameters_are_held_to_what_is_certified_until_they_must_do_what_is_predicted() -> None:
+    watch = Watch(WatchSettings(), RATE, 0.0, BAND)
+    calm = [0.0] * BLOCK
+    for first in range(0, 5000, BLOCK):
+        watch.see(first, calm, calm, calm)
+    watch.restart(Band(1e-5, 1.0, 1.0, 1.0), 5000)
+    verdicts = [watch.see(first, calm, [-1.1e-4] * BLOCK, calm) for first in range(5000, 7000, BLOCK)]
+    assert next(k for k, verdict in enumerate(verdicts) if verdict) == 20
+    watch.restart(Band(1e-5, 1.0, 1.0, 1.0), 7000)
+    assert watch.see(7000, calm, [-1.3e-4] * BLOCK, calm) == Verdict(
+        Cause.ERROR, pytest.approx(1.3e-4), pytest.approx(1.25e-4)
+    )
+
+
 def test_new_parameters_are_judged_by_their_own_evidence() -> None:
-    watch = Watch(WatchSettings(), RATE, 0.0, Band(1.0, 1.0, 1.0, 0.0))
+    watch = Watch(WatchSettings(settling_s=0.0), RATE)
+    watch.restart(Band(1.0, 1.0, 1.0, 0.0), 0)
     calm = [0.0] * BLOCK
     for first in range(0, 5000, BLOCK):
         assert watch.see(first, calm, calm, calm) is None

@@ -44,6 +44,7 @@ WATCH: Mapping[str, Reader] = {
     "window_s": ("window_s", Table.number),
     "settling_s": ("settling_s", Table.number),
     "margin": ("margin", Table.number),
+    "overshoot": ("overshoot", Table.number),
     "persist_s": ("persist_s", Table.number),
     "error_floor_mm": ("error_floor", _millimetres),
     "effort_floor_v": ("effort_floor", Table.number),

@@ -14,9 +14,9 @@ from servotwin.edge.recorder import Recorder
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import Store
 from servotwin.edge.switch import Rules, Step, Switch
-from servotwin.edge.verdict import Verdict, judged_by
+from servotwin.edge.verdict import Verdict
 from servotwin.edge.watch import Watch
-from servotwin.messages import Band, Cause, Fallback, Receipt, Update
+from servotwin.messages import Cause, Fallback, Receipt, Update
 
 Said = tuple[Receipt | Fallback, ...]
 
@@ -86,10 +86,6 @@ class Supervisor:
         return self._watch is not None and not self.parameters.fallback
 
     @property
-    def _band(self) -> Band | None:
-        return judged_by(self.parameters.band, None if self._fallback is None else self._fallback.band)
-
-    @property
     def _here(self) -> Instant:
         s = self._settings
         return Instant(s.servo, s.boot, self._recorder.samples, s.sample_rate)
@@ -114,7 +110,9 @@ class Supervisor:
         s = self._settings
         if self._fallback is None or s.supervision.watch is None:
             return None
-        return Watch(s.supervision.watch, s.sample_rate, s.reference, self._band)
+        watch = Watch(s.supervision.watch, s.sample_rate, s.reference, self._fallback.band)
+        watch.restart(self.parameters.band, 0)
+        return watch
 
     def _take(self, step: Step) -> Said:
         """Go on from a decision."""
@@ -122,7 +120,7 @@ class Supervisor:
         if self._state.current is not before.current:
             self._saved = False
             if self._watch is not None:
-                self._watch.restart(self._band, self.parameters.sample)
+                self._watch.restart(self.parameters.band, self.parameters.sample)
             self._keep()
         return step.said
 

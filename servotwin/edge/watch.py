@@ -1,8 +1,11 @@
 """Watches the loop itself: does it still do what was predicted of the parameters in force?
 
-Evidence counts only while the reference rests and the loop had time to settle, since the last step of the reference and
-since the last change of parameters. Samples are taken together in slots of 10 ms: the mean error of a slot keeps what
-the loop does and little of the sensor's noise, the sums of squares keep everything.
+The error is watched at all times: while the loop may still follow its reference it may be as large as the reference
+moved and a little more, otherwise it stays within the band. Cycles and energies are evidence only while the reference
+rests and the loop had time to settle, since the last step of the reference and since the last change of parameters; in
+that time new parameters are held to what is certified, then to what is predicted of them. Samples are taken together in
+slots of 10 ms: the mean error of a slot keeps what the loop does and little of the sensor's noise, the sums of squares
+keep everything.
 """
 
 from collections import deque
@@ -10,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, sqrt
 from operator import mul, sub
+from typing import NamedTuple
 
 from servotwin.edge.turns import Turns
-from servotwin.edge.verdict import Verdict
+from servotwin.edge.verdict import Verdict, judged_by
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Cause
 
@@ -30,7 +34,9 @@ class WatchSettings:
     settling_s : float
         Until the loop is settled, where no band says so.
     margin : float
-        The loop may leave the predicted band by this factor.
+        The loop may leave the band by this factor.
+    overshoot : float
+        While the loop settles the error may be larger by this times the reference's travel.
     persist_s : float
         How long the error itself must be outside.
     error_floor, effort_floor : float
@@ -45,6 +51,7 @@ class WatchSettings:
     window_s: float = 2.0
     settling_s: float = 3.0
     margin: float = 1.25
+    overshoot: float = 1.3
     persist_s: float = 0.05
     error_floor: float = 1e-5
     effort_floor: float = 0.02
@@ -57,11 +64,19 @@ class WatchSettings:
                 raise InvalidInput(f"watch {name} = {getattr(self, name)!r}: must be finite and greater than 0")
         if not 0.0 <= self.settling_s < inf:
             raise InvalidInput(f"watch settling_s = {self.settling_s!r} s: must be finite and at least 0")
-        for name in ("margin", "similarity"):
+        for name in ("margin", "overshoot", "similarity"):
             if not 1.0 <= getattr(self, name) < inf:
                 raise InvalidInput(f"watch {name} = {getattr(self, name)!r}: must be finite and at least 1")
         if self.swings < 2:
             raise InvalidInput(f"watch swings = {self.swings!r}: must be at least 2")
+
+
+class Move(NamedTuple):
+    """What the reference did (m), and the sample until which the loop may still follow it."""
+
+    until: int
+    low: float
+    high: float
 
 
 class Watch:
@@ -74,27 +89,33 @@ class Watch:
         Samples per second.
     reference : float
         Before the first sample, m.
-    band : Band, optional
-        Predicted of the parameters in force at the start.
+    certified : Band, optional
+        What the loop has to stay within at all times, whatever is predicted.
     """
 
-    def __init__(self, settings: WatchSettings, rate: float, reference: float = 0.0, band: Band | None = None) -> None:
+    def __init__(
+        self, settings: WatchSettings, rate: float, reference: float = 0.0, certified: Band | None = None
+    ) -> None:
         self.settings, self.rate = settings, rate
         self.slot = max(1, round(settings.slot_s * rate))
-        self._reference = reference
-        self._settled = 0
-        self.restart(band, 0)
+        self._certified = certified
+        self._reference: float | None = None
+        self._before = reference
+        self._moves: deque[Move] = deque()
+        self.restart(None, 0)
 
     @property
     def proven(self) -> bool:
         """Whether the parameters in force did for a whole window what was predicted of them."""
         return len(self._squares) == self._squares.maxlen
 
-    def restart(self, band: Band | None, sample: int) -> None:
+    def restart(self, predicted: Band | None, sample: int) -> None:
         """Other parameters from a sample on: what was seen so far says nothing about them."""
-        self._band = band
-        self._floor = max(self.settings.error_floor, 0.0 if band is None else sqrt(2.0) * band.error_rms)
-        self._unsettle(sample)
+        self._band = judged_by(predicted, self._certified)
+        self._floor = max(self.settings.error_floor, 0.0 if self._band is None else sqrt(2.0) * self._band.error_rms)
+        self._proving = sample + self._settling
+        self._outside = 0
+        self._forget()
 
     def see(
         self, first: int, reference: Sequence[float], position: Sequence[float], voltage: Sequence[float]
@@ -110,48 +131,70 @@ class Watch:
         found: Verdict | None = None
         for start in range(0, len(errors), self.slot):
             part = slice(start, start + self.slot)
-            if self._counts(first + start, reference[part]):
-                verdict = self._add(errors[part], voltage[part])
-                found = found or verdict
+            verdict = self._slot(first + start, reference[part], errors[part], voltage[part])
+            found = found or verdict
         return found or self._energies()
 
-    def _counts(self, sample: int, reference: Sequence[float]) -> bool:
-        """Whether the reference rests and the loop is settled during a slot."""
-        if min(reference) != max(reference) or reference[0] != self._reference:
-            self._reference = reference[-1]
-            self._unsettle(sample + len(reference))
-        return sample >= self._settled
+    @property
+    def _settling(self) -> int:
+        """In samples."""
+        return round((self.settings.settling_s if self._band is None else self._band.settling) * self.rate)
 
-    def _unsettle(self, sample: int) -> None:
-        settling = self.settings.settling_s if self._band is None else self._band.settling
-        self._settled = sample + round(settling * self.rate)
+    def _slot(
+        self, sample: int, reference: Sequence[float], errors: Sequence[float], voltage: Sequence[float]
+    ) -> Verdict | None:
+        """One more slot, which begins with a sample."""
+        mean = sum(errors) / len(errors)
+        if not isfinite(mean):
+            return None
+        self._note_moves(sample, reference, abs(errors[0]))
+        if self._moves:
+            self._forget()
+        verdict = self._error(sample, abs(mean))
+        if verdict is not None or self._moves or sample < self._proving:
+            return verdict
+        self._squares.append(sum(map(mul, errors, errors)) / len(errors))
+        self._efforts.append(sum(map(mul, voltage, voltage)) / len(voltage))
+        return self._cycle(mean)
+
+    def _note_moves(self, sample: int, reference: Sequence[float], size: float) -> None:
+        """Keep what the reference did while the loop may still follow it; the first error counts as a step."""
+        until = sample + len(reference) + self._settling
+        if self._reference is None:
+            self._reference = self._before
+            self._moves.append(Move(until, reference[0] - size, reference[0]))
+        low, high = min(reference), max(reference)
+        if low != high or low != self._reference:
+            self._moves.append(Move(until, min(low, self._reference), max(high, self._reference)))
+            self._reference = reference[-1]
+        while self._moves and self._moves[0].until <= sample:
+            self._moves.popleft()
+
+    def _forget(self) -> None:
         window = max(1, round(self.settings.window_s * self.rate / self.slot))
         self._squares: deque[float] = deque(maxlen=window)
         self._efforts: deque[float] = deque(maxlen=window)
         self._turns = Turns(self._floor, self.settings.swings)
-        self._outside = 0
 
-    def _add(self, errors: Sequence[float], voltage: Sequence[float]) -> Verdict | None:
-        """One more slot."""
-        mean = sum(errors) / len(errors)
-        if not isfinite(mean):
+    def _error(self, sample: int, size: float) -> Verdict | None:
+        """Larger for too long than the band and the reference's moves allow?"""
+        band = self._certified if sample < self._proving else self._band
+        if band is None:
             return None
-        self._squares.append(sum(map(mul, errors, errors)) / len(errors))
-        self._efforts.append(sum(map(mul, voltage, voltage)) / len(voltage))
-        if self._turns.add(mean):
-            amplitude = self._turns.sustained(self._floor, self.settings.similarity)
-            if amplitude is not None:
-                return Verdict(Cause.LIMIT_CYCLE, amplitude, self._floor)
-        return self._error(abs(mean))
-
-    def _error(self, size: float) -> Verdict | None:
-        """Outside the band for too long?"""
-        if self._band is None:
-            return None
-        allowed = max(self.settings.margin * self._band.error, self.settings.error_floor)
+        allowed = max(self.settings.margin * band.error, self.settings.error_floor)
+        if self._moves:
+            travel = max(move.high for move in self._moves) - min(move.low for move in self._moves)
+            allowed += self.settings.overshoot * travel
         self._outside = self._outside + 1 if size > allowed else 0
         long = self._outside * self.slot >= self.settings.persist_s * self.rate
         return Verdict(Cause.ERROR, size, allowed) if long else None
+
+    def _cycle(self, mean: float) -> Verdict | None:
+        """An oscillation that lasts?"""
+        if not self._turns.add(mean):
+            return None
+        amplitude = self._turns.sustained(self._floor, self.settings.similarity)
+        return None if amplitude is None else Verdict(Cause.LIMIT_CYCLE, amplitude, self._floor)
 
     def _energies(self) -> Verdict | None:
         """More error or effort than predicted over a whole window?"""
