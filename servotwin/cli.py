@@ -31,8 +31,8 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except InvalidInput as error:
             _end(f"error: {error}", INVALID)
-        except KeyboardInterrupt:
-            _end("interrupted; nothing half written was left behind", INTERRUPTED)
+        except KeyboardInterrupt as interrupt:
+            _end(str(interrupt) or "interrupted; nothing half written was left behind", INTERRUPTED)
 
 
 app = typer.Typer(
@@ -190,6 +190,40 @@ def tune(
     from servotwin.redesign.tunetable import Request, tell
 
     tell(Request(servo, kind, crossover, phase_margin_deg, ms_max, prefer, delay_ms, b, c), json)
+
+
+@app.command("map")
+def map_(
+    servo: Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")] = "paper",
+    out: Annotated[Path, typer.Option(help="Where the map goes, and its finished pieces.")] = Path("servotwin-map"),
+    tolerance: Annotated[
+        str | None, typer.Option(help="Dead zone / (p b), b half the gap: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
+    ] = None,
+    amplitude: Annotated[str | None, typer.Option(help="Reference step / (p b), likewise.")] = None,
+    gap_deg: Annotated[str | None, typer.Option(help="Instead of these two: total gap, deg ...")] = None,
+    estimate_deg: Annotated[str | None, typer.Option(help="... its estimate; the truth by default ...")] = None,
+    k_dz: Annotated[str | None, typer.Option(help="... dead zone / (p estimate) ...")] = None,
+    amplitude_mm: Annotated[str | None, typer.Option(help="... and reference step.")] = None,
+    enter: Annotated[float | None, typer.Option(help="The loop opens at so many tolerances.")] = None,
+    leave: Annotated[float | None, typer.Option(help="The loop closes again above so many tolerances.")] = None,
+    members: Annotated[int, typer.Option(help="Initial states in each cell.")] = 16,
+    motion: Annotated[float, typer.Option(help="Extent of the motion that half of them start in.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of the initial states.")] = 0,
+    duration: Annotated[float, typer.Option(help="Of every run, s.")] = 120.0,
+    window: Annotated[float, typer.Option(help="The end of it in which a run must be still, s.")] = 40.0,
+    still_um: Annotated[float, typer.Option(help="Still: half the peak-to-peak is below this.")] = 1.0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="A Dask scheduler, tcp://host:8786, whose workers do the work.")
+    ] = None,
+) -> None:
+    """A stability map: which dead zones settle which steps, from many initial states."""
+    from servotwin.maps.command import stability_map
+    from servotwin.maps.request import Request
+
+    axes = (tolerance, amplitude, gap_deg, estimate_deg, k_dz, amplitude_mm)
+    runs = (members, motion, seed, duration, window, still_um)
+    stability_map(Request(servo, *axes, enter, leave, *runs), out, workers, scheduler)
 
 
 def main() -> None:

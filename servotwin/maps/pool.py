@@ -1,0 +1,138 @@
+"""The pieces of a map shared among processes: a pool on this machine, or a Dask cluster. Written once, for joblib."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import signal
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky.backend import resource_tracker
+
+from servotwin.errors import InvalidInput
+
+CONNECT_TIMEOUT = 5.0
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?([^\s/:\[\]]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+@contextmanager
+def workplace(workers: int | None = None, scheduler: str | None = None) -> Iterator[None]:
+    """Where `shared` finds its processes inside this block.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Processes on this machine, one per core by default; 1: no other process.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as tcp://host:8786: its workers do the work.
+
+    Raises
+    ------
+    InvalidInput
+        The scheduler cannot be reached, has no workers, or is lost.
+    """
+    with _processes(workers or os.cpu_count() or 1) if scheduler is None else _cluster(scheduler):
+        yield
+
+
+def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple[_T, _R], None, None]:
+    """Each task with what `function` makes of it, as they come; close it to leave the rest undone.
+
+    Parameters
+    ----------
+    function : callable
+        Picklable; what it gives depends on the task alone.
+    tasks : iterable
+        Picklable.
+    """
+    with _interrupts_held():
+        outcomes = Parallel(batch_size=1, return_as="generator_unordered")(
+            delayed(_performed)(function, task) for task in tasks
+        )
+    try:
+        yield from outcomes
+    finally:
+        with warnings.catch_warnings(action="ignore"):  # joblib's, that not all was wanted
+            outcomes.close()
+
+
+def _performed(function: Callable[[_T], _R], task: _T) -> tuple[_T, _R]:
+    return task, function(task)
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[None]:
+    try:
+        with parallel_config(backend="loky", n_jobs=workers):
+            yield
+    finally:
+        if workers > 1:
+            get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[None]:
+    if not _ADDRESS.fullmatch(address):
+        raise InvalidInput(f"--scheduler {address!r}: is no address; give one such as tcp://host:8786")
+    client = _connected(address)
+    try:
+        with parallel_config(backend="dask", client=client):
+            yield
+    except ModuleNotFoundError as error:
+        raise InvalidInput(
+            f"--scheduler {address}: its workers cannot import {error.name}; install servotwin"
+        ) from None
+    except Exception as error:
+        if not type(error).__module__.startswith("distributed."):
+            raise
+        raise InvalidInput(
+            f"--scheduler {address}: was lost, or its workers were ({type(error).__name__}); what was finished is kept,"
+            " the same command goes on from there"
+        ) from None
+    finally:
+        client.close()
+
+
+def _connected(address: str) -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise InvalidInput(
+            f"--scheduler {address}: needs Dask, which is not installed; install it with pip install 'servotwin[dask]'"
+        ) from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it has to say is said once, by us
+    connect: Any = distributed.Client
+    try:
+        client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError):
+        raise InvalidInput(
+            f"--scheduler {address}: no Dask scheduler answers there within {CONNECT_TIMEOUT:g} s; start one, or give"
+            " the address that it shows"
+        ) from None
+    if not client.ncores():
+        client.close()
+        raise InvalidInput(f"--scheduler {address}: has no workers; start some with dask worker {address}")
+    return client
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let interrupts wait; processes that are started meanwhile never see one, and leave it to this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # its start would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
