@@ -7,6 +7,7 @@ Cholesky factor of its covariance.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -35,7 +36,16 @@ def noise_root(samples: int, rate: float, floor: float, noise: Noise | None) -> 
     return np.asarray(cholesky(toeplitz(covariance), lower=True))
 
 
-def bound(servo: Servo, theta_m: Array, rate: float, gap: float, theta_d0: float, root: Array) -> float:
+def bound(
+    servo: Servo,
+    theta_m: Array,
+    rate: float,
+    gap: float,
+    theta_d0: float,
+    root: Array,
+    free: Sequence[str] = (),
+    angles: Array | None = None,
+) -> float:
     """Smallest standard deviation (rad) of an unbiased estimate of the gap.
 
     Unknown beside it: the screw's start, the structure's initial state, the encoder's offset, the channels' delay.
@@ -51,19 +61,63 @@ def bound(servo: Servo, theta_m: Array, rate: float, gap: float, theta_d0: float
         rad, the truth.
     root : (n, n) or (1, 1) array
         Of the noise: `noise_root`.
+    free : sequence of str
+        Of "k", "c", "p": unknown too.
+    angles : (a, n) array, optional
+        Derivatives of theta_m by what it depends on where it is not measured: `motor_unknowns`.
     """
     times = np.arange(theta_m.size) / rate
     first = theta_m[0]
 
-    def position(gap: float, theta_d0: float) -> Array:
-        return _respond(servo, play(theta_m - first, gap, theta_d0 - first), times)
+    def position(gap: float, theta_d0: float, model: Servo = servo, angle: Array = theta_m) -> Array:
+        return _respond(model, play(angle - first, gap, theta_d0 - first), times)
 
     here = position(gap, theta_d0)
     inwards = math.copysign(_STEP, first - theta_d0)
     by_gap = (position(gap + _STEP, theta_d0) - here) / _STEP
     by_start = (position(gap, theta_d0 + inwards) - here) / inwards
-    others = np.vstack([by_start, np.gradient(here, times), np.ones_like(here), _free(servo, rate, here.size)])
+    by_model = [(position(gap, theta_d0, _scaled(servo, name)) - here) / _STEP for name in free]
+    by_angle = []
+    for row in () if angles is None else angles:
+        step = _STEP / np.abs(row).max()
+        by_angle.append((position(gap, theta_d0, angle=theta_m + step * row) - here) / step)
+    usual = [by_start, np.gradient(here, times), np.ones_like(here), _free(servo, rate, here.size)]
+    others = np.vstack([*usual, *by_model, *by_angle])
     return _spread(by_gap, others, root)
+
+
+def motor_unknowns(servo: Servo, voltage: Array, rate: float, held: bool) -> Array:
+    """(3, n) derivatives of theta_m (rad) by the logarithm of k_B, the current (A) and the speed (rad/s) at first.
+
+    Parameters
+    ----------
+    servo : Servo
+    voltage : (n,) array
+        V.
+    rate : float
+        Hz.
+    held : bool
+        Whether it is constant between samples, or linear.
+    """
+    times = np.arange(voltage.size) / rate
+
+    def angle(model: Servo, start: Sequence[float], drive: Array) -> Array:
+        electric, mechanic = [-model.R / model.L, -model.k_B / model.L, 0.0], [model.k_T / model.J, 0.0, 0.0]
+        system = ([electric, mechanic, [0.0, 1.0, 0.0]], [[1.0 / model.L], [0.0], [0.0]], [[0.0, 0.0, 1.0]], [[0.0]])
+        return np.asarray(lsim(system, drive, times, X0=start, interp=not held)[1])
+
+    speed = float(voltage[0]) / servo.k_B
+    here, step = angle(servo, (0.0, speed, 0.0), voltage), 1e-4
+    other = angle(servo.replace(k_B=(1.0 + step) * servo.k_B), (0.0, speed, 0.0), voltage)
+    by_state = [angle(servo, start, 0.0 * voltage) for start in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))]
+    return np.vstack([(other - here) / step, *by_state])
+
+
+def _scaled(servo: Servo, name: str) -> Servo:
+    """With one of its numbers larger by the step."""
+    value = getattr(servo, name)
+    larger = tuple((1.0 + _STEP) * one for one in value) if isinstance(value, tuple) else (1.0 + _STEP) * value
+    return servo.replace(**{name: larger})
 
 
 def _spread(column: Array, others: Array, root: Array) -> float:

@@ -1,4 +1,4 @@
-"""How right the default estimator is, how well it knows that, and how fast it is: every figure of docs/estimator.md."""
+"""How right the default and the joint estimator are, how well they know that, how fast: the figures of the docs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from statistics import median
 import numpy as np
 
 from servotwin.bench import estimator_conditions as conditions
+from servotwin.bench import estimator_joint as joint
 from servotwin.bench.cramer_rao import bound, noise_root
 from servotwin.bench.estimator_figures import (
     ANY,
@@ -61,6 +62,7 @@ def table(size: float = 1.0, seed: int = 2026) -> Iterator[Figure]:
     yield from conditions.wrong_model(share(9), seed)
     yield from conditions.compliant_screw(seed)
     yield from random_windows(share(1000), seed)
+    yield from joint.table(share(8), seed)
     yield from speed(share(24), seed)
 
 
