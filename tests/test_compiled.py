@@ -1,12 +1,15 @@
 """Compilation cached on disk: the key is the same in every process, and follows what a function uses."""
 
+import importlib
 import os
+import pkgutil
 import subprocess
 import sys
 
 import pytest
 
-from servotwin.hybrid.compiled import compiled
+import servotwin
+from servotwin.hybrid.compiled import compiled, stamp
 
 LIST_STAMPS = """
 import importlib, pkgutil, servotwin.hybrid, servotwin.simulation
@@ -30,6 +33,15 @@ def test_stamps_do_not_depend_on_the_process() -> None:
     first = stamps(0)  # seeds 0 and 4 order a set of two words differently
     assert first.count("\n") > 20
     assert {stamps(seed) for seed in (1, 4)} == {first}
+
+
+def test_every_helper_stands_above_its_callers() -> None:
+    """Only then does a caller's stamp follow it: the stamp made again, now that all is defined, is the same."""
+    for found in pkgutil.walk_packages(servotwin.__path__, "servotwin."):
+        if not found.name.endswith("__main__"):
+            for value in vars(importlib.import_module(found.name)).values():
+                if hasattr(value, "stamp") and hasattr(value, "py_func"):
+                    assert stamp(value.py_func, value.options_told) == value.stamp, value
 
 
 def helper_plus_one(x: float) -> float:

@@ -67,22 +67,6 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
     return tables
 
 
-@bare
-def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
-    """Tables of the automaton with these numbers; `t` has its structure."""
-    _fill_guards(t, numbers, w)
-    modes = len(t.guard_count)
-    flow = 0
-    for m in range(modes):
-        if t.flow_of[m] == flow:
-            _fill_flow(t, numbers, flow, m, step, w)
-            flow += 1
-    for m in range(modes):
-        for g in range(t.guards):
-            _fill_series(t, numbers, m, g, step, w)
-        _fill_single(t, m)
-
-
 @inlined
 def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
     """Rows, slopes and resets."""
@@ -100,27 +84,22 @@ def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
 
 
 @inlined
-def _store(p: Powers, n: int, table: Array, base: int) -> None:
-    """The present power, transposed."""
-    for i in range(n):
-        for j in range(n):
-            table[base + j * n + i] = p.power[i * n + j]
-
-
-@inlined
-def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
-    """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
-    n, p = t.states, w.powers
-    _fill_orders(t, numbers, flow, mode, step, w)
-    start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
-    base = flow * PARTS * n * n
-    for i in range(n * n):
-        t.jump_part[base + i] = 0.0
-    for j in range(1, PARTS):
-        _store(p, n, t.jump_part, base + j * n * n)
-        next_power(n, p)
-    _fill_nodes(t, t.fine, t.jump_fine, NODES_FINE, flow, step, w)
-    _fill_nodes(t, t.coarse, t.jump_coarse, NODES_COARSE, flow, step * NODES_FINE, w)
+def _fill_single(t: Tables, mode: int) -> None:
+    """One step: the flow's first power, and every guard's Bernstein rows from its values and slopes at both ends."""
+    n, stride = t.states, t.states + 4 * t.guards
+    count, nodes = t.guard_count[mode], NODES_FINE + 1
+    width = (2 * t.guards * nodes + VECTOR - 1) // VECTOR * VECTOR
+    for j in range(n):
+        at, source = (mode * n + j) * stride, (mode * n + j) * width
+        for r in range(n):
+            t.single[at + r] = t.jump_fine[(t.flow_of[mode] * NODES_FINE * n + j) * n + r]
+        for g in range(count):
+            value, third = source + g * nodes, source + (count + g) * nodes
+            to = at + n + 4 * g
+            t.single[to] = t.fine[value]
+            t.single[to + 1] = t.fine[value] + t.fine[third]
+            t.single[to + 2] = t.fine[value + 1] - t.fine[third + 1]
+            t.single[to + 3] = t.fine[value + 1]
 
 
 @inlined
@@ -140,18 +119,11 @@ def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float,
 
 
 @inlined
-def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, spacing: float, w: Workspace) -> None:
-    """One scale: the present power becomes its base; its powers, and the guards at its nodes."""
-    n, p = t.states, w.powers
-    rebase(n, p)
-    for j in range(nodes):
-        if j > 0:
-            next_power(n, p)
-        _store(p, n, jumps, (flow * nodes + j) * n * n)
-        for m in range(len(t.guard_count)):
-            if t.flow_of[m] == flow:
-                for g in range(t.guard_count[m]):
-                    _fill_guard(t, table, nodes, m, g, j + 1, spacing, w)
+def _store(p: Powers, n: int, table: Array, base: int) -> None:
+    """The present power, transposed."""
+    for i in range(n):
+        for j in range(n):
+            table[base + j * n + i] = p.power[i * n + j]
 
 
 @inlined
@@ -175,6 +147,37 @@ def _fill_guard(
         if node == 1:
             table[at + j * stride - 1] = row[j]
             table[at + j * stride + thirds - 1] = w.slope[j]
+
+
+@inlined
+def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, spacing: float, w: Workspace) -> None:
+    """One scale: the present power becomes its base; its powers, and the guards at its nodes."""
+    n, p = t.states, w.powers
+    rebase(n, p)
+    for j in range(nodes):
+        if j > 0:
+            next_power(n, p)
+        _store(p, n, jumps, (flow * nodes + j) * n * n)
+        for m in range(len(t.guard_count)):
+            if t.flow_of[m] == flow:
+                for g in range(t.guard_count[m]):
+                    _fill_guard(t, table, nodes, m, g, j + 1, spacing, w)
+
+
+@inlined
+def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
+    """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
+    n, p = t.states, w.powers
+    _fill_orders(t, numbers, flow, mode, step, w)
+    start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
+    base = flow * PARTS * n * n
+    for i in range(n * n):
+        t.jump_part[base + i] = 0.0
+    for j in range(1, PARTS):
+        _store(p, n, t.jump_part, base + j * n * n)
+        next_power(n, p)
+    _fill_nodes(t, t.fine, t.jump_fine, NODES_FINE, flow, step, w)
+    _fill_nodes(t, t.coarse, t.jump_coarse, NODES_COARSE, flow, step * NODES_FINE, w)
 
 
 @inlined
@@ -203,20 +206,17 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
             t.sizes[(at * TERMS + k) * n + i] = w.orders[k * n + i]
 
 
-@inlined
-def _fill_single(t: Tables, mode: int) -> None:
-    """One step: the flow's first power, and every guard's Bernstein rows from its values and slopes at both ends."""
-    n, stride = t.states, t.states + 4 * t.guards
-    count, nodes = t.guard_count[mode], NODES_FINE + 1
-    width = (2 * t.guards * nodes + VECTOR - 1) // VECTOR * VECTOR
-    for j in range(n):
-        at, source = (mode * n + j) * stride, (mode * n + j) * width
-        for r in range(n):
-            t.single[at + r] = t.jump_fine[(t.flow_of[mode] * NODES_FINE * n + j) * n + r]
-        for g in range(count):
-            value, third = source + g * nodes, source + (count + g) * nodes
-            to = at + n + 4 * g
-            t.single[to] = t.fine[value]
-            t.single[to + 1] = t.fine[value] + t.fine[third]
-            t.single[to + 2] = t.fine[value + 1] - t.fine[third + 1]
-            t.single[to + 3] = t.fine[value + 1]
+@bare
+def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
+    """Tables of the automaton with these numbers; `t` has its structure."""
+    _fill_guards(t, numbers, w)
+    modes = len(t.guard_count)
+    flow = 0
+    for m in range(modes):
+        if t.flow_of[m] == flow:
+            _fill_flow(t, numbers, flow, m, step, w)
+            flow += 1
+    for m in range(modes):
+        for g in range(t.guards):
+            _fill_series(t, numbers, m, g, step, w)
+        _fill_single(t, m)

@@ -2,7 +2,7 @@
 
 numba keys its disk cache on the file that defines a function, so an edit to an *imported* compiled helper would go
 unnoticed. Here the key is a digest of the function's own code and of every compiled function that it names, and theirs
-in turn.
+in turn. Helpers must stand above what calls them: what is defined later has no digest yet.
 """
 
 from __future__ import annotations
@@ -48,13 +48,15 @@ def _compile(function: _Function, **options: Any) -> _Function:
     dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # A set of strings is written in another order by every process.
     told = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
-    dispatcher.stamp = _stamp(function, repr(sorted(told.items())))
+    dispatcher.options_told = repr(sorted(told.items()))
+    dispatcher.stamp = stamp(function, dispatcher.options_told)
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
     return cast(_Function, dispatcher)
 
 
-def _stamp(function: Any, options: str) -> str:
+def stamp(function: Any, options: str) -> str:
+    """Digest of a function, of the options it is compiled with, and of everything compiled or constant that it names."""
     code = function.__code__
     parts = [options, _fingerprint(code)]
     for name in code.co_names:

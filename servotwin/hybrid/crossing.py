@@ -37,31 +37,6 @@ def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
 
 
 @inlined
-def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
-    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
-    not."""
-    base = (mode * t.guards + guard) * t.states
-    if dot(t.rows, base, x) + dot_sizes(t.changes, base, x) < 0.0:
-        # Not even with every term of the series at its worst.
-        return np.inf
-    c = scratch.series
-    first = series(t, mode, guard, x, c)
-    if first == TERMS:
-        return np.inf
-    if c[first] > 0.0:
-        return 0.0
-    if first > 0 or length < 1.0:
-        # Leading zeros are divided out: the guard starts at zero and moves away.
-        power = 1.0
-        for k in range(TERMS - first):
-            c[k] = c[k + first] * power
-            power *= length
-        for k in range(TERMS - first, TERMS):
-            c[k] = 0.0
-    return _search_unit(t, scratch) * length
-
-
-@inlined
 def significant(c: Array) -> int:
     """Number of leading coefficients, at least two, after which all the rest cannot change a value on [0, 1]."""
     largest = 0.0
@@ -86,3 +61,28 @@ def _search_unit(t: Tables, scratch: Scratch) -> float:
             if root < np.inf:
                 return root
     return np.inf
+
+
+@inlined
+def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
+    """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
+    not."""
+    base = (mode * t.guards + guard) * t.states
+    if dot(t.rows, base, x) + dot_sizes(t.changes, base, x) < 0.0:
+        # Not even with every term of the series at its worst.
+        return np.inf
+    c = scratch.series
+    first = series(t, mode, guard, x, c)
+    if first == TERMS:
+        return np.inf
+    if c[first] > 0.0:
+        return 0.0
+    if first > 0 or length < 1.0:
+        # Leading zeros are divided out: the guard starts at zero and moves away.
+        power = 1.0
+        for k in range(TERMS - first):
+            c[k] = c[k + first] * power
+            power *= length
+        for k in range(TERMS - first, TERMS):
+            c[k] = 0.0
+    return _search_unit(t, scratch) * length

@@ -77,6 +77,13 @@ def _multiply(a: Array, b: Array, n: int, out: Array) -> None:
 
 
 @inlined
+def rebase(n: int, p: Powers) -> None:
+    """The present power becomes the base: what comes next are powers of it."""
+    for i in range(n * n):
+        p.base[i], p.base_low[i] = p.power[i], p.power_low[i]
+
+
+@inlined
 def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None:
     """The first power of ``flow[base:]``, ``(n, n)`` flat, over a time in which no eigenvalue turns far: its Taylor
     series."""
@@ -93,13 +100,6 @@ def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None
         if open_terms == 0:
             break
     rebase(n, p)
-
-
-@inlined
-def rebase(n: int, p: Powers) -> None:
-    """The present power becomes the base: what comes next are powers of it."""
-    for i in range(n * n):
-        p.base[i], p.base_low[i] = p.power[i], p.power_low[i]
 
 
 @inlined

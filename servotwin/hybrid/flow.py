@@ -145,6 +145,24 @@ def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: S
 
 
 @inlined
+def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wanted: int) -> int:
+    """Number of intervals, at most `wanted`, before the first in which some guard may become positive.
+
+    More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
+    """
+    clean, thirds = wanted, t.guard_count[mode] * rows
+    for g in range(t.guard_count[mode]):
+        least = rounding(t, mode, g, 0, x)
+        for k in range(clean):
+            at = g * rows + k
+            begin, end = out[at], out[at + 1]
+            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > least:
+                clean = k
+                break
+    return clean
+
+
+@inlined
 def advance_clean(
     t: Tables, table: Array, jumps: Array, nodes: int, wanted: int, mode: int, x: Array, scratch: Scratch
 ) -> int:
@@ -163,22 +181,4 @@ def advance_clean(
     clean = wanted if positive == 0 else clean_intervals(t, mode, x, out, nodes + 1, wanted)
     if clean > 0:
         advance(jumps, (t.flow_of[mode] * nodes + clean - 1) * t.states * t.states, x, scratch.change)
-    return clean
-
-
-@inlined
-def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wanted: int) -> int:
-    """Number of intervals, at most `wanted`, before the first in which some guard may become positive.
-
-    More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
-    """
-    clean, thirds = wanted, t.guard_count[mode] * rows
-    for g in range(t.guard_count[mode]):
-        least = rounding(t, mode, g, 0, x)
-        for k in range(clean):
-            at = g * rows + k
-            begin, end = out[at], out[at + 1]
-            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > least:
-                clean = k
-                break
     return clean

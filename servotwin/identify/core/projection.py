@@ -49,6 +49,18 @@ def spread(derivative: Array, others: Array, singular: float = _SINGULAR) -> flo
 
 
 @bare
+def remove(rows: Array, known: int, column: Array) -> None:
+    """Take off a column (n,) its parts along the first `known` orthonormal rows, one after the other."""
+    for k in range(known):
+        row = rows[k]
+        share = 0.0
+        for i in range(column.size):
+            share += row[i] * column[i]
+        for i in range(column.size):
+            column[i] -= share * row[i]
+
+
+@bare
 def add_direction(rows: Array, known: int, column: Array, dependent: float) -> bool:
     """Put what is new in a column, normalised, into row `known`; False when nothing is."""
     row = rows[known]
@@ -67,15 +79,3 @@ def add_direction(rows: Array, known: int, column: Array, dependent: float) -> b
     for i in range(row.size):
         row[i] /= length
     return True
-
-
-@bare
-def remove(rows: Array, known: int, column: Array) -> None:
-    """Take off a column (n,) its parts along the first `known` orthonormal rows, one after the other."""
-    for k in range(known):
-        row = rows[k]
-        share = 0.0
-        for i in range(column.size):
-            share += row[i] * column[i]
-        for i in range(column.size):
-            column[i] -= share * row[i]

@@ -151,18 +151,6 @@ def _respond(inputs: Array, decay: Array, readout: Readout) -> Array:
 
 
 @bare
-def run_modes(signal: Array, decay: Array, gain: Array, direct: float, out: Array) -> None:
-    """The output (n,) of all modes to a signal (n,); two modes at a time, because one waits for its own products."""
-    for i in range(signal.size):
-        out[i] = direct * signal[i]
-    modes = len(decay)
-    for first in range(0, modes - 1, 2):
-        run_pair(signal, decay, gain, first, first + 1, 1.0, out)
-    if modes % 2 == 1:
-        run_pair(signal, decay, gain, modes - 1, modes - 1, 0.0, out)
-
-
-@bare
 def run_pair(signal: Array, decay: Array, gain: Array, one: int, two: int, share: float, out: Array) -> None:
     """Add the output of mode `one`, and `share` times that of mode `two`."""
     ar, ai, br, bi = decay[one, 0], decay[one, 1], decay[two, 0], decay[two, 1]
@@ -174,3 +162,15 @@ def run_pair(signal: Array, decay: Array, gain: Array, one: int, two: int, share
         u = signal[i]
         xr, xi = ar * xr - ai * xi + u, ai * xr + ar * xi
         yr, yi = br * yr - bi * yi + u, bi * yr + br * yi
+
+
+@bare
+def run_modes(signal: Array, decay: Array, gain: Array, direct: float, out: Array) -> None:
+    """The output (n,) of all modes to a signal (n,); two modes at a time, because one waits for its own products."""
+    for i in range(signal.size):
+        out[i] = direct * signal[i]
+    modes = len(decay)
+    for first in range(0, modes - 1, 2):
+        run_pair(signal, decay, gain, first, first + 1, 1.0, out)
+    if modes % 2 == 1:
+        run_pair(signal, decay, gain, modes - 1, modes - 1, 0.0, out)

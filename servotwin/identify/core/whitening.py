@@ -76,6 +76,25 @@ def _criterion(power: float, order: int, size: int) -> float:
     return size * math.log(max(power, 1e-300)) + 2.0 * count * size / max(1, size - count - 1)
 
 
+@bare
+def correlation(forward: Array, backward: Array, order: int) -> tuple[float, float]:
+    """Sums of the products of both errors, and of their squares, the backward one a sample earlier."""
+    across = square = 0.0
+    for i in range(order, forward.size):
+        across += forward[i] * backward[i - 1]
+        square += forward[i] * forward[i] + backward[i - 1] * backward[i - 1]
+    return across, square
+
+
+@bare
+def reflect(forward: Array, backward: Array, order: int, reflection: float) -> None:
+    """One stage of the lattice, in place."""
+    for i in range(forward.size - 1, order - 1, -1):
+        ahead, behind = forward[i], backward[i - 1]
+        forward[i] = ahead + reflection * behind
+        backward[i] = behind + reflection * ahead
+
+
 @compiled
 def recursion(series: Array, most: int) -> tuple[Array, Array]:
     """Burg's recursion: prediction error filters (most + 1, most + 1) and powers (most + 1,) of all orders."""
@@ -98,25 +117,6 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
             predictors[order, i] = predictors[order - 1, i] + reflection * last
         power[order] = power[order - 1] * (1.0 - reflection * reflection)
     return predictors, power
-
-
-@bare
-def correlation(forward: Array, backward: Array, order: int) -> tuple[float, float]:
-    """Sums of the products of both errors, and of their squares, the backward one a sample earlier."""
-    across = square = 0.0
-    for i in range(order, forward.size):
-        across += forward[i] * backward[i - 1]
-        square += forward[i] * forward[i] + backward[i - 1] * backward[i - 1]
-    return across, square
-
-
-@bare
-def reflect(forward: Array, backward: Array, order: int, reflection: float) -> None:
-    """One stage of the lattice, in place."""
-    for i in range(forward.size - 1, order - 1, -1):
-        ahead, behind = forward[i], backward[i - 1]
-        forward[i] = ahead + reflection * behind
-        backward[i] = behind + reflection * ahead
 
 
 @bare
