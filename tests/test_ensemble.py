@@ -5,11 +5,12 @@ import pytest
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Automaton, Guard, Mode
-from servotwin.hybrid.ensemble import run_ensemble
+from servotwin.hybrid.ensemble import Members, run_ensemble, run_family
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.servo import Servo
 from servotwin.simulation import simulate
-from servotwin.simulation.ensemble import simulate_ensemble, simulate_members
+from servotwin.simulation.cases import Cases
+from servotwin.simulation.ensemble import simulate_ensemble, simulate_members, summarise_members
 
 DEGREE = np.pi / 180.0
 TABLE1 = Servo.preset("table1")
@@ -51,6 +52,69 @@ def test_members_with_servos_and_controllers_of_their_own_are_runs() -> None:
             assert np.abs(values[at] - expected).max() < 1e-9 * np.abs(expected).max(), (at, name)
 
 
+@pytest.mark.parametrize(
+    ("plant", "law"),
+    [
+        ({}, {"feedforward": 0.05}),
+        ({}, {"voltage_limit": 3.0, "loop_filter_hz": 40.0, "enter": 0.5, "leave": 1.5}),
+        ({"n": 2, "m": 4.0}, {"Ki": 0.0}),
+        ({"k_d": 1e6}, {}),
+    ],
+)
+def test_disturbed_members_of_any_structure_are_runs(plant: dict[str, float], law: dict[str, float]) -> None:
+    servo = Servo.preset("paper").replace(**plant)
+    controller = servo.controller.replace(**law)
+    biases, tolerances = [0.0, -0.07], [0.0, servo.tolerance_for(5.0 * DEGREE)]
+    frictions = [0.0, 0.05 * servo.k_T / servo.R] if servo.rigid else [0.0]
+    members = simulate_members(
+        servo,
+        controller,
+        3.0,
+        -1e-3,
+        gap=8.0 * DEGREE,
+        tolerance=tolerances,
+        theta_d0=0.03,
+        input_bias=np.array(biases)[:, None],
+        friction=np.array(frictions)[:, None, None],
+        outputs=("error", "voltage"),
+    )
+    for k, b, t in np.ndindex(len(frictions), 2, 2):
+        options = {"reference": -1e-3, "gap": 8.0 * DEGREE, "tolerance": tolerances[t] or None, "theta_d0": 0.03}
+        disturbances = {"input_bias": biases[b], "friction": frictions[k]}
+        alone = simulate(servo, 3.0, controller=controller, sample_rate=100.0, **options, **disturbances)
+        found = members["voltage"][k, b, t], members["error"][k, b, t]
+        for values, expected in zip(found, (alone.voltage, alone.channel("error", 0, 301)), strict=True):
+            assert np.abs(values - expected).max() < 1e-9 * np.abs(expected).max(), (k, b, t)
+
+
+def test_figures_are_those_of_the_samples() -> None:
+    paper, rng = Servo.preset("paper"), np.random.default_rng(5)
+    servos = np.array([paper.replace(k=1e4 * rng.uniform(0.85, 1.15)) for _ in range(5)])[:, None]
+    cases = Cases(np.array([0.3e-3, 2e-3]), np.array([4.0, 20.0]) * DEGREE, np.array([0.0, 1e-5]))
+    samples = simulate_members(servos, None, 6.0, *cases, outputs=("error", "theta_m"))
+    figures = summarise_members(servos, None, 6.0, cases, 2.0, {"error": 1e-4}, outputs=("error", "theta_m"))
+    for name, y in samples.items():
+        found, last = figures[name], y[..., -200:]
+        expected = {
+            "lowest": y.min(axis=-1),
+            "highest": y.max(axis=-1),
+            "mean": y.mean(axis=-1),
+            "mean_square": np.mean(y**2, axis=-1),
+            "mean_size": np.abs(y).mean(axis=-1),
+            "travel": np.abs(np.diff(y)).sum(axis=-1),
+            "last_lowest": last.min(axis=-1),
+            "last_highest": last.max(axis=-1),
+            "last_mean": last.mean(axis=-1),
+            "last_mean_square": np.mean(last**2, axis=-1),
+        }
+        for figure, value in expected.items():
+            assert np.allclose(getattr(found, figure), value, rtol=1e-10, atol=1e-18), (name, figure)
+        assert found.lowest.shape == (5, 2)
+    beyond = [[np.flatnonzero(np.abs(y) > 1e-4)[-1] + 1 for y in row] for row in samples["error"]]
+    assert np.array_equal(figures["error"].outside, beyond)
+    assert not figures["theta_m"].outside.any()
+
+
 def test_threads_change_no_bit() -> None:
     gaps = np.linspace(0.0, 40.0, 17) * DEGREE
     one, three = (simulate_ensemble(TABLE1, 5.0, 1e-3, gap=gaps, tolerance=1e-5, threads=k) for k in (1, 3))
@@ -64,6 +128,14 @@ def test_wrong_members_are_refused() -> None:
         simulate_ensemble(TABLE1, 1.0, tolerance=np.nan)
     with pytest.raises(InvalidInput, match="continuous controller"):
         simulate_ensemble(TABLE1, 1.0, controller=TABLE1.controller.replace(sample_rate=1e3))
+    with pytest.raises(InvalidInput, match="friction"):
+        simulate_members(TABLE1, None, 1.0, friction=-0.1)
+    with pytest.raises(InvalidInput, match="no output 'speed'"):
+        simulate_members(TABLE1, None, 1.0, outputs=("speed",))
+    with pytest.raises(InvalidInput, match="limits name 'voltage'"):
+        summarise_members(TABLE1, None, 1.0, Cases(), 0.5, {"voltage": 1.0}, outputs=("error",))
+    with pytest.raises(InvalidInput, match="last 201 of 101"):
+        summarise_members(TABLE1, None, 1.0, Cases(), 2.01)
 
 
 def test_a_member_that_slides_is_named() -> None:
@@ -75,3 +147,14 @@ def test_a_member_that_slides_is_named() -> None:
         run_ensemble(automaton, starts, [0, 0, 0], 0.1, 20, [1.0, 0.0], threads=1)
     with pytest.raises(InvalidInput, match="modes"):
         run_ensemble(automaton, starts, [0, 0, 2], 0.1, 20, [1.0, 0.0])
+
+
+def test_a_family_has_one_structure() -> None:
+    down, up = (Automaton((Mode([[0.0]], (Guard([sign], 0),)),), ("x",)) for sign in (-1.0, 1.0))
+    members = Members(np.array([0, 1]), np.array([0, 0]), np.array([[1.0], [-1.0]]))
+    traces, _ = run_family((down, up), np.ones((2, 1, 1, 1)), members, 0.1, 3)
+    assert np.array_equal(traces[:, 0], [[1.0] * 3, [-1.0] * 3])
+    with pytest.raises(InvalidInput, match="same states"):
+        run_family((down, Automaton((Mode([[0.0]]),), ("x",))), np.ones((2, 1, 1, 1)), members, 0.1, 3)
+    with pytest.raises(InvalidInput, match="automaton of 0 to 0"):
+        run_family((down,), np.ones((1, 1, 1, 1)), members, 0.1, 3)

@@ -92,17 +92,43 @@ class Automaton:
     @cached_property
     def fastest(self) -> float:
         """Largest eigenvalue magnitude of any mode, 1/s."""
-        return float(np.abs(np.linalg.eigvals(self.flows)).max())
+        return float(self._speeds[0])
 
     @cached_property
     def fastest_lasting(self) -> float:
         """The same among motions that last: those damped by less than 1 / sqrt(2), 1/s."""
-        values = np.linalg.eigvals(self.flows)
-        return float(np.abs(values[values.real > -np.abs(values) / np.sqrt(2.0)]).max(initial=0.0))
+        return float(self._speeds[1])
+
+    @cached_property
+    def _speeds(self) -> tuple[Array, Array]:
+        return speeds(self.flows)
 
     def index(self, name: str) -> int:
         """Index of the state called `name`."""
         return self.names.index(name)
+
+
+def speeds(flows: Array) -> tuple[Array, Array]:
+    """Largest eigenvalue magnitudes (1/s) of the modes of automata, flows (..., M, n, n): of all, and of those damped
+    by less than 1 / sqrt(2)."""
+    # What never moves has eigenvalue zero, and equal flows have equal ones.
+    moving = np.flatnonzero(flows.any(axis=(*range(flows.ndim - 2), flows.ndim - 1)))
+    different = np.unique(shared_flows(flows), return_index=True)[1]
+    if moving.size == 0:
+        return np.zeros(flows.shape[:-3]), np.zeros(flows.shape[:-3])
+    values = np.linalg.eigvals(flows[..., different, :, :][..., moving[:, None], moving])
+    sizes = np.abs(values)
+    lasting = np.where(values.real > -sizes / np.sqrt(2.0), sizes, 0.0)
+    return sizes.max(axis=(-2, -1)), lasting.max(axis=(-2, -1))
+
+
+def shared_flows(flows: Array) -> NDArray[np.int64]:
+    """(M,) which of the different flows each of the (..., M, n, n) is, counted in the order in which they appear."""
+    result: list[int] = []
+    for m in range(flows.shape[-3]):
+        same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))
+        result.append(next((result[k] for k in same), max(result, default=-1) + 1))
+    return np.array(result)
 
 
 def _check(what: str, value: ArrayLike, shape: tuple[int, ...]) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.exponential import Powers, new_powers, next_power, rebase, start_powers
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.tables import (
@@ -67,7 +67,7 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
     return tables
 
 
-@inlined
+@bare
 def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
     """Rows, slopes and resets."""
     n = t.states
@@ -83,7 +83,7 @@ def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
                     t.reset[(at + j) * n + i] = numbers.resets[(at + i) * n + j] - (i == j)
 
 
-@inlined
+@bare
 def _fill_single(t: Tables, mode: int) -> None:
     """One step: the flow's first power, and every guard's Bernstein rows from its values and slopes at both ends."""
     n, stride = t.states, t.states + 4 * t.guards
@@ -102,7 +102,7 @@ def _fill_single(t: Tables, mode: int) -> None:
             t.single[to + 3] = t.fine[value + 1]
 
 
-@inlined
+@bare
 def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
     """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
     n, stride = t.states, t.states * PART_TERMS
@@ -118,7 +118,7 @@ def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float,
                 w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
 
 
-@inlined
+@bare
 def _store(p: Powers, n: int, table: Array, base: int) -> None:
     """The present power, transposed."""
     for i in range(n):
@@ -126,7 +126,7 @@ def _store(p: Powers, n: int, table: Array, base: int) -> None:
             table[base + j * n + i] = p.power[i * n + j]
 
 
-@inlined
+@bare
 def _fill_guard(
     t: Tables, table: Array, nodes: int, mode: int, g: int, node: int, spacing: float, w: Workspace
 ) -> None:
@@ -149,7 +149,7 @@ def _fill_guard(
             table[at + j * stride + thirds - 1] = w.slope[j]
 
 
-@inlined
+@bare
 def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, spacing: float, w: Workspace) -> None:
     """One scale: the present power becomes its base; its powers, and the guards at its nodes."""
     n, p = t.states, w.powers
@@ -164,7 +164,7 @@ def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, sp
                     _fill_guard(t, table, nodes, m, g, j + 1, spacing, w)
 
 
-@inlined
+@bare
 def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
     """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
     n, p = t.states, w.powers
@@ -180,7 +180,7 @@ def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w
     _fill_nodes(t, t.coarse, t.jump_coarse, NODES_COARSE, flow, step * NODES_FINE, w)
 
 
-@inlined
+@bare
 def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w: Workspace) -> None:
     """A guard's Taylor series over a step, the sizes of all the terms that enter it and each of its derivatives."""
     n = t.states
@@ -210,12 +210,11 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
 def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
     """Tables of the automaton with these numbers; `t` has its structure."""
     _fill_guards(t, numbers, w)
-    modes = len(t.guard_count)
-    flow = 0
+    modes, filled = len(t.guard_count), -1
     for m in range(modes):
-        if t.flow_of[m] == flow:
-            _fill_flow(t, numbers, flow, m, step, w)
-            flow += 1
+        if t.flow_of[m] > filled:
+            filled = t.flow_of[m]
+            _fill_flow(t, numbers, filled, m, step, w)
     for m in range(modes):
         for g in range(t.guards):
             _fill_series(t, numbers, m, g, step, w)

@@ -1,58 +1,54 @@
-"""Many runs of one automaton from many starts, on several threads: one set of tables serves all."""
+"""Many runs from many starts, of one automaton or of many with one structure, on several threads."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.compiled import bare
-from servotwin.hybrid.flow import Scratch, new_scratch
-from servotwin.hybrid.kernel import DONE, FULL, ZENO, Record, flow_until, grown, new_record, settle
-from servotwin.hybrid.output import Outputs, output_table, sample_segments
-from servotwin.hybrid.tables import Tables, search_step
-from servotwin.hybrid.trajectory import ZenoError, tables_for
+from servotwin.hybrid.automaton import Array, Automaton, shared_flows, speeds
+from servotwin.hybrid.build import new_workspace, numbers_of
+from servotwin.hybrid.flow import new_scratch
+from servotwin.hybrid.kernel import DONE, ZENO, Record, grown, new_record
+from servotwin.hybrid.members import Family, Figures, Found, Hand, Starts, run_members
+from servotwin.hybrid.output import empty_outputs, new_block
+from servotwin.hybrid.tables import divisors, empty_tables
+from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
 
 
-@bare
-def run_members(
-    t: Tables,
-    states: Array,
-    modes: NDArray[np.int64],
-    first: int,
-    steps: int,
-    stride: int,
-    outputs: Outputs,
-    out: Array,
-    events: NDArray[np.int64],
-    record: Record,
-    scratch: Scratch,
-) -> tuple[int, int]:
-    """Run members `first` on until all are done; return the status and the member it concerns."""
-    for k in range(first, len(states)):
-        x = states[k]
-        record.size[0] = record.size[1] = 0
-        mode = settle(t, modes[k], x, 0, 0.0, True, record, scratch)
-        if mode < 0:
-            return ZENO, k
-        status, _, _, mode = flow_until(t, x, mode, 0, 0.0, steps, 0.0, record, scratch)
-        if status != DONE:
-            return status, k
-        modes[k] = mode
-        events[k] = record.size[1]
-        size = record.size[0]
-        for o in range(len(out[k])):
-            one, row = Outputs(outputs.table[o], outputs.order[o], outputs.used[o]), out[k, o]
-            sample_segments(
-                0, size, record.step, record.fraction, record.mode, record.state, one, stride, 0, scratch.change, row
-            )
-    return DONE, len(states)
+class Members(NamedTuple):
+    """Where runs begin, and what of them.
+
+    Attributes
+    ----------
+    automaton : (K,) array
+        Index of each member's automaton.
+    mode : (K,) array
+        Modes at time 0.
+    state : (K, n) array
+        States at time 0.
+    """
+
+    automaton: NDArray[np.int64]
+    mode: NDArray[np.int64]
+    state: Array
+
+
+@dataclass(frozen=True)
+class Judging:
+    """What figures need: ``limits`` (K, O) that an output is outside of, and the number of samples at the end that have
+    figures of their own."""
+
+    limits: Array
+    last: int
 
 
 def run_ensemble(
@@ -93,61 +89,170 @@ def run_ensemble(
     ZenoError
         Naming the member.
     """
-    starts, first_modes = _checked_starts(automaton, states, modes)
-    step, divisor = search_step(automaton, sample_step)
-    tables = tables_for(automaton, step)
-    outputs = _output_tables(automaton, tables, rows, divisor)
-    out, events = np.empty((len(starts), len(outputs.table), samples)), np.zeros(len(starts), dtype=np.int64)
-    workers = max(1, min(threads or os.cpu_count() or 1, len(starts)))
-    # Members cost unequally: many small parts keep every worker busy to the end.
-    size = max(1, len(starts) // (_PARTS_PER_WORKER * workers))
-    parts = [slice(first, first + size) for first in range(0, len(starts), size)]
+    starts, first_modes = np.array(states, dtype=float, ndmin=2), np.array(modes, dtype=np.int64, ndmin=1)
+    full = np.array(np.broadcast_to(rows, (*np.shape(rows)[:-2], *automaton.flows.shape[:2])), dtype=float, ndmin=3)
+    members = Members(np.zeros(len(first_modes), dtype=np.int64), first_modes, starts)
+    traces, events = run_family((automaton,), full[None], members, sample_step, samples, threads)
+    return (traces if np.ndim(rows) == 3 else traces[:, 0]), events
 
-    def work(part: slice) -> None:
-        steps = (samples - 1) * divisor
-        run = _run_part(tables, starts[part], first_modes[part], steps, divisor, outputs, out[part], events[part])
-        if run < size and part.start + run < len(starts):
-            raise ZenoError(f"member {part.start + run} changes mode without end: the automaton is Zeno or slides")
+
+def run_family(
+    automata: Sequence[Automaton],
+    rows: Array,
+    members: Members,
+    sample_step: float,
+    samples: int,
+    threads: int | None = None,
+) -> tuple[Array, NDArray[np.int64]]:
+    """Outputs of every member at every sample, each of an automaton of its own.
+
+    Parameters
+    ----------
+    automata : sequence of A Automaton
+        Of one structure: states, guards, targets; their numbers differ.
+    rows : (A, O, M, n) array
+        Outputs ``rows[automaton, o, mode] @ x``.
+    members : Members
+    sample_step, samples, threads
+        As for `run_ensemble`.
+
+    Returns
+    -------
+    output : (K, O, samples) array
+    events : (K,) array
+
+    Raises
+    ------
+    InvalidInput
+        Automata of different structure, or members that begin nowhere.
+    ZenoError
+        Naming the member.
+    """
+    traces = np.empty((len(members.mode), rows.shape[1], samples))
+    found = Found(traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64))
+    _run(_family(automata, rows, sample_step), automata[0], members, found, None, threads)
+    return traces, found.events
+
+
+def figures_of_family(
+    automata: Sequence[Automaton],
+    rows: Array,
+    members: Members,
+    sample_step: float,
+    samples: int,
+    judging: Judging,
+    threads: int | None = None,
+) -> Figures:
+    """The same runs; the samples are not kept, but what they come to: arrays (K, O)."""
+    if not 1 <= judging.last <= samples:
+        raise InvalidInput(f"the last {judging.last} of {samples} samples: must be 1 to {samples}")
+    figures = np.empty((len(members.mode), rows.shape[1], len(Figures._fields)))
+    found = Found(np.empty((1, rows.shape[1], samples)), figures, np.zeros(len(figures), dtype=np.int64))
+    _run(_family(automata, rows, sample_step), automata[0], members, found, judging, threads)
+    return Figures(*np.moveaxis(figures, 2, 0))
+
+
+def _family(automata: Sequence[Automaton], rows: Array, sample_step: float) -> Family:
+    flows = np.array([automaton.flows for automaton in automata])
+    structure = _structure(automata[0])
+    if any(_structure(automaton) != structure for automaton in automata[1:]):
+        raise InvalidInput("the automata of an ensemble must have the same states, modes, guards and targets")
+    guards = max(1, *(len(mode.guards) for mode in automata[0].modes))
+    numbers = [numbers_of(automaton, guards) for automaton in automata]
+    strides = divisors(*speeds(flows), sample_step)
+    return Family(
+        np.array([each.flows for each in numbers]),
+        np.array([each.rows for each in numbers]),
+        np.array([each.resets for each in numbers]),
+        np.array(rows, dtype=float).reshape(*rows.shape[:2], -1),
+        sample_step / strides,
+        strides,
+    )
+
+
+def _structure(automaton: Automaton) -> tuple[object, ...]:
+    targets = tuple(tuple((g.target, g.reset is None) for g in mode.guards) for mode in automaton.modes)
+    return automaton.names, targets
+
+
+def _run(
+    family: Family,
+    structure: Automaton,
+    members: Members,
+    found: Found,
+    judging: Judging | None,
+    threads: int | None,
+) -> None:
+    """Fill `found`; every worker takes the next part when it is done with one."""
+    starts = _checked_starts(structure, len(family.step), members, found, judging)
+    count = len(starts.order)
+    workers = max(1, min(threads or os.cpu_count() or 1, count))
+    # Members cost unequally: many small parts keep every worker busy to the end.
+    size = max(1, count // (_PARTS_PER_WORKER * workers))
+    parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
+    tail = 1 if judging is None else judging.last
+
+    def work(_: int) -> list[int]:
+        return _worked(family, structure, starts, found, parts, tail)
 
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(work, parts))
-    return (out if np.ndim(rows) == 3 else out[:, 0]), events
+        lost = [member for some in pool.map(work, range(workers)) for member in some]
+    if lost:
+        raise ZenoError(f"member {min(lost)} changes mode without end: the automaton is Zeno or slides")
 
 
-def _output_tables(automaton: Automaton, tables: Tables, rows: ArrayLike, divisor: int) -> Outputs:
-    """The tables of every output, one above the other."""
-    full = np.array(np.broadcast_to(rows, (*np.shape(rows)[:-2], *automaton.flows.shape[:2])), dtype=float, ndmin=3)
-    parts = zip(*(output_table(tables, one, divisor) for one in full), strict=True)
-    return Outputs(*(np.stack(part) for part in parts))
-
-
-def _checked_starts(automaton: Automaton, states: ArrayLike, modes: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-    starts, first_modes = np.array(states, dtype=float, ndmin=2), np.array(modes, dtype=np.int64, ndmin=1)
-    if starts.shape != (len(first_modes), len(automaton.names)):
-        raise InvalidInput(f"{starts.shape} states for {len(first_modes)} modes of {len(automaton.names)} states each")
-    if not (np.isfinite(starts).all() and np.isin(first_modes, np.arange(len(automaton.modes))).all()):
-        raise InvalidInput(f"states must be finite and modes one of 0 to {len(automaton.modes) - 1}")
-    return starts, first_modes
+def _worked(
+    family: Family, structure: Automaton, starts: Starts, found: Found, parts: Iterator[tuple[int, int]], tail: int
+) -> list[int]:
+    """One worker: run parts while there are any; return the members that cannot go on."""
+    hand, record = _new_hand(family, structure), new_record(starts.state.shape[1])
+    if len(found.figures):
+        found = found._replace(traces=np.empty_like(found.traces))
+    lost = []
+    for first, last in parts:
+        status, record = _run_part(family, starts, found, first, last, tail, hand, record)
+        if status >= 0:
+            lost.append(int(starts.order[status]))
+    return lost
 
 
 def _run_part(
-    tables: Tables,
-    states: Array,
-    modes: NDArray[np.int64],
-    steps: int,
-    stride: int,
-    outputs: Outputs,
-    out: Array,
-    events: NDArray[np.int64],
-) -> int:
-    """Run the members of a part; return the one that cannot go on, their number when all are done."""
-    record = new_record(states.shape[1])
-    scratch, kept, member = new_scratch(tables), states.copy(), 0
-    while True:
-        status, member = run_members(
-            tables, states, modes, member, steps, stride, outputs, out, events, record, scratch
-        )
-        if status != FULL:
-            return int(member)
-        record = grown(record)
-        states[member] = kept[member]
+    family: Family, starts: Starts, found: Found, first: int, last: int, tail: int, hand: Hand, record: Record
+) -> tuple[int, Record]:
+    """Run the members of a part; return the place of the one that cannot go on, -1 when all are done."""
+    while first < last:
+        status, first = run_members(family, starts, found, first, last, tail, hand, record)
+        if status == ZENO:
+            return int(first), record
+        if status != DONE:
+            record = grown(record)
+    return -1, record
+
+
+def _new_hand(family: Family, structure: Automaton) -> Hand:
+    flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
+    tables = empty_tables(structure, shared_flows(flows))
+    return Hand(
+        tables,
+        empty_outputs(tables, family.outputs.shape[1]),
+        new_workspace(tables),
+        new_block(tables.states),
+        new_scratch(tables),
+        np.zeros(tables.states),
+        np.full(1, -1),
+    )
+
+
+def _checked_starts(
+    structure: Automaton, automata: int, members: Members, found: Found, judging: Judging | None
+) -> Starts:
+    which, modes, states = members
+    n, count = len(structure.names), len(structure.modes)
+    if states.shape != (len(modes), n):
+        raise InvalidInput(f"{states.shape} states for {len(modes)} modes of {n} states each")
+    if not (np.isfinite(states).all() and np.isin(modes, np.arange(count)).all()):
+        raise InvalidInput(f"states must be finite and modes one of 0 to {count - 1}")
+    if which.shape != modes.shape or not np.isin(which, np.arange(automata)).all():
+        raise InvalidInput(f"every member needs an automaton of 0 to {automata - 1}")
+    limits = np.zeros((len(modes), found.traces.shape[1])) if judging is None else judging.limits
+    return Starts(np.argsort(which, kind="stable"), which, modes, states, limits)

@@ -76,14 +76,14 @@ def _multiply(a: Array, b: Array, n: int, out: Array) -> None:
         product(b, 0, n, n, a[i * n : (i + 1) * n], out[i * n : (i + 1) * n])
 
 
-@inlined
+@bare
 def rebase(n: int, p: Powers) -> None:
     """The present power becomes the base: what comes next are powers of it."""
     for i in range(n * n):
         p.base[i], p.base_low[i] = p.power[i], p.power_low[i]
 
 
-@inlined
+@bare
 def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None:
     """The first power of ``flow[base:]``, ``(n, n)`` flat, over a time in which no eigenvalue turns far: its Taylor
     series."""
@@ -102,7 +102,7 @@ def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None
     rebase(n, p)
 
 
-@inlined
+@bare
 def next_power(n: int, p: Powers) -> None:
     """One base more: ``exp(A (j + 1) t) - I = B + P + B P``."""
     _multiply(p.base, p.power, n, p.change)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import Scratch, advance, advance_fraction, dot, product
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables, aligned
 
 _BLOCK = NODES_COARSE * NODES_FINE
 
@@ -19,27 +20,108 @@ class Outputs(NamedTuple):
     """How one output follows from the state at the start of a segment, up to 127 steps later."""
 
     table: Array  # M * 128 * n, or M * n * 128 for the states in `order`
+    place: NDArray[np.int64]  # (M,) mode whose rows these are: modes of equal flow and row share them
     order: NDArray[np.int64]  # (M, n) states, those that count first
     used: NDArray[np.int64]  # (M,) number of those that count
 
 
-def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
+class Block(NamedTuple):
+    """Working memory of `fill_output`."""
+
+    starts: Array
+    jump: Array
+    rows: Array
+
+
+def new_block(states: int) -> Block:
+    """Working memory for outputs of so many states."""
+    return Block(
+        aligned(np.zeros(NODES_COARSE * states)), aligned(np.zeros(states * states)), aligned(np.zeros(_BLOCK * states))
+    )
+
+
+def empty_outputs(tables: Tables, *count: int) -> Outputs:
+    """Room for one output, or for `count` of them."""
+    n, modes = tables.states, len(tables.guard_count)
+    table = aligned(np.zeros(math.prod(count) * modes * _BLOCK * n)).reshape(*count, modes * _BLOCK * n)
+    place, used = np.zeros((2, *count, modes), dtype=np.int64)
+    return Outputs(table, place, np.zeros((*count, modes, n), dtype=np.int64), used)
+
+
+@inlined
+def _equal(rows: Array, one: int, other: int, n: int) -> bool:
+    different = 0
+    for i in range(n):
+        different += rows[one + i] != rows[other + i]
+    return different == 0
+
+
+@bare
+def _fill_rows(t: Tables, flow: int, row: Array, w: Block) -> None:
+    """``row @ exp(A j h)`` for all j: to every eighth step, and on from each of those."""
+    n = t.states
+    for k in range(n):
+        w.starts[k] = row[k]
+        for c in range(1, NODES_COARSE):
+            w.starts[c * n + k] = row[k] + dot(t.jump_coarse, ((flow * NODES_COARSE + c - 1) * n + k) * n, row)
+    for j in range(NODES_FINE):
+        base = (flow * NODES_FINE + j - 1) * n * n
+        for i in range(n):
+            for k in range(n):
+                # The tables hold deviations transposed.
+                w.jump[i * n + k] = t.jump_fine[base + k * n + i] if j > 0 else 0.0
+        for c in range(NODES_COARSE):
+            start, to = w.starts[c * n : (c + 1) * n], w.rows[(c * NODES_FINE + j) * n : (c * NODES_FINE + j + 1) * n]
+            product(w.jump, 0, n, n, start, to)
+            for k in range(n):
+                to[k] += start[k]
+
+
+@bare
+def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: Block) -> None:
+    """Rows as sampling needs them: whole ones, or for every step the columns that are not zero."""
+    base = m * _BLOCK * n
+    if stride > 1:
+        for i in range(_BLOCK * n):
+            outputs.table[base + i] = w.rows[i]
+        return
+    used, last = 0, n - 1
+    for k in range(n):
+        size = 0.0
+        for j in range(_BLOCK):
+            size += abs(w.rows[j * n + k])
+        if size > 0.0:
+            outputs.order[m, used] = k
+            for j in range(_BLOCK):
+                outputs.table[base + used * _BLOCK + j] = w.rows[j * n + k]
+            used += 1
+        else:
+            outputs.order[m, last] = k
+            last -= 1
+    outputs.used[m] = used
+
+
+@bare
+def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: Block) -> None:
     """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)`` for a
     few."""
-    n, modes = tables.states, len(tables.guard_count)
-    # Stored transposed: [m, j, k, i] is element (i, k) of the deviation.
-    fine = tables.jump_fine.reshape(-1, NODES_FINE, n, n)[tables.flow_of]
-    coarse = tables.jump_coarse.reshape(-1, NODES_COARSE, n, n)[tables.flow_of]
-    eights = rows[:, None] + np.einsum("mjki,mi->mjk", coarse[:, :-1], rows)
-    starts = np.concatenate([rows[:, None], eights], axis=1)
-    ones = starts[:, :, None] + np.einsum("mjki,mli->mljk", fine[:, :-1], starts)
-    table = np.concatenate([starts[:, :, None], ones], axis=2).reshape(modes, _BLOCK, n)
-    counts = np.abs(table).max(axis=1) > 0.0
-    order, used = np.argsort(~counts, axis=1, kind="stable"), counts.sum(axis=1)
-    if stride > 1:
-        return Outputs(table.ravel(), order, used)
-    columns = np.take_along_axis(table.transpose(0, 2, 1), order[:, :, None], axis=1)
-    return Outputs(np.ascontiguousarray(columns).ravel(), order, used)
+    n = t.states
+    for m in range(len(t.guard_count)):
+        outputs.place[m] = m
+        for k in range(m - 1, -1, -1):
+            if t.flow_of[k] == t.flow_of[m] and _equal(rows, k * n, m * n, n):
+                outputs.place[m] = outputs.place[k]
+                break
+        if outputs.place[m] == m:
+            _fill_rows(t, t.flow_of[m], rows[m * n : (m + 1) * n], w)
+            _lay_out(m, n, stride, outputs, w)
+
+
+def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
+    """The output ``rows[m] @ x``, `rows` being (M, n), at every `stride`-th step."""
+    outputs = empty_outputs(tables)
+    fill_output(tables, np.ascontiguousarray(rows, dtype=float).ravel(), stride, outputs, new_block(tables.states))
+    return outputs
 
 
 @bare
@@ -71,11 +153,12 @@ def sample_segments(
             if low >= last:
                 break
             continue
-        at, offset = mode[s] * n * _BLOCK, low * stride - step[s]
+        place = outputs.place[mode[s]]
+        at, offset = place * n * _BLOCK, low * stride - step[s]
         if stride == 1:
-            used = outputs.used[mode[s]]
+            used = outputs.used[place]
             for j in range(np.uint64(used)):
-                chosen[j] = state[s, outputs.order[mode[s], j]]
+                chosen[j] = state[s, outputs.order[place, j]]
             product(table, at + offset, _BLOCK, high - low, chosen[:used], out[low - first : high - first])
         else:
             for sample in range(low, high):

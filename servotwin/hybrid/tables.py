@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.automaton import Array, Automaton, shared_flows
 
 NODES_COARSE = 16
 NODES_FINE = 8
@@ -57,16 +57,22 @@ class Tables(NamedTuple):
 def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
     """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and none whose motion
     lasts by more than a quarter, and k."""
-    turns = max(automaton.fastest / SPECTRAL_STEP, automaton.fastest_lasting / LASTING_STEP) * sample_step
-    divisor = max(1, int(np.ceil(turns - 0.05)))
+    divisor = int(divisors(automaton.fastest, automaton.fastest_lasting, sample_step))
     return sample_step / divisor, divisor
 
 
-def empty_tables(automaton: Automaton) -> Tables:
-    """Tables with the structure of `automaton` and room for its numbers."""
+def divisors(fastest: ArrayLike, fastest_lasting: ArrayLike, sample_step: float) -> NDArray[np.int64]:
+    """The number k of search steps a sample, of each automaton."""
+    turns = np.maximum(np.divide(fastest, SPECTRAL_STEP), np.divide(fastest_lasting, LASTING_STEP)) * sample_step
+    return np.maximum(1, np.ceil(turns - 0.05)).astype(np.int64)
+
+
+def empty_tables(automaton: Automaton, flow_of: NDArray[np.int64] | None = None) -> Tables:
+    """Tables with the structure of `automaton` and room for its numbers; `flow_of` when automata of that structure do
+    not share its equal flows."""
     n, modes = len(automaton.names), automaton.modes
     guards, count = max(1, *(len(mode.guards) for mode in modes)), len(modes)
-    flow_of = shared_flows(automaton.flows)
+    flow_of = shared_flows(automaton.flows) if flow_of is None else flow_of
     flows = int(flow_of.max()) + 1
     target = np.zeros((count, guards), dtype=np.int64)
     has_reset = np.zeros((count, guards), dtype=bool)
@@ -97,15 +103,6 @@ def empty_tables(automaton: Automaton) -> Tables:
         bernstein=aligned(_bernstein_of_taylor().ravel()),
         **{name: aligned(np.zeros(size)) for name, size in sizes.items()},
     )
-
-
-def shared_flows(flows: Array) -> NDArray[np.int64]:
-    """(M,) which of the different flows each of the (..., M, n, n) is, counted in the order in which they appear."""
-    result: list[int] = []
-    for m in range(flows.shape[-3]):
-        same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))
-        result.append(next((result[k] for k in same), max(result, default=-1) + 1))
-    return np.array(result)
 
 
 def padded(rows: int) -> int:

@@ -1,21 +1,20 @@
-"""Many continuous runs at once: members that differ in constants share one automaton and its tables, members that
-differ in servo or controller are run side by side."""
+"""Many continuous runs at once, on all threads: of one servo, or each of a servo and with a controller of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.ensemble import run_ensemble
-from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
+from servotwin.hybrid.ensemble import Judging, figures_of_family, run_family
+from servotwin.hybrid.members import Figures
 from servotwin.plant.servo import Servo
-from servotwin.simulation.continuous import plant_start
+from servotwin.simulation.cases import Cases, Crowd, crowd
 
 
 def simulate_ensemble(
@@ -29,7 +28,7 @@ def simulate_ensemble(
     sample_rate: float = 100.0,
     threads: int | None = None,
 ) -> Array:
-    """Position of the last mass in many runs from rest.
+    """Position of the last mass in many runs of one servo from rest.
 
     Parameters
     ----------
@@ -37,8 +36,8 @@ def simulate_ensemble(
     duration : float
         s.
     reference, gap, tolerance, theta_d0 : array_like
-        m, rad (total), m, rad: constants of each run, broadcast against each other to shape S. A tolerance of 0 is no
-        dead zone, a gap of 0 no backlash.
+        m, rad (total), m, rad: constants of each run, broadcast against each other to shape S. A tolerance of 0 is a
+        dead zone of no width, a gap of 0 no backlash.
     controller : Controller, optional
         Continuous; the servo's own by default.
     sample_rate : float
@@ -51,20 +50,22 @@ def simulate_ensemble(
     (*S, N) array
         m, ``N = round(duration * sample_rate) + 1``.
     """
-    law = servo.controller if controller is None else controller
-    constants = _constants(reference, gap, tolerance, theta_d0)
-    out = _run_shared(servo, law, Shape(), constants, duration, sample_rate, ("position",), threads)
-    return out.reshape(*np.broadcast_shapes(*map(np.shape, (reference, gap, tolerance, theta_d0))), out.shape[-1])
+    members = crowd(servo, controller, Cases(reference, gap, tolerance, theta_d0))
+    return _traces(members, ("position",), duration, sample_rate, threads, dead_zone=True)[:, 0].reshape(
+        *members.shape, -1
+    )
 
 
 def simulate_members(
-    servos: Servo | Sequence[Any] | NDArray[np.object_],
-    controllers: Controller | Sequence[Any] | NDArray[np.object_] | None,
+    servos: Any,
+    controllers: Any,
     duration: float,
     reference: ArrayLike = 0.0,
     gap: ArrayLike = 0.0,
     tolerance: ArrayLike = 0.0,
     theta_d0: ArrayLike = 0.0,
+    input_bias: ArrayLike = 0.0,
+    friction: ArrayLike = 0.0,
     outputs: Sequence[str] = ("error", "voltage"),
     sample_rate: float = 100.0,
     threads: int | None = None,
@@ -74,13 +75,13 @@ def simulate_members(
     Parameters
     ----------
     servos : Servo or array_like of Servo
-    controllers : Controller or array_like of Controller, optional
-        Continuous; None: each servo's own.
+    controllers : Controller or array_like of Controller, or None
+        Continuous; None: the servo's own.
     duration : float
         s.
-    reference, gap, tolerance, theta_d0 : array_like
-        m, rad (total), m, rad: constants of each run. They, `servos` and `controllers` are broadcast against each other
-        to shape S. A tolerance of 0 is no dead zone, a gap of 0 no backlash.
+    reference, gap, tolerance, theta_d0, input_bias, friction : array_like
+        m, rad (total), m, rad, V, N m: constants of each run. They, `servos` and `controllers` are broadcast against
+        each other to shape S. A tolerance of 0 is no dead zone, a gap of 0 no backlash.
     outputs : sequence of str
         Rows of `ServoAutomaton`: error, voltage, position, theta_m, theta_d, q1, ...
     sample_rate : float
@@ -92,69 +93,97 @@ def simulate_members(
     -------
     dict of (*S, N) arrays
         By output, ``N = round(duration * sample_rate) + 1``.
+
+    Raises
+    ------
+    InvalidInput
+        A controller that is not continuous, a constant out of its range, an output that does not exist.
     """
-    plants, laws = _objects(servos), _objects(controllers)
-    constants = [np.asarray(v, dtype=float) for v in (reference, gap, tolerance, theta_d0)]
-    shape = np.broadcast_shapes(plants.shape, laws.shape, *(v.shape for v in constants))
-    flat = _constants(*(np.broadcast_to(v, shape) for v in constants))
-    groups: dict[tuple[Servo, Controller, bool], list[int]] = {}
-    pairs = zip(np.broadcast_to(plants, shape).ravel(), np.broadcast_to(laws, shape).ravel(), flat[2], strict=True)
-    for member, (servo, law, width) in enumerate(pairs):
-        groups.setdefault((servo, servo.controller if law is None else law, width > 0.0), []).append(member)
-    out = np.empty((len(flat[0]), len(outputs), round(duration * sample_rate) + 1))
-    for (servo, law, dead_zone), members in groups.items():
-        chosen = [v[members] for v in flat]
-        kind = Shape(dead_zone=dead_zone)
-        out[members] = _run_shared(servo, law, kind, chosen, duration, sample_rate, outputs, threads)
-    return {name: out[:, i].reshape(*shape, -1) for i, name in enumerate(outputs)}
+    members = crowd(servos, controllers, Cases(reference, gap, tolerance, theta_d0, input_bias, friction))
+    traces = _traces(members, outputs, duration, sample_rate, threads)
+    return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
 
-def _objects(values: object) -> NDArray[np.object_]:
-    return np.asarray(values, dtype=object)
+def summarise_members(
+    servos: Any,
+    controllers: Any,
+    duration: float,
+    cases: Cases,
+    last: float,
+    limits: Mapping[str, ArrayLike] | None = None,
+    outputs: Sequence[str] = ("error", "voltage", "theta_m"),
+    sample_rate: float = 100.0,
+    threads: int | None = None,
+) -> dict[str, Figures]:
+    """The same runs without their samples: what each output comes to.
+
+    Parameters
+    ----------
+    servos, controllers, duration, outputs, sample_rate, threads
+        As for `simulate_members`.
+    cases : Cases
+        Its constants.
+    last : float
+        s, the end of a run that has figures of its own.
+    limits : dict of array_like, optional
+        By output, what it is outside beyond; infinite for those not named.
+
+    Returns
+    -------
+    dict of Figures
+        By output, arrays of shape S.
+
+    Raises
+    ------
+    InvalidInput
+        As `simulate_members`; also for limits of what is not asked for, or a `last` longer than the run.
+    """
+    members, judged = crowd(servos, controllers, cases), round(last * sample_rate)
+    bounds = np.full((len(members.servos), len(outputs)), np.inf)
+    for name, limit in (limits or {}).items():
+        if name not in outputs:
+            raise InvalidInput(f"limits name {name!r}, which is none of the outputs {', '.join(outputs)}")
+        bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
+    found = np.empty((len(bounds), len(outputs), len(Figures._fields)))
+    for group in members.groups(outputs):
+        judging = Judging(bounds[group.which], judged)
+        figures = figures_of_family(
+            group.automata,
+            group.rows,
+            group.members,
+            1.0 / sample_rate,
+            _samples(duration, sample_rate),
+            judging,
+            threads,
+        )
+        found[group.which] = np.stack(figures, axis=2)
+    by_output = np.moveaxis(found, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
+    return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
 
 
-def _constants(reference: ArrayLike, gap: ArrayLike, tolerance: ArrayLike, theta_d0: ArrayLike) -> list[Array]:
-    """(K,) of each, checked."""
-    values = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (reference, gap, tolerance, theta_d0)))
-    for name, value in zip(("gap", "tolerance"), values[1:3], strict=True):
-        if not (np.isfinite(value).all() and (value >= 0.0).all()):
-            raise InvalidInput(f"{name}: every value of an ensemble must be finite and 0 or more")
-    return [value.ravel() for value in values]
+def _samples(duration: float, sample_rate: float) -> int:
+    if not (0.0 < duration < np.inf and 0.0 < sample_rate < np.inf):
+        raise InvalidInput(f"duration = {duration} s at sample_rate = {sample_rate} Hz: must be positive and finite")
+    return round(duration * sample_rate) + 1
 
 
-def _run_shared(
-    servo: Servo,
-    law: Controller,
-    shape: Shape,
-    constants: Sequence[Array],
+def _traces(
+    members: Crowd,
+    outputs: Sequence[str],
     duration: float,
     sample_rate: float,
-    outputs: Sequence[str],
     threads: int | None,
+    dead_zone: bool | None = None,
 ) -> Array:
-    """(K, O, N) outputs of members of one servo and controller."""
-    if law.sample_rate is not None or law.voltage_limit is not None or law.loop_filter_hz is not None:
-        raise InvalidInput("an ensemble needs a continuous controller without voltage limit and loop filter")
-    loop = continuous_loop(servo, law, shape)
-    states = _starts(servo, loop, *constants)
-    modes = _modes(loop, states, law.enter)
-    samples = round(duration * sample_rate) + 1
-    rows = np.array([loop.rows[name] for name in outputs])
-    return run_ensemble(loop.automaton, states, modes, 1.0 / sample_rate, samples, rows, threads)[0]
-
-
-def _starts(servo: Servo, loop: ServoAutomaton, reference: Array, gap: Array, tolerance: Array, screw: Array) -> Array:
-    """(K, n) states at rest: as `plant_start` says of one."""
-    index = loop.automaton.index
-    states = np.array([plant_start(servo, loop, b, w) for b, w in zip(gap, screw, strict=True)])
-    states[:, index("reference")], states[:, index("gap")], states[:, index("tolerance")] = reference, gap, tolerance
-    return states
-
-
-def _modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np.int64]:
-    """(K,) modes: as `start_zone` says of one."""
-    if "inside" not in loop.zones:
-        return np.full(len(states), loop.mode("on"))
-    error = states @ loop.rows["error"][0]
-    inside = np.abs(error) <= enter * states[:, loop.automaton.index("tolerance")]
-    return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))
+    """(K, O, N) outputs of all members."""
+    groups, samples = members.groups(outputs, dead_zone), _samples(duration, sample_rate)
+    runs = [
+        run_family(group.automata, group.rows, group.members, 1.0 / sample_rate, samples, threads)[0]
+        for group in groups
+    ]
+    if len(runs) == 1:
+        return runs[0]
+    found = np.empty((len(members.servos), len(outputs), samples))
+    for group, run in zip(groups, runs, strict=True):
+        found[group.which] = run
+    return found

@@ -1,0 +1,180 @@
+"""The compiled side of an ensemble: tables filled for one automaton after the other, its members run, their outputs
+sampled, and what is asked of those summed up."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.build import Numbers, Workspace, fill_tables
+from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.flow import Scratch
+from servotwin.hybrid.kernel import DONE, ZENO, Record, flow_until, settle
+from servotwin.hybrid.output import Block, Outputs, fill_output, sample_segments
+from servotwin.hybrid.tables import Tables
+
+
+class Figures(NamedTuple):
+    """What is left of outputs when their samples are not kept; arrays of one shape, ``[..., output]``.
+
+    Attributes
+    ----------
+    mean_size : array
+        Mean of abs(y).
+    travel : array
+        Sum of abs(y[i] - y[i - 1]).
+    outside : array
+        Number of samples up to the last one beyond the limit, that one included; 0: none is.
+    lowest, highest, mean, mean_square : array
+        Of all samples.
+    last_lowest, last_highest, last_mean, last_mean_square : array
+        Of the last ones.
+    """
+
+    mean_size: Array
+    travel: Array
+    outside: Array
+    lowest: Array
+    highest: Array
+    mean: Array
+    mean_square: Array
+    last_lowest: Array
+    last_highest: Array
+    last_mean: Array
+    last_mean_square: Array
+
+
+class Family(NamedTuple):
+    """Automata of one structure: the numbers of each."""
+
+    flows: Array  # (A, M * n * n)
+    guards: Array  # (A, M * G * n)
+    resets: Array  # (A, M * G * n * n)
+    outputs: Array  # (A, O, M * n)
+    step: Array  # (A,) search steps, s
+    stride: NDArray[np.int64]  # (A,) search steps a sample
+
+
+class Starts(NamedTuple):
+    """Where members begin."""
+
+    order: NDArray[np.int64]  # (K,) in which to run them: those of one automaton together
+    automaton: NDArray[np.int64]  # (K,)
+    mode: NDArray[np.int64]  # (K,)
+    state: Array  # (K, n)
+    limits: Array  # (K, O) outputs beyond them count as outside
+
+
+class Found(NamedTuple):
+    """What is kept of members."""
+
+    traces: Array  # (K, O, samples), or (1, O, samples) when only figures are asked for
+    figures: Array  # (K, O, number of figures), or (0, O, number of figures)
+    events: NDArray[np.int64]  # (K,)
+
+
+class Hand(NamedTuple):
+    """What one worker holds: everything that it fills again for each automaton and each member."""
+
+    tables: Tables
+    outputs: Outputs
+    workspace: Workspace
+    block: Block
+    scratch: Scratch
+    state: Array
+    loaded: NDArray[np.int64]  # (1,) automaton that the tables are those of; -1: none
+
+
+@inlined
+def output(hand: Hand, o: int) -> Outputs:
+    """One of the outputs."""
+    every = hand.outputs
+    return Outputs(every.table[o], every.place[o], every.order[o], every.used[o])
+
+
+@bare
+def load(family: Family, a: int, hand: Hand) -> None:
+    """Fill the tables for automaton `a`."""
+    numbers = Numbers(family.flows[a], family.guards[a], family.resets[a])
+    fill_tables(hand.tables, numbers, family.step[a], hand.workspace)
+    for o in range(family.outputs.shape[1]):
+        fill_output(hand.tables, family.outputs[a, o], family.stride[a], output(hand, o), hand.block)
+    hand.loaded[0] = a
+
+
+@bare
+def sample_all(record: Record, hand: Hand, stride: int, traces: Array) -> None:
+    """Every output of the run just recorded."""
+    for o in range(len(traces)):
+        sample_segments(
+            0,
+            record.size[0],
+            record.step,
+            record.fraction,
+            record.mode,
+            record.state,
+            output(hand, o),
+            stride,
+            0,
+            hand.scratch.change,
+            traces[o],
+        )
+
+
+@bare
+def _spread(y: Array, out: Array) -> None:
+    lowest, highest, total, square = y[0], y[0], 0.0, 0.0
+    for value in y:
+        lowest, highest = min(lowest, value), max(highest, value)
+        total += value
+        square += value * value
+    out[0], out[1], out[2], out[3] = lowest, highest, total / len(y), square / len(y)
+
+
+@bare
+def figures_of(y: Array, limit: float, tail: int, out: Array) -> None:
+    """Fill `out` with the `Figures` of one output."""
+    begin = len(y) - tail
+    sizes, travel, outside = 0.0, 0.0, 0
+    for i in range(len(y)):
+        sizes += abs(y[i])
+        travel += abs(y[i] - y[max(i - 1, 0)])
+        if abs(y[i]) > limit:
+            outside = i + 1
+    out[0], out[1], out[2] = sizes / len(y), travel, outside
+    _spread(y, out[3:7])
+    _spread(y[begin:], out[7:11])
+
+
+@bare
+def run_members(
+    family: Family, starts: Starts, found: Found, first: int, last: int, tail: int, hand: Hand, record: Record
+) -> tuple[int, int]:
+    """Run members at places first .. last - 1 of the order; return the status and the place it concerns. `tail` is the
+    number of samples at the end that have figures of their own."""
+    t = hand.tables
+    for place in range(first, last):
+        k = starts.order[place]
+        a = starts.automaton[k]
+        if hand.loaded[0] != a:
+            load(family, a, hand)
+        for i in range(t.states):
+            hand.state[i] = starts.state[k, i]
+        traces = found.traces[k if len(found.traces) > 1 else 0]
+        steps = (traces.shape[1] - 1) * family.stride[a]
+        record.size[0] = record.size[1] = 0
+        mode = settle(t, starts.mode[k], hand.state, 0, 0.0, True, record, hand.scratch)
+        if mode < 0:
+            return ZENO, place
+        status, _, _, mode = flow_until(t, hand.state, mode, 0, 0.0, steps, 0.0, record, hand.scratch)
+        if status != DONE:
+            return status, place
+        found.events[k] = record.size[1]
+        sample_all(record, hand, family.stride[a], traces)
+        if len(found.figures) > 0:
+            for o in range(len(traces)):
+                figures_of(traces[o], starts.limits[k, o], tail, found.figures[k, o])
+    return DONE, last
