@@ -105,3 +105,11 @@ def share(case, path) -> float:
     screw = path(angles - angles[0], Gap(case.gap, case.theta_d0 - float(angles[0])))[:1]
     left = project_out(basis, case.window.position[None] - case.window.position[0] - model.respond(screw))
     return float(np.sqrt(np.mean(left**2)))
+
+
+def test_a_screw_that_rests_keeps_all_derivatives():
+    """A growing gap never moves the screw: what the last push gave it stays, by the gap's rate too."""
+    theta_m = np.sin(np.minimum(0.05 * np.arange(100.0), 0.5 * math.pi + 0.01))
+    exact, samples = polygon(theta_m, Gap(0.5, 0.0)), contacts(theta_m, Gap(0.5, 0.0))
+    np.testing.assert_array_equal(exact[1:, 40:], samples[1:, 40:])
+    assert np.ptp(exact[BY_RATE, 40:]) == 0.0

@@ -17,7 +17,7 @@ from servotwin.identify.whitened.estimator import Settings
 from servotwin.identify.whitened.plain import plain_fit
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SquareWave
+from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import simulate
 
 SERVO = Servo.preset("paper")
@@ -292,3 +292,55 @@ def test_the_bound_grows_with_the_noise():
         for floor in (1e-6, 1e-5)
     ]
     assert limits[1] == pytest.approx(10.0 * limits[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("integral", [0.0, 1.0])
+def test_a_gap_that_grows_within_the_window(integral):
+    """Where the motor holds still in contact, a growing gap lets go of the screw; none that is constant does."""
+    controller = SERVO.controller.replace(Ki=integral * SERVO.controller.Ki)
+    reference, gap = SquareWave(1e-3, 40.0), SCurve(0.0, math.radians(30.0), 200.0)
+    run = simulate(SERVO, 62.5, controller=controller, reference=reference, gap=gap)
+    cases = [cut(run, start, 2.0 if start % 1.0 else 1.0) for start in (20.0, 39.7, 40.0, 59.7)]
+    for case in cases:
+        estimate = estimate_gap(case.window, SERVO, settings=Settings(gap_rate=math.radians(0.15)))
+        assert abs(error(estimate, case)) < 2e-3
+        assert estimate.interval[0] < case.gap < estimate.interval[1]
+
+
+def at_rest(span: float = 1.0) -> tuple[Case, ...]:
+    """A calm loop long after its step: the motor creeps by less than a degree, the load by half a micrometre."""
+    calm = SERVO.controller.replace(Ki=0.0)
+    run = simulate(SERVO, 6.5, controller=calm, reference=SquareWave(1e-3, 12.0), gap=math.radians(10.0))
+    return tuple(cut(run, start, span) for start in (4.0, 4.5, 5.0))
+
+
+@pytest.mark.parametrize("floor", [1e-8, 1e-6, 1e-5, 1e-4])
+def test_noise_at_rest_is_no_wrong_model(floor):
+    for seed, case in enumerate(at_rest()):
+        estimate = estimate_gap(measured(case, seed, floor), SERVO)
+        assert estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND), estimate
+        if estimate.status is GapStatus.LOWER_BOUND:
+            assert estimate.gap <= np.ptp(case.window.theta_m)
+
+
+def test_bounds_are_below_the_gap():
+    """Calm loops show one contact: what they say of the gap is a bound, and never more than the gap."""
+    found = [estimate_gap(window, SERVO) for window, _ in one_contact()]
+    bounds = [
+        (e.gap, gap) for e, (_, gap) in zip(found, one_contact(), strict=True) if e.status is GapStatus.LOWER_BOUND
+    ]
+    assert len(bounds) > 10
+    assert all(bound <= gap for bound, gap in bounds), bounds
+
+
+def one_contact():
+    """Windows of calm loops, 2 s long, with 1 um of noise or none."""
+    calm = SERVO.controller.replace(Ki=0.0)
+    for degrees in (5.0, 10.0, 15.0):
+        gap = math.radians(degrees)
+        for tolerance in (None, SERVO.tolerance_for(gap), SERVO.tolerance_for(gap, 1.5)):
+            run = simulate(SERVO, 5.0, controller=calm, reference=1e-3, gap=gap, tolerance=tolerance)
+            for start in (0.0, 1.0, 2.5):
+                case = cut(run, start, 2.0)
+                yield case.window, gap
+                yield measured(case), gap

@@ -101,7 +101,10 @@ def pushed(low: float, high: float, before: float, after: float) -> tuple[float,
 
 @inlined
 def put(out: Array, i: int, side: float, time: float) -> None:
-    """The derivatives at a sample, for the side that the screw was last pushed to: 1, -1, or 0 before any contact."""
+    """The derivatives at a sample, for the side and the time (samples from the middle) of the last push.
+
+    The side is 1 forwards, -1 backwards, 0 before any contact.
+    """
     out[BY_GAP, i] = -0.5 * side
     out[BY_START, i] = 1.0 - abs(side)
     out[BY_RATE, i] = -0.5 * side * time
@@ -124,10 +127,10 @@ def trace(theta_m: Array, gap: float, theta_d0: float, rate: float, out: Array) 
     last, middle = theta_m.size - 1, 0.5 * (theta_m.size - 1)
     half = 0.5 * (gap - rate * middle)
     screw = min(max(theta_d0, theta_m[0] - half), theta_m[0] + half)
-    side = np.sign(screw - theta_d0)
+    side, time = np.sign(screw - theta_d0), -middle
     out[0, 0] = screw
     if len(out) > 1:
-        put(out, 0, side, -middle)
+        put(out, 0, side, time)
     after = theta_m[2] - 2.0 * theta_m[1] + theta_m[0]
     for i in range(1, last + 1):
         before, narrow = after, half
@@ -143,12 +146,12 @@ def trace(theta_m: Array, gap: float, theta_d0: float, rate: float, out: Array) 
             crest, begin, area, moment = pushed(low, high, way * before, way * after)
             if crest > 0.0:
                 screw = theta_m[i] - way * half if crest == high else screw + way * crest
-                area, moment, new = way * area, way * moment, way
+                area, moment, new, time = way * area, way * moment, way, i - middle
                 break
         out[0, i - 1] += area - moment
         out[0, i] = screw + moment
         if len(out) > 1:
-            put(out, i, new, i - middle)
+            put(out, i, new, time)
             if new != side and i == 1 and begin == 0.0:
                 put(out, 0, new, -middle)
             elif new != side:

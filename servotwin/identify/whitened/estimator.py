@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.core.contacts import travel
+from servotwin.identify.core.contacts import Travel, travel
 from servotwin.identify.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.identify.whitened.aligned import Aligned, align_and_fit
 from servotwin.identify.whitened.channels import faults, motor_angle
 from servotwin.identify.whitened.diagnosis import likely_fault
-from servotwin.identify.whitened.gate import Evidence, judge
+from servotwin.identify.whitened.gate import Evidence, judge, lower_bound
 from servotwin.identify.whitened.lostmotion import static_lost_motion
 from servotwin.identify.whitened.modelcheck import Shift, model_shift, observer_shift
 from servotwin.identify.whitened.passes import Found
@@ -90,7 +90,7 @@ def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, sett
         aligned,
         std,
         profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
-        travel(seen_by_the_load(found), found.point.screw(0.0)),
+        _travel(found),
         model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, "", 0.0),
         observer_shift(found, servo) if identifiable else (0.0, math.inf),
         static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
@@ -98,10 +98,13 @@ def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, sett
     )
 
 
-def seen_by_the_load(found: Found) -> Array:
-    """The motor's angle without the end of the window, to which the last mass cannot have answered."""
-    model, theta_m = found.reduction.response, found.reduction.theta_m
-    return theta_m[: max(2, theta_m.size - round(model.unseen / model.interval))]
+def _travel(found: Found) -> Travel:
+    """Of the screw, without the end of the window, to which the last mass cannot have answered."""
+    reduction, model = found.reduction, found.reduction.response
+    kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
+    middle = found.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - kept)
+    at = found.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
+    return travel(reduction.theta_m[:kept], at)
 
 
 def _stated(
@@ -123,7 +126,7 @@ def _stated(
         evaluations=found.evaluations,
     )
     if status is GapStatus.LOWER_BOUND:
-        bound = seen.interval[0]
+        bound = lower_bound(seen, settings)
         return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
     if status is not GapStatus.OK:
         return result

@@ -54,12 +54,17 @@ def judge(seen: Evidence, settings: Settings) -> tuple[GapStatus, tuple[str, ...
     """Status and reasons."""
     mismatches = tuple(filter(None, (_unexplained(seen), _delayed(seen, settings), *_disagreements(seen, settings))))
     silence = tuple(filter(None, (_one_sided(seen, settings), _spread(seen, settings))))
-    bound = seen.interval[0] > _SMALLEST_BOUND and math.isinf(seen.interval[1])
+    bound = lower_bound(seen, settings) > _SMALLEST_BOUND and math.isinf(seen.interval[1])
     if seen.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(seen.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
         return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
+
+
+def lower_bound(seen: Evidence, settings: Settings) -> float:
+    """rad: what the window contradicts every gap below of, were the model off by its usual error."""
+    return max(0.0, seen.interval[0] - NORMAL_95 * settings.model_error)
 
 
 def _one_sided(seen: Evidence, settings: Settings) -> str:

@@ -47,7 +47,7 @@ def model_shift(found: Found, servo: Servo, order: int) -> Shift:
     Whitening takes a wrong model for noise; with the model free it is seen for what it is.
     """
     model, reduction = found.reduction.response, found.reduction
-    screw = polygon(reduction.theta_m, found.point.screw(0.0))[:1]
+    screw = polygon(reduction.theta_m, found.point.screw(0.0, reduction.rate))[:1]
     here = model.respond(screw)
     motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
     motions.insert(2, here)

@@ -17,6 +17,7 @@ from servotwin.identify.whitened.search import Fit, continued, descend, in_conta
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
+_EARLY, _PLACES = 1, (-0.85, 0.0, 0.85)  # the pass in which a growing gap is looked at from other places, and these
 _SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
 
 
@@ -100,13 +101,21 @@ def refine(
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
         noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
+        reduction = reduction.growing(noise, fit.point)
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
-        fit = best_of(misfit, [fit.point, *([*points, *in_contact(fit.point)] if last else [])], largest, tolerance)
+        starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
+        starts += _elsewhere(fit.point) if reduction.growth and number == _EARLY else []
+        fit = best_of(misfit, starts, largest, tolerance)
         fit = off_the_plain(misfit, fit, largest, tolerance) if last else fit
         evaluations += fit.evaluations
     rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
     return Found(reduction, misfit, fit, noise, rows, evaluations)
+
+
+def _elsewhere(point: Point) -> list[Point]:
+    """Other places in a growing gap: at a wrong rate a wrong place looks right, and holds the rate where it is."""
+    return [point._replace(place=place) for place in _PLACES]
 
 
 def noise_left(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:

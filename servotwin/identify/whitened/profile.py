@@ -12,6 +12,7 @@ from servotwin.identify.whitened.search import PLACE_ONLY, PLACES, descend
 
 _CHI_SQUARED_95 = 3.841458820694124
 _CLOSE, _TRIALS = 0.1, 12
+_NEAR = 0.1  # of the gap: closer by, the best place is next to that of the fit, if the spread is not wider
 
 
 def profile_interval(found: Found, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
@@ -33,7 +34,8 @@ def profile_interval(found: Found, std: float, calibration: float, largest: floa
 
     def rise(gap: float) -> float:
         """How much worse the best fit with this gap is, in units of what is allowed."""
-        places = {found.point.place} if abs(gap - found.point.gap) < 3.0 * std else {found.point.place, *PLACES}
+        near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
+        places = {found.point.place} if near else {*same_way(found.point, gap), *PLACES}
         fits = [descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY) for place in places]
         return (min(fit.slopes.cost for fit in fits) - found.fit.slopes.cost) / allowed
 
@@ -41,8 +43,24 @@ def profile_interval(found: Found, std: float, calibration: float, largest: floa
     return _end(rise, found.point.gap, -first, 0.0), _end(rise, found.point.gap, first, largest)
 
 
+def same_way(point: Point, gap: float) -> tuple[float, float, float]:
+    """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
+
+    A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact
+    being the same.
+    """
+    if gap == 0.0:
+        return (point.place,) * 3
+    share = point.gap / gap
+    ahead, behind = share * (1.0 + point.place) - 1.0, 1.0 - share * (1.0 - point.place)
+    return point.place, min(max(ahead, -1.0), 1.0), min(max(behind, -1.0), 1.0)
+
+
 def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
-    """Where `rise` reaches 1 on one side, between what is known to be below and above; the far limit as 0 or inf."""
+    """Where `rise` reaches 1 on one side, between what is known to be below and above; the far limit as 0 or inf.
+
+    When the trials do not suffice, what is known to be above.
+    """
     beyond = math.inf if limit > 0.0 else 0.0
     room = abs(limit - middle)
     inside, outside, size = 0.0, math.inf, abs(step)
@@ -61,4 +79,6 @@ def _end(rise: Callable[[float], float], middle: float, step: float, limit: floa
         size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), 3.0)
         if not inside < size < outside:
             size = 0.5 * (inside + outside)
+    else:
+        size = min(outside, room)
     return middle + math.copysign(size, step)

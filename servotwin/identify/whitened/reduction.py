@@ -7,7 +7,7 @@ growth within the window. The last two depend on the gap, mildly, and are taken 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from servotwin.identify.core.between import polygon
 from servotwin.identify.core.contacts import BY_RATE
 from servotwin.identify.core.decimation import Decimation, decimation
+from servotwin.identify.core.normal import least_squares
 from servotwin.identify.core.projection import orthonormal
 from servotwin.identify.core.response import Response
 from servotwin.identify.core.whitening import Autoregression
@@ -23,6 +24,8 @@ from servotwin.plant.signals import Array
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
 _SAMPLES_PER_PERIOD, _SLOWEST, _FEWEST = 40.0, 400.0, 100  # kept at least: of the fastest mode; Hz; in all
+
+_MOST_GROWTH = 4.0  # standard deviations of the gap's rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,8 @@ class Reduction:
         Of the constant in the position, m.
     growth : Prior, optional
         Of the gap's rate, rad per sample; None: the gap is constant.
+    rate : float
+        rad per sample: the rate at which the screw is followed; what is left of the rate is a nuisance.
     skew : bool
         Whether a delay between the channels is a nuisance.
     """
@@ -60,6 +65,7 @@ class Reduction:
     offset: Prior | None = None
     growth: Prior | None = None
     skew: bool = True
+    rate: float = 0.0
 
     @classmethod
     def of(
@@ -82,7 +88,7 @@ class Reduction:
 
     def table(self, point: Point) -> Array:
         """(k, m) residual, derivatives of the response by gap and place, nuisances; not whitened."""
-        seen = polygon(self.theta_m, point.screw(0.0))
+        seen = polygon(self.theta_m, point.screw(0.0, self.rate))
         mix_places(seen, point.gap, point.place)
         rows = self.response.respond(seen if self.growth else seen[:BY_RATE])
         rows = np.vstack([rows, self.response.velocities(seen[:1])]) if self.skew else rows
@@ -93,7 +99,7 @@ class Reduction:
         """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
         known = {} if self.offset is None else {first: self.offset}
         if self.growth is not None:
-            known[first + len(self.fixed())] = self.growth
+            known[first + len(self.fixed())] = Prior(self.growth.mean - self.rate, self.growth.std)
         columns = [noise.whiten(rows)]
         for row, prior in known.items():
             column = np.zeros((len(rows), 1))
@@ -104,7 +110,7 @@ class Reduction:
     def coarse(self) -> Misfit:
         """The misfit in white noise, with the fixed nuisances only: for the first search."""
         basis = _fixed_basis(self.response, self.decimation, self.theta_m.size)
-        return Misfit(self.theta_m, self.position, basis, self.response, self.decimation)
+        return Misfit(self.theta_m, self.position, basis, self.response, self.decimation, rate=self.rate)
 
     def misfit(self, noise: Autoregression, point: Point) -> Misfit:
         """The misfit in noise of a known kind, its nuisances taken at a point."""
@@ -112,7 +118,21 @@ class Reduction:
         table[RESIDUAL] = self.position
         rows = self.prepared(noise, np.delete(table, [GAP, PLACE], axis=0), 1)
         extra = rows.shape[1] - self.position.size
-        return Misfit(self.theta_m, rows[0], orthonormal(rows[1:]), self.response, self.decimation, noise, extra)
+        basis = orthonormal(rows[1:])
+        return Misfit(self.theta_m, rows[0], basis, self.response, self.decimation, noise, extra, self.rate)
+
+    def growing(self, noise: Autoregression, point: Point) -> Reduction:
+        """With the screw followed at the rate of growth that a point and a noise make likely.
+
+        The rate is linear only as long as no contact comes or goes with it: a motor that holds still in contact holds
+        the screw in a constant gap, and not in a growing one.
+        """
+        if self.growth is None:
+            return self
+        rows = self.prepared(noise, self.table(point), CONSTANT)
+        shares = least_squares(rows[GAP:], rows[RESIDUAL]).coefficients[CONSTANT - GAP :]
+        most = _MOST_GROWTH * self.growth.std
+        return replace(self, rate=min(max(self.rate + float(shares[len(self.fixed())]), -most), most))
 
 
 @lru_cache(maxsize=32)
