@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.automaton import Shape, continuous_loop
 from servotwin.plant.servo import Servo
-from servotwin.redesign.map import MEASURES, joined, measured, starts, trajectories
+from servotwin.redesign.map import MEASURES, automaton, joined, measured, starts, trajectories
 from servotwin.redesign.mapaxes import Cells, PhysicalAxes, RatioAxes
 from servotwin.redesign.mapsettings import MapSettings
 from servotwin.simulation import simulate
@@ -51,7 +50,7 @@ def test_a_cell_is_the_run_from_rest():
 
 def test_every_member_at_rest_is_a_run_with_its_screw():
     settings = MapSettings(PAPER, PhysicalAxes((8.0 * DEGREE,)), members=4, motion=0.0, **QUICK)
-    cells, loop = cells_of(settings), continuous_loop(PAPER, settings.law, Shape())
+    cells, loop = cells_of(settings), automaton(settings)
     position, voltage = trajectories(settings, cells, range(1))
     screws = starts(settings, loop, cells, range(1))[0, :, loop.automaton.index("theta_d")]
     assert screws[0] == 0.0
@@ -65,7 +64,7 @@ def test_every_member_at_rest_is_a_run_with_its_screw():
 
 def test_half_of_the_members_start_in_motion_within_bounds():
     settings = MapSettings(PAPER, PhysicalAxes((10.0 * DEGREE,)), members=400, motion=0.5)
-    loop = continuous_loop(PAPER, settings.law, Shape())
+    loop = automaton(settings)
     states = starts(settings, loop, cells_of(settings), range(1))[0]
     crossover = PAPER.margins().gain_crossovers[0].omega
     bounds = {"theta_d": 5.0 * DEGREE, "speed": 0.5e-3 * crossover / PAPER.p, "integral": 0.5e-3 * PAPER.controller.Ki}
@@ -132,8 +131,8 @@ def test_rest_that_does_not_last_is_not_settled_and_is_marked():
     assert math.isinf(found.settling[0])
 
 
-def test_loop_filter_and_voltage_limit_are_the_direct_run_s():
-    law = PAPER.controller.replace(loop_filter_hz=20.0, voltage_limit=2.0)
+def test_loop_filter_limit_and_feedforward_are_the_direct_run_s():
+    law = PAPER.controller.replace(loop_filter_hz=20.0, voltage_limit=2.0, feedforward=0.01)
     settings = MapSettings(PAPER, PhysicalAxes((10.0 * DEGREE,), k_dz=(1.5,)), law, members=1, **QUICK)
     cells = cells_of(settings)
     position, _ = trajectories(settings, cells, range(1))

@@ -190,8 +190,8 @@ def _shares(axes: Axes, across: Line, settled: Array, marked: bool) -> None:
     axes.plot(across.values, full, color=style.RED, label="cells in which all do")
     if marked:
         axes.plot([], [], label="in (a): rests over 10 s, then moves on", **_DOT)
-    axes.set(ylabel="%", ylim=(-3.0, 103.0))
-    axes.legend(loc="best", frameon=True, framealpha=0.8, edgecolor="none")
+    axes.set(ylabel="%", ylim=(-36.0, 104.0), yticks=range(0, 101, 20))  # below 0 is room for the legend
+    axes.legend(loc="lower right", fontsize=7.0)
     _scales(axes, across)
     axes.grid(True)
 

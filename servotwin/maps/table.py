@@ -68,11 +68,13 @@ def sentences(found: StabilityMap) -> tuple[str, ...]:
 
 
 def _scale(found: StabilityMap) -> str:
-    axes = found.settings.axes
+    axes, law = found.settings.axes, found.settings.law
     if not isinstance(axes, RatioAxes):
         return ""
-    unit = 0.5 * found.settings.servo.p * axes.gap
-    return f" at a gap of {math.degrees(axes.gap):g} deg, {found.settings.still / unit:.3g} p b at any"
+    at = f" at a gap of {math.degrees(axes.gap):g} deg"
+    if law.voltage_limit is not None or law.feedforward != 0.0:  # neither scales with the gap
+        return f"{at}, for which alone this map is made"
+    return f"{at}, {found.settings.still / (0.5 * found.settings.servo.p * axes.gap):.3g} p b at any"
 
 
 def text(found: StabilityMap) -> str:

@@ -16,6 +16,7 @@ from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.redesign.mapaxes import Cells
 from servotwin.redesign.mapsettings import SHORT_WINDOW, MapSettings
 from servotwin.redesign.scaled import characteristic_time
+from servotwin.simulation.continuous import controller_constants
 
 # Around where the position ends, in parts of the reference step: the usual five per cent.
 SETTLING_BAND = 0.05
@@ -69,7 +70,7 @@ def joined(parts: list[Measures]) -> Measures:
 
 def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Array, Array]:
     """Position (m) and voltage (V), each (cells, members, samples)."""
-    loop = continuous_loop(settings.servo, settings.law, Shape())
+    loop = automaton(settings)
     states = starts(settings, loop, cells, chunk).reshape(-1, len(loop.automaton.names))
     modes, rows = _modes(settings, loop, states), np.array([loop.rows["position"], loop.rows["voltage"]])
     try:
@@ -80,6 +81,12 @@ def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Arr
         raise InvalidInput(f"map cells {chunk.start} to {chunk.stop - 1}: {error}") from None
     position, voltage = np.moveaxis(found.reshape(len(chunk), settings.members, 2, -1), 2, 0)
     return position, voltage
+
+
+def automaton(settings: MapSettings) -> ServoAutomaton:
+    """Plant and law together, with a dead zone."""
+    law = settings.law
+    return continuous_loop(settings.servo, law, Shape(feedforward=law.feedforward != 0.0))
 
 
 def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: range) -> Array:
@@ -96,8 +103,9 @@ def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: ran
     states[:, :, index("integral")] = settings.motion * draws[:, :, 2] * step * settings.law.Ki / omega
     for name, value in zip(("gap", "tolerance", "reference"), cells, strict=True):
         states[:, :, index(name)] = value[:, None]
-    if settings.law.voltage_limit is not None:
-        states[:, :, index("voltage limit")] = settings.law.voltage_limit
+    for name, constant in controller_constants(settings.law).items():
+        if name in loop.automaton.names:
+            states[:, :, index(name)] = constant
     if settings.law.loop_filter_hz is not None:
         states[:, :, index("filtered")] = states @ loop.rows["position"][0]
     return states
