@@ -1,6 +1,5 @@
 """`servotwin map`: resumed, shared among processes and machines, refused in one sentence; always the same bytes."""
 
-import json
 import os
 import shutil
 import socket
@@ -10,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from dask_cluster import Cluster
 from matplotlib import image
 from typer.testing import CliRunner
 
@@ -144,7 +144,7 @@ def test_processes_give_the_same_bytes(finished, tmp_path):
 
 def test_a_dask_cluster_gives_the_same_bytes(tmp_path, finished):
     pytest.importorskip("distributed")
-    with cluster(tmp_path) as (address, _):
+    with Cluster(tmp_path) as (address, _):
         process = started("paper", *SMALL, "--out", tmp_path / "out", "--scheduler", address)
         _, stderr = process.communicate(timeout=120)
     assert process.returncode == 0, stderr
@@ -154,7 +154,7 @@ def test_a_dask_cluster_gives_the_same_bytes(tmp_path, finished):
 def test_a_dask_cluster_that_is_lost_keeps_what_is_finished(tmp_path):
     pytest.importorskip("distributed")
     long = ("--tolerance", "0.5:3:30", "--amplitude", "1:100:30:log", "--members", "16", "--out", tmp_path / "out")
-    with cluster(tmp_path) as (address, scheduler):
+    with Cluster(tmp_path) as (address, scheduler):
         process = started("paper", *long, "--scheduler", address)
         chunks = tmp_path / "out" / "chunks"
         while not list(chunks.glob("0*.npz")) and process.poll() is None:
@@ -266,38 +266,3 @@ def started(*arguments):
     return subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-
-
-class cluster:
-    """A scheduler and two worker processes, as an operator would start them."""
-
-    def __init__(self, folder):
-        self.folder, self.file, self.processes = folder, folder / "scheduler.json", []
-
-    def __enter__(self):
-        scheduler = self.start("scheduler", "--port", "0")
-        while not (self.file.exists() and self.file.read_text().endswith("}")):
-            assert scheduler.poll() is None
-            time.sleep(0.05)
-        for _ in range(2):
-            self.start("worker", "--nworkers", "1", "--nthreads", "1")
-        address = json.loads(self.file.read_text())["address"]
-        self.wait_for_workers(address)
-        return address, scheduler
-
-    def start(self, kind, *options):
-        common = ("--scheduler-file", self.file, "--host", "127.0.0.1", "--no-dashboard")
-        command = [sys.executable, "-m", "dask", kind, *map(str, (*common, *options))]
-        with (self.folder / f"{kind}.log").open("a") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder)
-        self.processes.append(process)
-        return process
-
-    def wait_for_workers(self, address):
-        program = f"import distributed as d; d.Client({address!r}, timeout=30).wait_for_workers(2, timeout=60)"
-        subprocess.run([sys.executable, "-c", program], check=True, timeout=120, stderr=subprocess.DEVNULL)
-
-    def __exit__(self, *_):
-        for process in reversed(self.processes):
-            process.kill()
-            process.wait(timeout=30)
