@@ -216,6 +216,6 @@ def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
             filled = t.flow_of[m]
             _fill_flow(t, numbers, filled, m, step, w)
     for m in range(modes):
-        for g in range(t.guards):
+        for g in range(t.guard_count[m]):
             _fill_series(t, numbers, m, g, step, w)
         _fill_single(t, m)

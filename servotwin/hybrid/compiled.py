@@ -56,7 +56,7 @@ def _compile(function: _Function, **options: Any) -> _Function:
 
 
 def stamp(function: Any, options: str) -> str:
-    """Digest of a function, of the options it is compiled with, and of everything compiled or constant that it names."""
+    """Digest of a function, of the options it is compiled with, and of all that it names, compiled or constant."""
     code = function.__code__
     parts = [options, _fingerprint(code)]
     for name in code.co_names:

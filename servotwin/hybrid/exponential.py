@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import matrix_balance
 
 from servotwin.hybrid.automaton import Array
@@ -26,8 +27,10 @@ _SPLIT = 2.0**27 + 1.0
 
 class Powers(NamedTuple):
     """``exp(A t) - I`` (the base) and ``exp(A j t) - I`` for the present j, row-major and flat: values and remainders,
-    with working memory; each ``(n * n,)``."""
+    with working memory; each ``(n * n,)``. Only the rows that `moving` lists are not zero."""
 
+    moving: NDArray[np.int64]  # (n,)
+    movers: NDArray[np.int64]  # (1,) how many
     base: Array
     base_low: Array
     power: Array
@@ -38,7 +41,8 @@ class Powers(NamedTuple):
 
 def new_powers(states: int) -> Powers:
     """Working memory for matrices of so many states."""
-    return Powers(*np.zeros((6, states * states)))
+    whole = np.zeros((2, max(states, 1)), dtype=np.int64)
+    return Powers(whole[0], whole[1, :1], *np.zeros((6, states * states)))
 
 
 @verbatim
@@ -70,10 +74,11 @@ def _third(a: float, a_low: float, b: float, b_low: float, c: float) -> tuple[fl
 
 
 @inlined
-def _multiply(a: Array, b: Array, n: int, out: Array) -> None:
-    """``out = a @ b``."""
-    for i in range(n):
-        product(b, 0, n, n, a[i * n : (i + 1) * n], out[i * n : (i + 1) * n])
+def _multiply(a: Array, b: Array, n: int, p: Powers) -> None:
+    """The moving rows of ``a @ b`` as the change."""
+    for place in range(p.movers[0]):
+        at = p.moving[place] * n
+        product(b, 0, n, n, a[at : at + n], p.change[at : at + n])
 
 
 @bare
@@ -87,16 +92,25 @@ def rebase(n: int, p: Powers) -> None:
 def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None:
     """The first power of ``flow[base:]``, ``(n, n)`` flat, over a time in which no eigenvalue turns far: its Taylor
     series."""
-    for i in range(n * n):
-        p.power[i], p.power_low[i] = _product(flow[base + i], time)
-        p.base[i] = p.term[i] = p.power[i]
+    p.movers[0] = 0
+    for i in range(n):
+        size = 0.0
+        for at in range(i * n, (i + 1) * n):
+            p.power[at], p.power_low[at] = _product(flow[base + at], time)
+            p.base[at] = p.term[at] = p.power[at]
+            p.base_low[at] = 0.0
+            size += abs(p.power[at])
+        if size > 0.0:
+            p.moving[p.movers[0]] = i
+            p.movers[0] += 1
     for order in range(2, _MOST_TERMS):
-        _multiply(p.term, p.base, n, p.change)
+        _multiply(p.term, p.base, n, p)
         open_terms = 0
-        for i in range(n * n):
-            p.term[i] = p.change[i] / order
-            p.power[i], p.power_low[i] = _third(p.power[i], p.power_low[i], p.term[i], 0.0, 0.0)
-            open_terms += abs(p.term[i]) > _SMALL * abs(p.power[i])
+        for place in range(p.movers[0]):
+            for at in range(p.moving[place] * n, (p.moving[place] + 1) * n):
+                p.term[at] = p.change[at] / order
+                p.power[at], p.power_low[at] = _third(p.power[at], p.power_low[at], p.term[at], 0.0, 0.0)
+                open_terms += abs(p.term[at]) > _SMALL * abs(p.power[at])
         if open_terms == 0:
             break
     rebase(n, p)
@@ -105,9 +119,10 @@ def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None
 @bare
 def next_power(n: int, p: Powers) -> None:
     """One base more: ``exp(A (j + 1) t) - I = B + P + B P``."""
-    _multiply(p.base, p.power, n, p.change)
-    for i in range(n * n):
-        p.power[i], p.power_low[i] = _third(p.base[i], p.base_low[i], p.power[i], p.power_low[i], p.change[i])
+    _multiply(p.base, p.power, n, p)
+    for place in range(p.movers[0]):
+        for i in range(p.moving[place] * n, (p.moving[place] + 1) * n):
+            p.power[i], p.power_low[i] = _third(p.base[i], p.base_low[i], p.power[i], p.power_low[i], p.change[i])
 
 
 @bare

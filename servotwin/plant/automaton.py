@@ -99,7 +99,12 @@ def degree(pieces: PiecewiseCubic) -> int:
 
 def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
     """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in the feedforward only."""
-    return _continuous_loop(servo, controller.replace(feedforward=0.0), shape)
+    return _continuous_loop(servo, without_feedforward(controller), shape)
+
+
+def without_feedforward(controller: Controller) -> Controller:
+    """The same controller as far as the automaton's numbers go: the feedforward is a state."""
+    return controller.replace(feedforward=0.0) if controller.feedforward else controller
 
 
 @lru_cache(maxsize=64)

@@ -14,19 +14,19 @@ class Basis:
     def __init__(self, names: tuple[str, ...]) -> None:
         # Spare states that never move: the kernel's products run over whole vectors of the machine.
         self.names = (*names, *(f"spare{i}" for i in range(-len(names) % 4)))
+        self._index = {name: i for i, name in enumerate(self.names)}
+        self._rows = np.vstack([np.eye(len(self.names)), np.zeros(len(self.names))])
+        self._rows.setflags(write=False)
 
     def __getitem__(self, name: str) -> int:
-        return self.names.index(name)
+        return self._index[name]
 
     def __contains__(self, name: str) -> bool:
-        return name in self.names
+        return name in self._index
 
     def row(self, name: str) -> Array:
-        """The row that picks a state; zero when there is no such state."""
-        row = np.zeros(len(self.names))
-        if name in self.names:
-            row[self[name]] = 1.0
-        return row
+        """The row that picks a state, not to be written to; zero when there is no such state."""
+        return np.asarray(self._rows[self._index.get(name, -1)])
 
     def positions(self, servo: Servo) -> Array:
         """(n, states) rows of the masses' positions."""

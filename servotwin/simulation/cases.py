@@ -13,7 +13,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.ensemble import Members
-from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
+from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, without_feedforward
 from servotwin.plant.servo import Servo
 from servotwin.simulation.continuous import controller_constants
 
@@ -94,7 +94,7 @@ class Crowd:
     def _group(self, which: NDArray[np.int64], shape: Shape, outputs: Sequence[str]) -> Group:
         servos, laws = ([values[member] for member in which] for values in (self.servos, self.controllers))
         places: dict[tuple[Servo, Controller], int] = {}
-        pairs = [(servo, law.replace(feedforward=0.0)) for servo, law in zip(servos, laws, strict=True)]
+        pairs = [(servo, without_feedforward(law)) for servo, law in zip(servos, laws, strict=True)]
         automaton = np.array([places.setdefault(pair, len(places)) for pair in pairs])
         loops = [continuous_loop(servo, law, shape) for servo, law in places]
         constants = {name: values[which] for name, values in self.constants.items()}
