@@ -134,7 +134,7 @@ def test_a_gap_that_grows_within_the_window():
 
 
 def test_stated_spread_is_that_of_many_fits():
-    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.4."""
+    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.2."""
     run = run_of("paper", 10.0, False, False)
     servo, rng, errors, stated = scaled(run.servo, **WRONG), np.random.default_rng(8), [], []
     clean = Window.from_run(run, 5.0, 1.0)

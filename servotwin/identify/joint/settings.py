@@ -59,7 +59,7 @@ class JointSettings:
     model_error_rad: float = math.radians(0.02)
     numeric_error_rad: float = math.radians(2e-4)
     unexplained: float = 0.5
-    inflation: float = 1.4
+    inflation: float = 1.2
     noise_order: int = 30
     whitenings: int = 3
 
