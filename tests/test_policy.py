@@ -16,14 +16,14 @@ GOOD = GapEstimate(0.2, 0.01, 0.02, (0.16, 0.24), GapStatus.OK, 0.5)
 
 
 def test_the_tolerance_is_the_gap_times_pitch_and_gain():
-    made = PaperPolicy(SERVO, k_dz=1.5).redesign(Evidence(GOOD), 0.1)
+    made = PaperPolicy(SERVO, k_dz=1.5).redesign(Evidence(GOOD, tuned_for=0.1))
     assert made.tolerance == pytest.approx(1.5 * SERVO.p * 0.2, rel=1e-15)
     assert (made.gap, made.reason) == (0.2, "")
 
 
 def test_smoothing_keeps_a_share_of_the_previous_gap():
     policy = PaperPolicy(SERVO, smoothing=0.1)
-    assert policy.redesign(Evidence(GOOD), 0.1).gap == pytest.approx(0.19, rel=1e-15)
+    assert policy.redesign(Evidence(GOOD, tuned_for=0.1)).gap == pytest.approx(0.19, rel=1e-15)
     assert policy.redesign(Evidence(GOOD)).gap == pytest.approx(0.2, rel=1e-15)
 
 

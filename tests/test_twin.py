@@ -58,11 +58,13 @@ def known_gap(window: Window, _expected: Expectation) -> GapEstimate:
 class Rule:
     """A policy of one line."""
 
+    needs_estimate = True
+
     def __init__(self, rule):
         self.rule, self.asked = rule, []
 
-    def redesign(self, evidence: Evidence, tuned_for: float | None) -> Redesign:
-        self.asked.append((evidence, tuned_for))
+    def redesign(self, evidence: Evidence) -> Redesign:
+        self.asked.append(evidence)
         return self.rule(evidence)
 
 
@@ -339,16 +341,16 @@ def test_a_policy_sees_the_evidence():
     rule = eq_21()
     twin, store = with_policy(rule)
     _, update = twin.receive(window_message(1, 10.0), 0.0)
-    evidence, tuned_for = rule.asked[0]
+    evidence = rule.asked[0]
     assert evidence.estimate.gap == 0.1
     assert evidence.disturbance == DISTURBED == store.disturbances["axis", "boot-1", 1]
     assert evidence.trend is twin.trend
     assert (evidence.controller, evidence.tolerance) == (OWN.replace(voltage_limit=12.0), 1e-4)
-    assert tuned_for is None
+    assert evidence.tuned_for is None
     twin.receive(receipt(update), 1.0)
     twin.receive(window_message(2, 20.0, version=1), 2.0)
-    evidence, tuned_for = rule.asked[1]
-    assert (evidence.tolerance, tuned_for) == (PITCH * 0.1, 0.1)
+    evidence = rule.asked[1]
+    assert (evidence.tolerance, evidence.tuned_for) == (PITCH * 0.1, 0.1)
     assert evidence.controller == OWN.replace(voltage_limit=12.0)
 
 
@@ -360,16 +362,16 @@ def test_a_whole_controller_is_sent_and_known_to_be_in_force_once_it_is():
     assert messages.decode(messages.encode(update)) == update
     assert (update.controller.Ki, update.controller.feedforward, update.band.effort) == (0.0, -0.02, 1.0)
     twin.receive(window_message(2, 20.0), 1.0)
-    assert rule.asked[1][0].controller.Ki == OWN.Ki
+    assert rule.asked[1].controller.Ki == OWN.Ki
     twin.receive(window_message(3, 30.0, version=1), 2.0)
-    assert rule.asked[2][0].controller == OWN.replace(Ki=0.0, feedforward=-0.02, voltage_limit=12.0)
+    assert rule.asked[2].controller == OWN.replace(Ki=0.0, feedforward=-0.02, voltage_limit=12.0)
 
 
 def test_what_somebody_else_set_is_not_known():
     rule = eq_21()
     twin, _ = with_policy(rule)
     twin.receive(window_message(1, 10.0, version=17), 0.0)
-    assert (rule.asked[0][0].controller, rule.asked[0][0].tolerance) == (None, None)
+    assert (rule.asked[0].controller, rule.asked[0].tolerance) == (None, None)
 
 
 def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
@@ -384,8 +386,8 @@ def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
     assert twin.next_wake() is None
     assert store.fallbacks == [fallback]
     _, again = twin.receive(window_message(3, 30.0, version=3), 4.0)
-    evidence, tuned_for = rule.asked[-1]
-    assert (evidence.controller.Ki, evidence.tolerance, tuned_for) == (0.0, 2e-4, None)
+    evidence = rule.asked[-1]
+    assert (evidence.controller.Ki, evidence.tolerance, evidence.tuned_for) == (0.0, 2e-4, None)
     assert (again.version, again.base_version) == (4, 3)
 
 

@@ -28,6 +28,10 @@ class Evidence:
         In force at the edge as last told; None: set by somebody else than this twin.
     tolerance : float or None
         Half-width of the dead zone in force, m; None: not known.
+    tuned_for : float or None
+        rad, gap of the last redesign; None before the first.
+    why_not : str
+        Why nothing may stand on the estimate: its status, or that it does not fit the trend; empty where it may.
     """
 
     estimate: GapEstimate
@@ -35,3 +39,13 @@ class Evidence:
     trend: Trend | None = None
     controller: Controller | None = None
     tolerance: float | None = None
+    tuned_for: float | None = None
+    why_not: str = ""
+
+    @property
+    def unusable(self) -> str:
+        """Why nothing may stand on the estimate; empty where it may."""
+        if self.why_not or self.estimate.ok:
+            return self.why_not
+        reasons = "; ".join(self.estimate.reasons)
+        return f"the estimate is {self.estimate.status.value}" + (f": {reasons}" if reasons else "")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certificate import Certificate
 from servotwin.redesign.evidence import Evidence
 
 
@@ -30,6 +31,8 @@ class Redesign:
         the edge's. None: the gains stay.
     band : Band, optional
         What the loop is predicted to stay within.
+    certificate : Certificate, optional
+        What the setting showed in simulation.
     """
 
     tolerance: float | None
@@ -37,13 +40,23 @@ class Redesign:
     reason: str
     controller: Controller | None = None
     band: Band | None = None
+    certificate: Certificate | None = None
 
 
 class Policy(Protocol):
-    """Makes a setting of evidence."""
+    """Makes a setting of evidence.
 
-    def redesign(self, evidence: Evidence, tuned_for: float | None) -> Redesign:
-        """What to do; `tuned_for` is the gap (rad) of the last redesign, None before the first."""
+    Attributes
+    ----------
+    needs_estimate : bool
+        Whether it is asked only where something may stand on the estimate.
+    """
+
+    @property
+    def needs_estimate(self) -> bool: ...
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """What to do."""
         ...
 
 
@@ -70,6 +83,7 @@ class PaperPolicy:
     servo: Servo
     k_dz: float = 1.0
     smoothing: float = 0.0
+    needs_estimate: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.k_dz) and self.k_dz >= 0.0):
@@ -77,12 +91,10 @@ class PaperPolicy:
         if not 0.0 <= self.smoothing < 1.0:
             raise InvalidInput(f"policy smoothing = {self.smoothing!r}: must be at least 0 and below 1")
 
-    def redesign(self, evidence: Evidence, tuned_for: float | None = None) -> Redesign:
-        """The tolerance for an estimate; smoothed only where there was a gap (rad) to tune for before."""
-        estimate = evidence.estimate
-        if not estimate.ok:
-            because = f": {'; '.join(estimate.reasons)}" if estimate.reasons else ""
-            return Redesign(None, math.nan, f"the estimate is {estimate.status.value}{because}")
-        kept = self.smoothing if tuned_for is not None else 0.0
-        gap = (1.0 - kept) * estimate.gap + kept * (tuned_for or 0.0)
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """The tolerance for an estimate; smoothed only where there was a gap to tune for before."""
+        if evidence.unusable:
+            return Redesign(None, math.nan, evidence.unusable)
+        kept = self.smoothing if evidence.tuned_for is not None else 0.0
+        gap = (1.0 - kept) * evidence.estimate.gap + kept * (evidence.tuned_for or 0.0)
         return Redesign(self.servo.tolerance_for(gap, self.k_dz), gap, "")

@@ -32,6 +32,8 @@ Estimator = Callable[[Window, Expectation], GapEstimate]
 Observer = Callable[[Window], Disturbance]
 """window -> input bias and noise."""
 
+_STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
+
 
 class Twin:
     """Turns windows into estimates and estimates into updates.
@@ -163,9 +165,11 @@ class Twin:
         estimate, disturbed = self.estimate(message, now), self.observe(message)
         self._store.add_estimate(message, estimate)
         self._store.add_disturbance(message, disturbed)
-        why_not = self._refusal(message, estimate, now)
+        stale = not self._versions.admits(message)
+        why_not = _STALE if stale else self._refusal(message, estimate, now)
         self._store.add_trend(message, self.trend)
-        redesign = Redesign(None, math.nan, why_not) if why_not else self._redesign(estimate, disturbed)
+        unasked = stale or (why_not and self._policy.needs_estimate)
+        redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
         if redesign.tolerance is None:
             return []
@@ -173,20 +177,18 @@ class Twin:
         return self._send(self._versions.issue(self._draft(message, estimate, redesign)), now)
 
     def _refusal(self, message: WindowMessage, estimate: GapEstimate, now: float) -> str:
-        """Why no parameters may stand on a window; empty where they may, and the trend has learnt from it."""
-        if not self._versions.admits(message):
-            return "the window is not newer than what the parameters stand on, or of an earlier boot"
+        """Why no parameters may stand on an estimate; empty where they may, and the trend has learnt from it."""
         if not estimate.ok:
             return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
         if self._wear.learn(message.boot, estimate, now):
             return ""
         return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
 
-    def _redesign(self, estimate: GapEstimate, disturbed: Disturbance) -> Redesign:
+    def _redesign(self, estimate: GapEstimate, disturbed: Disturbance, why_not: str) -> Redesign:
         now = self._known.of(self._versions.in_force)
-        evidence = Evidence(estimate, disturbed, self.trend, now.controller, now.tolerance)
+        evidence = Evidence(estimate, disturbed, self.trend, now.controller, now.tolerance, self._tuned_for, why_not)
         try:
-            return self._policy.redesign(evidence, self._tuned_for)
+            return self._policy.redesign(evidence)
         except InvalidInput as error:
             return Redesign(None, math.nan, str(error))
 

@@ -1,0 +1,110 @@
+"""What a setting must show before it is sent, and what it showed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from servotwin.redesign.setting import Setting
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What a setting must show, and how hard it is looked for.
+
+    Parameters
+    ----------
+    Ms : float
+        Largest sensitivity peak of the loop without a gap on the model itself.
+    settled : float
+        Least share of the members that settle.
+    overshoot : float
+        Largest overshoot of a member, per step.
+    scales : tuple of float
+        Factors on Kp and Kd.
+    integral : tuple of float
+        Factors on Ki, tried where the input bias is known to no better than `bias_known`.
+    bias_known : float
+        V.
+    hysteresis : tuple of (float, float)
+        enter and leave of a dead zone of p gap, tried beside no dead zone where there is noise.
+    effort_weight : float
+        s/V: what a volt (rms) of measurement noise in the voltage costs, beside seconds of error.
+    screened, plants, conditions : int
+        Conditions of the two plants that rank the candidates; plants and conditions of the proof.
+    attempts : int
+        Candidates that are tried before none is found.
+    """
+
+    Ms: float = 2.0
+    settled: float = 0.99
+    overshoot: float = 0.3
+    scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+    integral: tuple[float, ...] = (0.0, 0.01, 0.05)
+    bias_known: float = 0.01
+    hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
+    effort_weight: float = 1.0
+    screened: int = 8
+    plants: int = 32
+    conditions: int = 8
+    attempts: int = 4
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A setting with what it showed.
+
+    Attributes
+    ----------
+    setting : Setting
+    gap, input_bias, step : (float, float)
+        rad, V, m: ranges of the members.
+    members : int
+    settled : float
+        Share that settled.
+    cost : float
+        s: 95th percentile of the integral of abs(error) per step, and the noise's price.
+    tail, tail_p95, error_rms, effort : float
+        m, m, m, V: worst of all members in the last part; the 95th percentile of the tail.
+    overshoot : float
+        Worst, per step.
+    settling, settling_worst : float
+        s until the error stays below 2 % of the step: the 95th percentile, and the worst.
+    Ms, crossover, phase_margin : float
+        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad.
+    saturated : bool
+        Whether the voltage limit was met by a member.
+    looked_at : int
+        Candidates simulated, this one included.
+    seconds : float
+        What it took.
+    """
+
+    setting: Setting
+    gap: tuple[float, float]
+    input_bias: tuple[float, float]
+    step: tuple[float, float]
+    members: int
+    settled: float
+    cost: float
+    tail: float
+    tail_p95: float
+    error_rms: float
+    effort: float
+    overshoot: float
+    settling: float
+    settling_worst: float
+    Ms: float
+    crossover: float
+    phase_margin: float
+    saturated: bool
+    looked_at: int
+    seconds: float = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """No candidate could be proved."""
+
+    reason: str
+    best: Certificate | None = None

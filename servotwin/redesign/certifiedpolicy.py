@@ -1,0 +1,168 @@
+"""The default policy: send what was proved for everything the evidence allows, otherwise the fallback set."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from time import perf_counter
+from typing import ClassVar
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import NORMAL_95, GapEstimate
+from servotwin.identify.trend import Trend
+from servotwin.messages import Band
+from servotwin.plant.servo import Servo
+from servotwin.redesign.assess import NEAR, Trial
+from servotwin.redesign.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified import certify
+from servotwin.redesign.deadzones import gap_range
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Redesign
+from servotwin.redesign.setting import Setting
+from servotwin.redesign.uncertainty import Range, Uncertainty
+
+# Relative, and V: nobody is troubled with an update for less.
+_SAME, _SAME_FEEDFORWARD = 1e-3, 1e-3
+
+
+@dataclass(frozen=True)
+class CertifiedPolicy:
+    """A setting proved by simulation on the joint uncertainty of gap, plant, input bias and steps.
+
+    Parameters
+    ----------
+    servo : Servo
+        The model.
+    uncertainty : Uncertainty
+        What is known before any window; its gap is the range that the fallback set is proved for.
+    demands : Demands
+    trial : Trial
+    feedforward_limit : float
+        V, either sign.
+    bias_floor : float
+        V: the input bias is never taken to be known better.
+    horizon : float
+        s for which a setting is to hold: the gap may grow meanwhile as fast as the trend says.
+    clock : callable
+        s, for the certificates' own times.
+    """
+
+    servo: Servo
+    uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
+    demands: Demands = field(default_factory=Demands)
+    trial: Trial = field(default_factory=Trial)
+    feedforward_limit: float = 0.2
+    bias_floor: float = 2e-3
+    horizon: float = 40.0
+    needs_estimate: ClassVar[bool] = False
+    clock: Callable[[], float] = field(default=perf_counter, compare=False)
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """The proved setting for the evidence; without one the fallback set, and why.
+
+        Where nothing may stand on the window's own estimate, what it says of the input bias still counts, with the gap
+        as the trend knows it.
+        """
+        estimate = self._estimate(evidence)
+        if estimate is None:
+            return Redesign(None, math.nan, evidence.unusable)
+        gap = self._gap(estimate, evidence.trend)
+        if gap[1] > self.uncertainty.gap[1]:
+            low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
+            reason = f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified"
+            return self._fallen_back(evidence, reason)
+        feedforward, bias = self._input_bias(evidence)
+        noise = _noise(evidence)
+        found = certify(
+            self.servo,
+            self.uncertainty.replace(gap=gap, input_bias=bias),
+            self.demands,
+            self.trial,
+            feedforward,
+            noise,
+            self.clock,
+        )
+        if isinstance(found, Refusal):
+            return self._fallen_back(evidence, found.reason)
+        if _in_force(found.setting, evidence):
+            return Redesign(None, estimate.gap, "what was proved is in force already", certificate=found)
+        return _sent(found, noise, estimate.gap, "")
+
+    def fallback(self) -> Certificate:
+        """What holds for every gap and bias of the stated range, whatever is estimated.
+
+        Raises
+        ------
+        InvalidInput
+            Nothing is proved for the whole range: it has to be stated narrower, or the demands lower.
+        """
+        return _fallback(self.servo, self.uncertainty, self.demands, self.trial)
+
+    def _estimate(self, evidence: Evidence) -> GapEstimate | None:
+        if not evidence.unusable:
+            return evidence.estimate
+        trend, told = evidence.trend, math.isfinite(evidence.disturbance.bias_std)
+        return trend.as_estimate() if told and trend is not None and trend.updates > 0 else None
+
+    def _gap(self, estimate: GapEstimate, trend: Trend | None) -> Range:
+        """Gaps to reckon with until `horizon` has passed; one window alone says nothing of wear."""
+        low, high = gap_range(estimate)
+        grows = trend is not None and trend.updates > 1
+        return low, high + (self.horizon * max(0.0, trend.rate_interval[1]) if trend is not None and grows else 0.0)
+
+    def _fallen_back(self, evidence: Evidence, reason: str) -> Redesign:
+        proved = self.fallback()
+        feedforward, _ = self._input_bias(evidence)
+        law = proved.setting.controller.replace(feedforward=feedforward)
+        sent = replace(proved, setting=replace(proved.setting, controller=law))
+        return _sent(sent, _noise(evidence), math.nan, f"{reason}; the fallback set is sent")
+
+    def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
+        """What to feed forward (V), and the range of biases to reckon with."""
+        told = evidence.disturbance
+        if not math.isfinite(told.bias_std):
+            fed = evidence.controller.feedforward if evidence.controller is not None else 0.0
+            return fed, self.uncertainty.input_bias
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * told.bias_std, self.bias_floor)
+        return min(max(-told.bias, -limit), limit), (told.bias - spread, told.bias + spread)
+
+
+def _noise(evidence: Evidence) -> float:
+    """m rms; 0 where nobody could tell."""
+    noise = evidence.disturbance.noise
+    return noise if math.isfinite(noise) else 0.0
+
+
+def _in_force(setting: Setting, evidence: Evidence) -> bool:
+    """Whether the edge runs it, as far as is known."""
+    now, new = evidence.controller, setting.controller
+    if now is None or evidence.tolerance is None or abs(now.feedforward - new.feedforward) > _SAME_FEEDFORWARD:
+        return False
+    gains = ((getattr(now, name), getattr(new, name)) for name in ("Kp", "Ki", "Kd", "Tf", "enter", "leave"))
+    pairs = (*gains, (evidence.tolerance, setting.tolerance))
+    return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
+
+
+def band_of(proved: Certificate, noise: float = 0.0) -> Band:
+    """What the loop stays within once it has arrived: the worst member's tail, what is left of a step, and noise (m)."""
+    rest = NEAR * proved.step[1] + noise
+    error = proved.tail + rest
+    effort = proved.effort + abs(proved.setting.controller.Kp) * rest
+    return Band(error, error, effort, math.ceil(proved.settling_worst))
+
+
+@lru_cache(maxsize=16)
+def _fallback(servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> Certificate:
+    found = certify(servo, uncertainty, demands, trial)
+    if isinstance(found, Refusal):
+        raise InvalidInput(f"no fallback set for the servo's stated range: {found.reason}")
+    return found
+
+
+def _sent(proved: Certificate, noise: float, gap: float, reason: str) -> Redesign:
+    """The redesign that carries a certificate."""
+    setting = proved.setting
+    band = band_of(proved, noise)
+    return Redesign(setting.tolerance, gap, reason, setting.controller, band, proved)

@@ -1,0 +1,46 @@
+"""What a policy can send: a controller and its dead zone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+
+# Noise below this is the loop's to follow; above it is passed by the controller as it stands.
+_GRID = 512
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A controller and the half-width of its dead zone.
+
+    Attributes
+    ----------
+    controller : Controller
+    tolerance : float
+        m; 0: no dead zone.
+    """
+
+    controller: Controller
+    tolerance: float = 0.0
+
+    @property
+    def continuous(self) -> Setting:
+        """The same law in continuous time, in which candidates are simulated."""
+        return Setting(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
+
+    def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
+        """Voltage, V rms, that white measurement noise of `noise` (m rms) within `band` (Hz) causes by itself.
+
+        The loop is left out: it does not answer at frequencies far above its crossover. Gains as in Eq 14, behind the
+        loop filter.
+        """
+        law = self.controller
+        s = 2j * math.pi * np.linspace(*band, _GRID)
+        gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
+        if law.loop_filter_hz is not None:
+            gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
+        return noise * float(np.sqrt(np.mean(np.abs(gain) ** 2)))

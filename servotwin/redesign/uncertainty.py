@@ -1,0 +1,140 @@
+"""How wrong the model may be, and the machines it then stands for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import qmc
+
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.plant.servo import Servo
+
+Range = tuple[float, float]
+_PARAMETERS = ("k", "c", "k_B", "m")
+_UNITS = {"gap": "rad", "step": "m", "input_bias": "V"}
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What is known of a machine: each value lies in its range, and nothing says where.
+
+    Parameters
+    ----------
+    k, c, k_B, m : float
+        Half-widths relative to the model's values.
+    gap : (float, float)
+        rad, total.
+    step : (float, float)
+        m, size of the steps that the reference makes; one is as likely as another on a logarithmic scale.
+    input_bias : (float, float)
+        V, added to the voltage behind the controller.
+
+    Raises
+    ------
+    InvalidInput
+        A half-width is not in 0 .. 1, or a range is empty, not finite or, but for the bias, negative.
+    """
+
+    k: float = 0.15
+    c: float = 0.5
+    k_B: float = 0.1
+    m: float = 0.1
+    gap: Range = (0.0, math.radians(60.0))
+    step: Range = (1e-4, 2.5e-3)
+    input_bias: Range = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in _PARAMETERS:
+            width = getattr(self, name)
+            if not 0.0 <= width < 1.0:
+                raise InvalidInput(f"uncertainty {name} = {width!r}: a relative half-width must be 0 or more, below 1")
+        for name, unit in _UNITS.items():
+            low, high = getattr(self, name)
+            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+                raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be finite and in order")
+        if self.gap[0] < 0.0 or self.step[0] <= 0.0:
+            raise InvalidInput("uncertainty: the gap must be 0 or more, and steps greater than 0")
+
+    def replace(self, **changes: object) -> Uncertainty:
+        """A copy with some values changed, validated again."""
+        unknown = set(changes) - {field.name for field in fields(self)}
+        if unknown:
+            raise InvalidInput(f"uncertainty has no value named {sorted(unknown)[0]!r}")
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class Members:
+    """Machines to be simulated: every plant in every one of its conditions.
+
+    Attributes
+    ----------
+    plants : tuple of P Servo
+    gap, step, input_bias, theta_d0 : (P, C) array
+        rad, m, V, rad.
+    """
+
+    plants: tuple[Servo, ...]
+    gap: Array
+    step: Array
+    input_bias: Array
+    theta_d0: Array
+
+    @property
+    def count(self) -> int:
+        """How many machines."""
+        return self.gap.size
+
+
+def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> Members:
+    """`plants` times `conditions` members, spread evenly (scrambled Sobol sequences); equal calls draw equal members.
+
+    The first plant is the model itself. The first two conditions of every plant have the widest and the narrowest gap:
+    the ends of an estimate's interval are where a setting fails first.
+    """
+    conditioned = _sobol(4, plants * conditions, seed + 1).reshape(plants, conditions, 4)
+    if conditions > 1:
+        conditioned[:, 0, 0], conditioned[:, 1, 0] = 1.0, 0.0
+    gap = _spread(uncertainty.gap, conditioned[..., 0])
+    step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), conditioned[..., 1]))
+    return Members(
+        drawn_plants(servo, uncertainty, plants, seed),
+        gap,
+        step,
+        _spread(uncertainty.input_bias, conditioned[..., 2]),
+        (conditioned[..., 3] - 0.5) * gap,
+    )
+
+
+def drawn_plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
+    """The model and `count` - 1 others about it."""
+    widths = tuple(getattr(uncertainty, name) for name in _PARAMETERS)
+    return _plants(servo, widths, count, seed)
+
+
+@lru_cache(maxsize=16)
+def _plants(servo: Servo, widths: tuple[float, ...], count: int, seed: int) -> tuple[Servo, ...]:
+    factors = 1.0 + (2.0 * _sobol(4, count, seed) - 1.0) * np.array(widths)
+    factors[0] = 1.0
+    return tuple(_scaled(servo, dict(zip(_PARAMETERS, row.tolist(), strict=True))) for row in factors)
+
+
+def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
+    changes = {}
+    for name, factor in factors.items():
+        value = getattr(servo, name)
+        changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+    return servo.replace(**changes)
+
+
+def _sobol(dimensions: int, count: int, seed: int) -> Array:
+    """(count, dimensions) in 0 .. 1."""
+    return np.asarray(qmc.Sobol(dimensions, seed=seed).random(2 ** math.ceil(math.log2(max(count, 1))))[:count])
+
+
+def _spread(ends: Range, places: Array) -> Array:
+    return np.asarray(ends[0] + (ends[1] - ends[0]) * places)
