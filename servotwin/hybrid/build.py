@@ -176,8 +176,9 @@ def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w
     for j in range(1, PARTS):
         _store(p, n, t.jump_part, base + j * n * n)
         next_power(n, p)
-    _fill_nodes(t, t.fine, t.jump_fine, NODES_FINE, flow, step, w)
-    _fill_nodes(t, t.coarse, t.jump_coarse, NODES_COARSE, flow, step * NODES_FINE, w)
+    # Literals would have the function compiled once for each.
+    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), flow, step, w)
+    _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), flow, step * NODES_FINE, w)
 
 
 @bare
