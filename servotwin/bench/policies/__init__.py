@@ -1,0 +1,1 @@
+"""The policies side by side, on random machines."""

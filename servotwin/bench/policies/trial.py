@@ -1,0 +1,161 @@
+"""One machine under one policy: a step, 60 s, and two windows of rest from which the policy may learn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.bench.policies.machines import NOISE, Machine
+from servotwin.control.controller import Controller
+from servotwin.identify.disturbance import disturbance
+from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.redesign.assess import NEAR, STILL
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Policy
+from servotwin.redesign.setting import Setting
+from servotwin.simulation import Run, Simulation
+
+DURATION, LAST = 60.0, 10.0
+UPDATES = (20.0, 40.0)  # s, ends of the windows
+WINDOW, DELAY = 2.0, 1.0
+SPREAD = math.radians(0.05)
+_RATES = {"noise": 5000.0}
+_RATE = 500.0
+
+
+class Scores(NamedTuple):
+    """Measures of one run.
+
+    Attributes
+    ----------
+    ripple : float
+        m, half peak-to-peak of the true error over the last 10 s.
+    tail : float
+        m, largest abs(error) there.
+    cost : float
+        s, integral of abs(error) over the whole run, per step.
+    overshoot : float
+        Per step.
+    settling : float
+        s, last time at which the error exceeds 2 % of the step.
+    voltage : float
+        V rms over the last 10 s.
+    travel : float
+        rad/s, mean speed of the motor there, either way.
+    position : float
+        m, root mean square error there.
+    """
+
+    ripple: float
+    tail: float
+    cost: float
+    overshoot: float
+    settling: float
+    voltage: float
+    travel: float
+    position: float
+
+    @property
+    def settled(self) -> bool:
+        """Half peak-to-peak below 1 um."""
+        return self.ripple < STILL
+
+
+@dataclass(frozen=True)
+class Told:
+    """A policy with the setting that runs before it is asked.
+
+    Attributes
+    ----------
+    policy : Policy or None
+        None: the start stays.
+    start : Setting
+    """
+
+    policy: Policy | None
+    start: Setting
+
+
+def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Scores:
+    """The gap's estimate is right to 0.05 deg (standard deviation) and says so; of the rest a policy knows what its
+    windows show: 2 s that end 20 and 40 s after the step, its setting in force a second later."""
+    rng = np.random.default_rng(machine.seed)
+    believed = max(0.0, machine.gap + SPREAD * rng.standard_normal())
+    setting = _redesigned(told, Evidence(_estimate(believed)), told.start)
+    simulation = _simulation(machine, block, setting, rng)
+    for end in UPDATES if told.policy is not None else ():
+        simulation.advance(_sample(end, block))
+        window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
+        seen = disturbance(window, model)
+        now = _redesigned(
+            told, Evidence(_estimate(believed), seen, None, setting.controller, setting.tolerance), setting
+        )
+        if now != setting:
+            simulation.advance(_sample(end + DELAY, block))
+            simulation.set_controller(_law(now.controller, block), now.tolerance)
+            setting = now
+    simulation.advance(_sample(DURATION, block))
+    return scores(simulation.run(), machine.step)
+
+
+def scores(run: Run, step: float) -> Scores:
+    """Measures of a run of one step at time 0."""
+    error = run.reference - run.position
+    last = slice(-round(LAST * run.sample_rate), None)
+    outside = np.flatnonzero(np.abs(error) > NEAR * step)
+    return Scores(
+        ripple=0.5 * float(np.ptp(error[last])),
+        tail=float(np.abs(error[last]).max()),
+        cost=float(np.abs(error).mean()) * DURATION / step,
+        overshoot=max(0.0, -float(error.min())) / step,
+        settling=0.0 if outside.size == 0 else float(run.time[outside[-1]]),
+        voltage=float(np.sqrt(np.mean(run.voltage[last] ** 2))),
+        travel=float(np.abs(np.diff(run.theta_m[last])).sum()) / LAST,
+        position=float(np.sqrt(np.mean(error[last] ** 2))),
+    )
+
+
+def _redesigned(told: Told, evidence: Evidence, before: Setting) -> Setting:
+    """The setting after a policy was asked."""
+    if told.policy is None:
+        return before
+    made = told.policy.redesign(evidence)
+    if made.tolerance is None:
+        return before
+    return Setting(made.controller or before.controller, made.tolerance)
+
+
+def _estimate(gap: float) -> GapEstimate:
+    interval = (max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD)
+    return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, 0.0)
+
+
+def _simulation(machine: Machine, block: str, setting: Setting, rng: np.random.Generator) -> Simulation:
+    return Simulation(
+        machine.servo,
+        DURATION,
+        _law(setting.controller, block),
+        reference=machine.step,
+        gap=machine.gap,
+        tolerance=setting.tolerance,
+        theta_d0=machine.theta_d0,
+        sample_rate=_RATES.get(block, _RATE),
+        noise=NOISE if block == "noise" else None,
+        seed=rng,
+        input_bias=machine.input_bias,
+        friction=machine.friction,
+    )
+
+
+def _law(controller: Controller, block: str) -> Controller:
+    """Continuous and exact, but sampled where there is noise."""
+    return controller.replace(sample_rate=_RATES.get(block))
+
+
+def _sample(time: float, block: str) -> int:
+    return round(time * _RATES.get(block, _RATE))
