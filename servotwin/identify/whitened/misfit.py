@@ -71,7 +71,7 @@ class Misfit:
         """(k, m) of rows (k, n) at the full rate."""
         rows = self.decimation.rows(columns)
         rows = rows if self.noise is None else self.noise.whiten(rows)
-        return np.pad(rows, ((0, 0), (0, self.extra))) if self.extra else rows
+        return np.hstack([rows, np.zeros((len(rows), self.extra))]) if self.extra else rows
 
     def cost(self, point: Point) -> float:
         """Squared length of the residual."""

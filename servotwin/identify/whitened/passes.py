@@ -13,11 +13,13 @@ from servotwin.identify.core.projection import spread
 from servotwin.identify.core.whitening import Autoregression, burg
 from servotwin.identify.whitened.misfit import Misfit, Point
 from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.whitened.search import Fit, continued, descend, in_contact, off_the_plain, search
+from servotwin.identify.whitened.search import ROUGH, Fit, continued, descend, in_contact, off_the_plain, search
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
 _EARLY, _PLACES = 1, (-0.85, 0.0, 0.85)  # the pass in which a growing gap is looked at from other places, and these
+_GLANCE = 8  # steps from there
+_FINE = 1e-6  # of the cost: what the last descent may leave, a hundredth of a standard deviation
 _SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
 
 
@@ -81,9 +83,9 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
     return [fit.point for fit in different[:count]]
 
 
-def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float) -> Fit:
-    """The lowest of the minima nearest to some points."""
-    fits = [descend(misfit, point, largest, tolerance) for point in points]
+def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60) -> Fit:
+    """The lowest of the minima nearest to some points, or of what so many steps lead to."""
+    fits = [descend(misfit, point, largest, tolerance, steps, gain=ROUGH) for point in points]
     best = min(fits, key=lambda fit: fit.slopes.cost)
     return Fit(best.point, best.slopes, sum(fit.evaluations for fit in fits), best.converged)
 
@@ -105,12 +107,15 @@ def refine(
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
         starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
-        starts += _elsewhere(fit.point) if reduction.growth and number == _EARLY else []
         fit = best_of(misfit, starts, largest, tolerance)
-        fit = off_the_plain(misfit, fit, largest, tolerance) if last else fit
+        if reduction.growth and number == _EARLY:
+            others = best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
+            fit = min(fit, others, key=lambda one: one.slopes.cost)
         evaluations += fit.evaluations
+    fit = off_the_plain(misfit, fit, largest, tolerance)
+    fit = descend(misfit, fit.point, largest, tolerance, gain=_FINE)
     rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
-    return Found(reduction, misfit, fit, noise, rows, evaluations)
+    return Found(reduction, misfit, fit, noise, rows, evaluations + fit.evaluations)
 
 
 def _elsewhere(point: Point) -> list[Point]:

@@ -15,6 +15,7 @@ from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
+ROUGH = 1e-5  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
 
 
 class Free(NamedTuple):
@@ -39,17 +40,25 @@ class Fit:
     converged: bool
 
 
-def descend(misfit: Misfit, start: Point, largest: float, tolerance: float, steps: int = 60, free: Free = BOTH) -> Fit:
+def descend(
+    misfit: Misfit,
+    start: Point,
+    largest: float,
+    tolerance: float,
+    steps: int = 60,
+    free: Free = BOTH,
+    gain: float = _GAIN,
+) -> Fit:
     """From a start to the nearest minimum with 0 <= gap <= largest (rad).
 
-    It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises next to no
-    gain. What is not `free` keeps its value.
+    It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises less than the
+    part `gain` of the cost. What is not `free` keeps its value.
     """
     point, here, damping = start, misfit.slopes(start), _FIRST_DAMPING
     for count in range(1, steps):
         step = _step(here, point, damping, largest, free)
         trial = _bounded(point, step, largest)
-        if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= _GAIN * here.cost:
+        if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= gain * here.cost:
             return Fit(point, here, count, True)
         ahead = misfit.slopes(trial)
         if ahead.cost < here.cost:
@@ -102,7 +111,7 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
         costs = [misfit.cost(point) for point in points]
         lowest = int(np.argmin(costs))
         best.append((costs[lowest], points[lowest]))
-    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY) for _, point in best]
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, ROUGH) for _, point in best]
     return [continued(misfit, fit, largest, tolerance) for fit in near]
 
 
@@ -112,10 +121,10 @@ def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit
     In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
     in. And from a little further in, where the motor only just began to move, next to nothing leads there.
     """
-    ends = [descend(misfit, fit.point, largest, tolerance)]
+    ends = [descend(misfit, fit.point, largest, tolerance, gain=ROUGH)]
     point = ends[0].point
     inside = [point._replace(place=share * point.place) for share in _WITHIN] if abs(point.place) == 1.0 else []
-    ends += [descend(misfit, start, largest, tolerance, _SHORT) for start in (*inside, *in_contact(point))]
+    ends += [descend(misfit, start, largest, tolerance, _SHORT, gain=ROUGH) for start in (*inside, *in_contact(point))]
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
     return Fit(best.point, best.slopes, evaluations, best.converged)
@@ -137,7 +146,8 @@ def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) ->
     a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
     if a * c - b * b > _PLAIN * a * c:
         return fit
-    fits = [fit, *(descend(misfit, start, largest, tolerance) for start in _edges(misfit.theta_m, fit.point))]
+    starts = _edges(misfit.theta_m, fit.point)
+    fits = [fit, *(descend(misfit, start, largest, tolerance, gain=ROUGH) for start in starts)]
     best = min(fits, key=lambda one: one.slopes.cost)
     return Fit(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
 
