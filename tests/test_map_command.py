@@ -178,7 +178,7 @@ def test_ctrl_c_ends_the_pool_with_130_and_one_line(tmp_path):
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert stderr.startswith("interrupted: ")
+    assert stderr.startswith("interrupted: "), stderr
     assert stderr.count("\n") == 1
     assert not list(chunks.glob(".*"))
 

@@ -9,11 +9,12 @@ import signal
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
-from joblib.externals.loky.backend import resource_tracker
+from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from servotwin.errors import InvalidInput
 
@@ -72,7 +73,7 @@ def _performed(function: Callable[[_T], _R], task: _T) -> tuple[_T, _R]:
 @contextmanager
 def _processes(workers: int) -> Iterator[None]:
     try:
-        with parallel_config(backend="loky", n_jobs=workers):
+        with parallel_config(backend="loky", n_jobs=workers, initializer=_ignore_interrupts):
             yield
     finally:
         if workers > 1:
@@ -109,7 +110,8 @@ def _connected(address: str) -> Any:
         raise InvalidInput(
             f"--scheduler {address}: needs Dask, which is not installed; install it with pip install 'servotwin[dask]'"
         ) from None
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it has to say is said once, by us
+    for name in ("distributed", "distributed.client", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what they have to say is said once, by us
     connect: Any = distributed.Client
     try:
         client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
@@ -130,9 +132,15 @@ def _interrupts_held() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # its start would let interrupts through again
+    for tracker in (resource_tracker, loky_tracker):
+        tracker.ensure_running()  # its start would let interrupts through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _ignore_interrupts() -> None:
+    """Leave an interrupt to the process that started the pool."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
