@@ -181,7 +181,7 @@ class _System:
         ]
         found += [
             Guard(row, self.names.index((target, grip.name, zone.name)), reset, label, side)
-            for row, target, reset, label, side in play_endings(self.servo, self.basis, play, zone.voltage)
+            for row, target, reset, label, side in play_endings(self.servo, self.basis, play, grip, zone.voltage)
         ]
         return tuple(found)
 

@@ -42,6 +42,7 @@ _RIGID = (Play("-", -1), Play("open", 0), Play("+", 1))
 _ELASTIC = (*_RIGID, Play("held -", -1, held=True), Play("held +", 1, held=True))
 OPEN = 1
 SMOOTH = (Grip(""),)
+_HAIR = 1e-9
 _COULOMB = (Grip("stick", stuck=True), Grip("slip -", -1), Grip("slip +", 1))
 
 
@@ -103,7 +104,7 @@ def _contact_reset(servo: Servo, basis: Basis, side: int) -> Array:
     return reset
 
 
-def play_endings(servo: Servo, basis: Basis, play: Play, voltage: Array) -> list[Ending]:
+def play_endings(servo: Servo, basis: Basis, play: Play, grip: Grip, voltage: Array) -> list[Ending]:
     """What ends a mode of the backlash."""
     side = play.side
     if side == 0:
@@ -121,7 +122,7 @@ def play_endings(servo: Servo, basis: Basis, play: Play, voltage: Array) -> list
         )
         return [(pressed, flank, None, "contact", side), (-free, "open", None, "release", side)]
     reset = _contact_reset(servo, basis, side)
-    release = -side * _screw_rate(basis, side)
+    release = -side * _screw_rate(basis, side) - (_stopping(servo, basis) if grip.side else 0.0)
     if servo.rigid:
         return [(release, "open", reset, "release", side)]
     reset[basis["speed"]] = 0.5 * side * basis.row("gap'")
@@ -139,4 +140,13 @@ def grip_endings(servo: Servo, basis: Basis, grip: Grip) -> list[Ending]:
     # A reversal goes through the stuck mode within the instant.
     still = np.eye(len(basis.names))
     still[basis["speed"]] = 0.0
-    return [(-grip.side * basis.row("speed"), "stick", still, "stick", grip.side)]
+    return [(-grip.side * basis.row("speed") - _stopping(servo, basis), "stick", still, "stick", grip.side)]
+
+
+def _stopping(servo: Servo, basis: Basis) -> Array:
+    """The speed, a hair beyond zero, at which a sliding motor has stopped: 1e-9 of that at which its back EMF takes as
+    much voltage as the friction.
+
+    At zero itself a motor whose torque is the friction's to within rounding would stick and slip without end.
+    """
+    return _HAIR * servo.R / (servo.k_T * servo.k_B) * basis.row("friction")

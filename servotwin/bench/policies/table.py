@@ -68,7 +68,7 @@ def compare(
 
 def _row(pool: joblib.Parallel, block: str, name: str, those: Sequence[Machine], model: Servo, told: Told) -> Row:
     found = pool(joblib.delayed(run_machine)(machine, block, model, told) for machine in those)
-    return Row(block, name, Scores(*np.array(found).T))  # type: ignore[arg-type]
+    return Row(block, name, Scores(*np.array(found).T))
 
 
 def _best_constant(
