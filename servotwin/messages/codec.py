@@ -6,13 +6,14 @@ import msgspec
 
 from servotwin.messages.channels import checksum
 from servotwin.messages.checks import InvalidMessage, require
+from servotwin.messages.requests import Answer, Request
 from servotwin.messages.updates import Fallback, Receipt, Update
 from servotwin.messages.windows import Acknowledge, Hello, Window
 
 MAX_BYTES = 4 * 1024 * 1024
 """Largest message that is looked at: 1 s of four channels at 5 kHz takes 40 kB."""
 
-ParameterMessage = Update | Receipt | Fallback | Hello | Acknowledge
+ParameterMessage = Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge
 Message = Window | ParameterMessage
 _Decoded = TypeVar("_Decoded")
 

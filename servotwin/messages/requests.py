@@ -1,0 +1,135 @@
+"""To the edge: requests for windows that tell more; back: answers."""
+
+from enum import StrEnum
+from math import isfinite
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from servotwin.messages.checks import Count, Name, Text, require
+
+MAX_SECONDS = 600.0
+"""Longest window, or time of one probe, that a request may name; an edge's own limits are tighter."""
+
+
+class LongerWindow(Struct, frozen=True, tag="window"):
+    """From the next change of the reference on, windows of this length.
+
+    Attributes
+    ----------
+    window_s, pre_trigger_s : float
+        Length, and how much of it lies before the change.
+    """
+
+    window_s: float
+    pre_trigger_s: float
+
+    def __post_init__(self) -> None:
+        require(0.0 < self.window_s <= MAX_SECONDS, f"request window_s {self.window_s} s is not allowed")
+        require(
+            0.0 <= self.pre_trigger_s < self.window_s, f"request pre_trigger_s {self.pre_trigger_s} s is not allowed"
+        )
+
+
+class Probe(Struct, frozen=True, tag="probe"):
+    """Once, while the reference rests, a move of it there and back.
+
+    Attributes
+    ----------
+    size : float
+        m, added to the reference.
+    hold_s : float
+        How long it stays away, and how long it is watched after it came back, each time.
+    strokes : int
+        How often it goes there and back.
+    """
+
+    size: float
+    hold_s: float
+    strokes: Annotated[int, Meta(ge=1, le=16)] = 1
+
+    def __post_init__(self) -> None:
+        require(isfinite(self.size) and self.size != 0.0, f"request size {self.size} m is not allowed")
+        require(isfinite(self.hold_s) and self.hold_s > 0.0, f"request hold_s {self.hold_s} s is not allowed")
+        require(self.duration <= MAX_SECONDS, f"request takes {self.duration} s: at most {MAX_SECONDS} s are allowed")
+
+    @property
+    def duration(self) -> float:
+        """s, from the first move to the end of the last hold."""
+        return 2.0 * self.strokes * self.hold_s
+
+
+Ask = LongerWindow | Probe
+
+
+class Request(Struct, frozen=True, tag="request/1"):
+    """The twin asks for windows that tell more of the gap.
+
+    Attributes
+    ----------
+    boot : str
+        Of the edge it was made for.
+    serial : int
+        Its own number; only rises within a boot of the edge.
+    ask : LongerWindow or Probe
+    not_after : float
+        Sample time of the edge from which on it must not be begun, s.
+    reason : str
+        Why, in words.
+    """
+
+    servo: Name
+    boot: Name
+    serial: Annotated[int, Meta(ge=1, le=2**53)]
+    ask: Ask
+    not_after: float
+    reason: Text = ""
+
+    def __post_init__(self) -> None:
+        require(isfinite(self.not_after), f"request not_after {self.not_after} s is not finite")
+
+
+class Outcome(StrEnum):
+    """What the edge did with a request."""
+
+    TAKEN = "taken"
+    WRONG_SERVO = "wrong servo"
+    OTHER_BOOT = "made for another boot"
+    DUPLICATE = "a request of this serial or a later one was decided already"
+    EXPIRED = "expired"
+    NOT_ALLOWED = "not allowed at this edge"
+    TOO_LARGE = "larger than allowed at this edge"
+    TOO_SOON = "too soon after the last probe"
+    BUSY = "the reference does not rest, or a window is being recorded"
+
+    @property
+    def passing(self) -> bool:
+        """Whether the same request may be taken later."""
+        return self in (Outcome.BUSY, Outcome.TOO_SOON)
+
+
+class Answer(Struct, frozen=True, tag="answer/1"):
+    """What the edge did with a request.
+
+    Attributes
+    ----------
+    serial : int
+        The request's.
+    sample : int
+        First sample at which it counts, or at which it was refused.
+    outcome : Outcome
+    newest : int
+        Highest serial decided so far: a twin that forgot goes on from there.
+    """
+
+    servo: Name
+    boot: Name
+    serial: Count
+    sample: Count
+    outcome: Outcome
+    newest: Count
+
+    @property
+    def taken(self) -> bool:
+        """Whether the edge does what it was asked for."""
+        return self.outcome is Outcome.TAKEN

@@ -1,0 +1,96 @@
+"""Requests and answers as bytes: round trips, and what is refused."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.messages import (
+    Answer,
+    Ask,
+    InvalidMessage,
+    LongerWindow,
+    Outcome,
+    Probe,
+    Request,
+    decode,
+    decode_json,
+    encode,
+    encode_json,
+)
+
+SECONDS = st.floats(1e-3, 9.0)
+ASKS = st.one_of(
+    st.builds(lambda length, share: LongerWindow(length, share * length), SECONDS, st.floats(0.0, 0.999)),
+    st.builds(Probe, st.floats(1e-9, 1.0) | st.floats(-1.0, -1e-9), SECONDS, st.integers(1, 16)),
+)
+NAMES = st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")
+COUNTS = st.integers(1, 2**53)
+REQUEST = Request("axis-1", "b0", 1, LongerWindow(2.0, 0.3), 60.0, "two windows without the gap")
+
+
+@given(NAMES, NAMES, COUNTS, ASKS, st.floats(allow_nan=False, allow_infinity=False), st.text(max_size=256))
+def test_requests_survive_the_bytes(
+    servo: str, boot: str, serial: int, ask: Ask, not_after: float, reason: str
+) -> None:
+    request = Request(servo, boot, serial, ask, not_after, reason)
+    assert decode(encode(request)) == request
+    assert decode_json(encode_json(request)) == request
+    assert len(encode(request)) < 1500
+
+
+@given(NAMES, NAMES, COUNTS, COUNTS, st.sampled_from(Outcome), COUNTS)
+def test_answers_survive_the_bytes(
+    servo: str, boot: str, serial: int, sample: int, outcome: Outcome, newest: int
+) -> None:
+    answer = Answer(servo, boot, serial, sample, outcome, newest)
+    assert decode(encode(answer)) == answer
+    assert decode_json(encode_json(answer)) == answer
+
+
+def test_the_two_kinds_are_told_apart() -> None:
+    window, probe = (msgspec.structs.replace(REQUEST, ask=ask) for ask in (LongerWindow(2.0, 0.3), Probe(1e-4, 0.85)))
+    assert isinstance(decode(encode(window)).ask, LongerWindow)  # type: ignore[union-attr]
+    assert isinstance(decode(encode(probe)).ask, Probe)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"servo": "a b"}, "servo"),
+        ({"serial": 0}, "serial"),
+        ({"not_after": math.inf}, "not_after"),
+        ({"reason": "x" * 257}, "reason"),
+        ({"ask": {"type": "shake"}}, "shake"),
+        ({"ask": {"type": "window", "window_s": 0.0, "pre_trigger_s": 0.0}}, "window_s"),
+        ({"ask": {"type": "window", "window_s": 601.0, "pre_trigger_s": 0.0}}, "window_s"),
+        ({"ask": {"type": "window", "window_s": math.nan, "pre_trigger_s": 0.0}}, "window_s"),
+        ({"ask": {"type": "window", "window_s": 1.0, "pre_trigger_s": 1.0}}, "pre_trigger_s"),
+        ({"ask": {"type": "window", "window_s": 1.0, "pre_trigger_s": -0.1}}, "pre_trigger_s"),
+        ({"ask": {"type": "probe", "size": 0.0, "hold_s": 1.0}}, "size"),
+        ({"ask": {"type": "probe", "size": math.inf, "hold_s": 1.0}}, "size"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 0.0}}, "hold_s"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 100.0, "strokes": 4}}, "takes 800.0 s"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "strokes": 17}}, "strokes"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "strokes": 0}}, "strokes"),
+    ],
+)
+def test_what_is_wrong_is_named(change: dict[str, Any], words: str) -> None:
+    raw = msgspec.to_builtins(REQUEST) | change
+    with pytest.raises(InvalidMessage, match=words):
+        decode(msgspec.msgpack.encode(raw))
+
+
+@given(st.binary(max_size=200))
+def test_cut_and_random_bytes_are_refused(noise: bytes) -> None:
+    whole = encode(REQUEST)
+    for data in (noise, whole[: len(noise) % len(whole)], whole + noise[:1] if noise else b""):
+        with pytest.raises(InvalidMessage):
+            decode(data)
+
+
+def test_what_may_be_taken_later() -> None:
+    assert {outcome for outcome in Outcome if outcome.passing} == {Outcome.BUSY, Outcome.TOO_SOON}
