@@ -1,0 +1,228 @@
+"""When windows tell too little of the gap: ask for longer ones first, and only then for a probing move.
+
+The calmer a loop, the less its windows tell (dual control). A window with a pre-trigger costs nothing but bytes; a move
+of the reference costs the machine's rest, and is asked for only where the configuration allows it, no larger than
+needed, and rarely. State goes in and comes out; every decision says why.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import GapStatus
+from servotwin.messages import Ask, LongerWindow, Outcome, Probe
+
+_ROUNDING = 1e-6  # s: windows are whole numbers of samples
+_SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """What may be asked for, and when.
+
+    Parameters
+    ----------
+    after : int
+        Windows in a row without an estimate, for want of information, until something is asked for.
+    window, pre_trigger : float
+        s, of the windows asked for.
+    probe : float
+        m, the largest probing move; 0: none is asked for.
+    interval : float
+        s from one probing move to the next.
+    hold : float
+        s that a probing move stays away, and is watched after it came back.
+    strokes : int
+        How often it goes there and back.
+    margin : float
+        rad that it turns the screw beyond the gap. The estimator needs 0.5 deg pushed in each direction; the rest is
+        for the time that the loop takes to cross the gap.
+
+    Raises
+    ------
+    InvalidInput
+        A value is out of its range.
+    """
+
+    after: int = 2
+    window: float = 2.0
+    pre_trigger: float = 0.3
+    probe: float = 0.0
+    interval: float = 60.0
+    hold: float = 0.85
+    strokes: int = 1
+    margin: float = math.radians(5.0)
+
+    def __post_init__(self) -> None:
+        for name in ("after", "strokes"):
+            _check(name, getattr(self, name), "", getattr(self, name) >= 1, "1 or more")
+        for name, unit in {"window": "s", "interval": "s", "hold": "s", "margin": "rad"}.items():
+            _check(name, getattr(self, name), unit, getattr(self, name) > 0.0, "finite and greater than 0")
+        _check("pre_trigger", self.pre_trigger, "s", 0.0 <= self.pre_trigger < self.window, "0 or more, below window")
+        _check("probe", self.probe, "m", self.probe >= 0.0, "finite and 0 or more")
+
+
+class Stage(StrEnum):
+    """How far a request for something came."""
+
+    OPEN = "not asked for"
+    ASKED = "asked for"
+    TAKEN = "taken"
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one window said, and what is known when it did.
+
+    Attributes
+    ----------
+    time : float
+        s, on any steady clock.
+    status : GapStatus
+    long : bool
+        Whether it is of the length and pre-trigger that would be asked for, or was cut for a probing move.
+    upper : float
+        rad: the gap is at most this.
+    slack : float
+        m that the reference may move without an answer of the loop: both thresholds of the dead zone together; NaN: not
+        known.
+    """
+
+    time: float
+    status: GapStatus
+    long: bool
+    upper: float
+    slack: float = 0.0
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the policy remembers of one boot of the edge.
+
+    Attributes
+    ----------
+    misses : int
+        Windows in a row that told too little, since the last one that did not or the last thing asked for.
+    window, probing : Stage
+    probed : float
+        s, when the last probing move was asked for.
+    """
+
+    misses: int = 0
+    window: Stage = Stage.OPEN
+    probing: Stage = Stage.OPEN
+    probed: float = -math.inf
+
+    def rebooted(self) -> Memory:
+        """What is left of it after a boot of the edge: its windows are as configured again."""
+        return Memory(probed=self.probed)
+
+    def answered(self, ask: Ask, outcome: Outcome | None) -> Memory:
+        """After the edge's last word on a request; None: it never said anything.
+
+        What it does not allow is not asked for again.
+        """
+        refused = outcome in (Outcome.NOT_ALLOWED, Outcome.TOO_LARGE)
+        stage = Stage.REFUSED if refused else Stage.TAKEN if outcome is Outcome.TAKEN else Stage.OPEN
+        return replace(self, window=stage) if isinstance(ask, LongerWindow) else replace(self, probing=stage)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to ask for, and why, or why nothing."""
+
+    memory: Memory
+    ask: Ask | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class ExcitationPolicy:
+    """Asks for what would make the gap known.
+
+    Parameters
+    ----------
+    pitch : float
+        m/rad, travel per angle of the screw.
+    settings : ExcitationSettings
+    """
+
+    pitch: float
+    settings: ExcitationSettings
+
+    def look(self, memory: Memory, seen: Seen) -> Decision:
+        """Decide after one more window."""
+        if seen.status not in _SILENT:
+            known = seen.status is GapStatus.OK
+            why = "the window shows the gap" if known else "the window is at odds with the model, which no motion cures"
+            return Decision(replace(memory, misses=0), None, why)
+        memory = replace(memory, misses=memory.misses + 1)
+        if not seen.long and memory.window is not Stage.REFUSED:
+            return self._window(memory)
+        if memory.misses < self.settings.after:
+            return Decision(memory, None, self._missed(memory))
+        return self._probe(memory, seen)
+
+    def needed(self, seen: Seen) -> float:
+        """Size of a probing move, m: across the widest gap that is possible, and the margin beyond it.
+
+        Settled, the screw follows the reference but for the dead zone, whatever the gap; that the loop crosses the gap
+        within the hold takes an error of the gap's size.
+        """
+        return seen.slack + self.pitch * (seen.upper + self.settings.margin)
+
+    def _missed(self, memory: Memory) -> str:
+        return f"{memory.misses} of {self.settings.after} windows in a row tell too little of the gap"
+
+    def _window(self, memory: Memory) -> Decision:
+        """Shorter windows than could be had: they count until longer ones are asked for, and not against those."""
+        s = self.settings
+        if memory.window is not Stage.OPEN:
+            return Decision(replace(memory, misses=0), None, f"a longer window is {memory.window.value} already")
+        if memory.misses < s.after:
+            return Decision(memory, None, self._missed(memory))
+        why = f"{self._missed(memory)}: windows of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tell more"
+        asked = replace(memory, misses=0, window=Stage.ASKED)
+        return Decision(asked, LongerWindow(s.window, s.pre_trigger), why)
+
+    def _probe(self, memory: Memory, seen: Seen) -> Decision:
+        s, needed = self.settings, self.needed(seen)
+        why_not = self._why_not(memory, seen, needed)
+        if why_not:
+            return Decision(memory, None, f"{self._missed(memory)}, and {why_not}")
+        asked = replace(memory, misses=0, probing=Stage.ASKED, probed=seen.time)
+        why = f"{self._missed(memory)}: a move of {_mm(needed)} crosses a gap of {math.degrees(seen.upper):.3g} deg"
+        return Decision(asked, Probe(needed, s.hold, s.strokes), why)
+
+    def _why_not(self, memory: Memory, seen: Seen, needed: float) -> str:
+        """Why no probing move is asked for; empty where it may be."""
+        s, since = self.settings, seen.time - memory.probed
+        if s.probe == 0.0:
+            return "a probing move is not allowed"
+        if memory.probing is Stage.REFUSED:
+            return "this edge refuses probing moves"
+        if since < s.interval:
+            return f"the last probing move was asked for {since:.3g} s ago, where {s.interval:g} s must lie between two"
+        if not math.isfinite(needed):
+            return "neither gap nor dead zone are bounded well enough to say how large a probing move must be"
+        if needed > s.probe:
+            return f"a probing move must be {_mm(needed)}, where {_mm(s.probe)} are allowed"
+        return ""
+
+
+def long_enough(length: float, pre_trigger: float, settings: ExcitationSettings) -> bool:
+    """Whether a window is what would be asked for (s)."""
+    return length >= settings.window - _ROUNDING and pre_trigger >= settings.pre_trigger - _ROUNDING
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm"
+
+
+def _check(name: str, value: float, unit: str, accepted: bool, allowed: str) -> None:
+    if isinstance(value, bool) or not (math.isfinite(value) and accepted):
+        raise InvalidInput(f"excitation {name} = {value!r}{' ' if unit else ''}{unit}: must be {allowed}")
