@@ -7,13 +7,15 @@ import math
 import os
 import re
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from servotwin import scenariofile
 from servotwin.control.controller import Controller
-from servotwin.edge.parameters import Parameters, gains_of
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters, gains_of, with_gains
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import shortest_window
@@ -23,14 +25,15 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
 from servotwin.scenariofile import Recording
-from servotwin.tomltable import Table, did_you_mean, parse_toml, read_toml
+from servotwin.supervision import Guarding, guarding, start_of
+from servotwin.tomltable import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
 MOST_SAMPLES = 1e8  # some 10 GB of signals
-PRESETS = ("fig15", "fig15-sampled", "fig16", "calm")
+PRESETS = ("fig15", "fig15-sampled", "fig16", "calm", "certified")
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,21 @@ class Scenario:
     noise : Noise, optional
         On the measured position; needs a sampled controller.
     recording : Recording
-        Left open, a window holds 1 s from the change of the reference on. A loop without integral action is calm: the
-        screw turns back so late that a second often shows one side of the gap only. Its windows begin 0.3 s before the
-        change, or with the first sample, and hold 2 s. What `recording` says goes first.
+        Left open, a window holds 1 s from the change of the reference on. A loop with little or no integral action, as
+        the certified policy makes it, is calm: the screw turns back so late that a second often shows one side of the
+        gap only. Its windows begin 0.3 s before the change, or with the first sample, and hold 2 s. What `recording`
+        says goes first; limits that it leaves open are made for the policy where `supervision` is.
     uplink, downlink : LinkSettings
         Edge to twin, and back.
     twin : TwinSettings
         Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
+        Under the policy "certified" the loop begins, twin or no twin, on the fallback set, which is proved for every
+        gap of the stated range, unless `controller` has other gains than the servo's own, or `supervision` is given.
     supervision : Supervision, optional
         How the edge looks after itself; then updates may set gains too, in a box around the servo's own, and every
-        change leaves the voltage where it is. None: updates set the tolerance, at once, and the edge trusts them.
+        change leaves the voltage where it is. None: made for the policies that send gains, "certified" and
+        "hysteresis", from what is proved; under the others updates set the tolerance, at once, and the edge trusts
+        them.
     input_bias, friction : float
         What disturbs the plant: V on its input, and N m of Coulomb friction on the motor's shaft.
 
@@ -111,13 +119,13 @@ class Scenario:
         ------
         InvalidInput
             The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
-            is unstable on the servo even without a gap.
+            is unstable on the servo even without a gap, nothing is proved for the stated range.
         """
         return cls._from_table(read_toml(path), Path(path).parent)
 
     @classmethod
     def preset(cls, name: str) -> Scenario:
-        """One of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm"."""
+        """One of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm", "certified"."""
         if name not in PRESETS:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
@@ -127,9 +135,10 @@ class Scenario:
     @classmethod
     def _from_table(cls, table: Table, folder: Path) -> Scenario:
         values = scenariofile.read(table, folder)
-        with scenariofile.named(table):
+        with named(table):
             scenario = cls(**values)
             scenario.servo.check_loop(scenario.law)
+            scenario.agent_settings()
             return scenario
 
     def replace(self, **changes: Any) -> Scenario:
@@ -150,9 +159,41 @@ class Scenario:
         return self.servo.controller if self.controller is None else self.controller
 
     @property
+    def model(self) -> Servo:
+        """The servo with the controller that runs: what the twin designs for."""
+        return self.servo.replace(controller=self.law)
+
+    @cached_property
+    def guarding(self) -> Guarding | None:
+        """What the edge is given where the scenario leaves its supervision to the policy; None: nothing.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is proved for the whole stated range.
+        """
+        noise = 0.0 if self.noise is None else self.noise.std
+        return None if self.supervision is not None else guarding(self.model, self.twin, noise)
+
+    @property
+    def start(self) -> Parameters:
+        """What the edge runs before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
+        if self.twin.policy == "certified":
+            fallback = guarded.supervision.fallback if guarded is not None and own else None
+            return Parameters() if fallback is None else start_of(fallback)
+        k_dz = 1.0 if self.twin.k_dz is None else self.twin.k_dz
+        return Parameters(tolerance=self.servo.tolerance_for(self.twin.initial_gap, k_dz))
+
+    @property
+    def start_law(self) -> Controller:
+        """The controller before the first update."""
+        return with_gains(self.law, self.start.gains)
+
+    @property
     def start_tolerance(self) -> float:
-        """Dead-zone half-width before the first update, m (Eq 21)."""
-        return self.servo.tolerance_for(self.twin.initial_gap, self.twin.k_dz)
+        """Dead-zone half-width before the first update, m."""
+        return self.start.tolerance
 
     @property
     def samples(self) -> int:
@@ -173,11 +214,35 @@ class Scenario:
 
     @property
     def calm(self) -> bool:
-        """Whether the loop has no integral action, and so nothing that makes it hunt through the gap."""
-        return self.law.Ki == 0.0
+        """Whether the loop has hardly any integral action, and so nothing that makes it hunt through the gap."""
+        return self.law.Ki == 0.0 or self.twin.policy == "certified"
 
     def agent_settings(self) -> AgentSettings:
-        """What the edge is told."""
+        """What the edge is told.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is proved for the whole stated range.
+        """
+        settings, guarded = dataclasses.replace(self._recorded(), parameters=self.start), self.guarding
+        if guarded is not None:
+            given = self.recording.limits
+            limits = guarded.limits if given == Limits() else given
+            return dataclasses.replace(
+                settings,
+                limits=limits,
+                controller=self.law,
+                own=guarded.middle if given == Limits() else gains_of(self.servo.controller),
+                supervision=guarded.supervision,
+            )
+        if self.supervision is not None:
+            own = gains_of(self.servo.controller)
+            return dataclasses.replace(settings, controller=self.law, own=own, supervision=self.supervision)
+        return settings
+
+    def _recorded(self) -> AgentSettings:
+        """The part that is about windows."""
         r = self.recording
         return AgentSettings(
             servo=self.name,
@@ -188,11 +253,7 @@ class Scenario:
             fine_angle=r.fine_angle,
             retry=r.retry,
             limits=r.limits,
-            parameters=Parameters(tolerance=self.start_tolerance),
             model_version=self.servo.version,
-            controller=None if self.supervision is None else self.law,
-            own=None if self.supervision is None else gains_of(self.servo.controller),
-            supervision=self.supervision or Supervision(),
         )
 
     def seed_of(self, source: str) -> int:
@@ -229,7 +290,7 @@ class Scenario:
 
     def _check_window(self) -> None:
         """The edge accepts the window's length, and the estimator finds enough in it."""
-        self.agent_settings()
+        self._recorded()
         needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
         if self.window < needed * (1.0 - 1e-9):
             raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from servotwin.control.controller import Controller
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import gains_of
 from servotwin.edge.settings import Supervision
-from servotwin.errors import InvalidInput
-from servotwin.identify import settingsfile
-from servotwin.identify.gap import METHODS
-from servotwin.identify.trend import TrendSettings
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
@@ -25,8 +20,8 @@ from servotwin.plant import servofile
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.tomltable import Table, given
-from servotwin.twin.settings import TwinSettings
+from servotwin.tomltable import Table, given, part
+from servotwin.twin import settingsfile as twinfile
 
 MM = 1e-3
 _GAINS = [key for key in servofile.CONTROLLER if key.symbol in Gains.__struct_fields__]
@@ -76,40 +71,19 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "seed": table.integer("seed", 0),
         "name": table.text("name", "servo"),
         "theta_d0": table.number("theta_d0_deg", 0.0) * DEG,
-        "reference": _read(table, "reference", _reference),
-        "gap": _read(table, "gap", _gap),
-        "recording": _read(table, "recording", _recording),
-        "twin": _read(table, "twin", _twin),
-        **_read(table, "disturbances", _disturbances),
+        "reference": part(table, "reference", _reference),
+        "gap": part(table, "gap", _gap),
+        "recording": part(table, "recording", _recording),
+        "twin": part(table, "twin", twinfile.twin),
+        **part(table, "disturbances", _disturbances),
     }
-    values["controller"] = _read(table, "controller", lambda t: _controller(t, servo.controller))
+    values["controller"] = part(table, "controller", lambda t: _controller(t, servo.controller))
     values["supervision"] = _supervision(table, values["controller"] or servo.controller)
-    values["noise"] = _read(table, "noise", _noise) if "noise" in table.values else None
-    values["uplink"], values["downlink"] = _read(table, "link", _links)
+    values["noise"] = part(table, "noise", _noise) if "noise" in table.values else None
+    values["uplink"], values["downlink"] = part(table, "link", _links)
     table.table("noise")
     table.done()
     return values
-
-
-@contextmanager
-def named(table: Table) -> Iterator[None]:
-    """Let what a constructor refuses be known by its file and table."""
-    try:
-        yield
-    except InvalidInput as error:
-        if str(error).startswith(table.source):
-            raise
-        where = f"{table.source}: [{table.name}]" if table.name else table.source
-        raise InvalidInput(f"{where}: {error}") from None
-
-
-def _read(table: Table, key: str, read: Callable[[Table], Any]) -> Any:
-    """One table of the file, read to its last key."""
-    inner = table.table(key)
-    with named(inner):
-        value = read(inner)
-    inner.done()
-    return value
 
 
 def _servo(table: Table, folder: Path) -> Servo:
@@ -188,7 +162,7 @@ def _noise(table: Table) -> Noise:
 def _links(table: Table) -> tuple[LinkSettings, LinkSettings]:
     """Edge to twin and back: [link] for both, [link.up] and [link.down] for what differs."""
     both = _link(table, LinkSettings())
-    return _read(table, "up", lambda t: _link(t, both)), _read(table, "down", lambda t: _link(t, both))
+    return part(table, "up", lambda t: _link(t, both)), part(table, "down", lambda t: _link(t, both))
 
 
 def _link(table: Table, default: LinkSettings) -> LinkSettings:
@@ -221,7 +195,7 @@ def _recording(table: Table) -> Recording:
         pre_trigger=table.number("pre_trigger_s", None, minimum=0.0),
         fine_angle=table.boolean("fine_angle", default.fine_angle),
         retry=_retry(table, default.retry),
-        limits=_read(table, "limits", edgefile.limits),
+        limits=part(table, "limits", edgefile.limits),
     )
 
 
@@ -242,7 +216,7 @@ def _supervision(table: Table, controller: Controller) -> Supervision | None:
         changed = given(inner, {key.name: (key.symbol, key.read) for key in _GAINS})
         return gains_of(controller.replace(**changed))
 
-    return cast(Supervision, _read(table, "edge", lambda inner: edgefile.supervision(inner, gains)))
+    return part(table, "edge", lambda inner: edgefile.supervision(inner, gains))
 
 
 def _disturbances(table: Table) -> dict[str, float]:
@@ -250,33 +224,3 @@ def _disturbances(table: Table) -> dict[str, float]:
         "input_bias": table.number("input_bias_v", 0.0),
         "friction": table.number("friction_n_m", 0.0, minimum=0.0),
     }
-
-
-def _twin(table: Table) -> TwinSettings:
-    default = TwinSettings()
-    method = table.text("method", default.method, choices=tuple(METHODS))
-    limit = table.number("gap_limit_deg", None, minimum=0.0)
-    return TwinSettings(
-        enabled=table.boolean("enabled", True),
-        method=method,
-        estimator=_read(table, "estimator", lambda inner: settingsfile.read(inner, method)),
-        k_dz=table.number("k_dz", default.k_dz, minimum=0.0),
-        smoothing=table.number("smoothing", default.smoothing, minimum=0.0, maximum=1.0),
-        initial_gap=table.number("initial_gap_deg", 0.0, minimum=0.0) * DEG,
-        trend=_read(table, "trend", _trend),
-        gap_limit=None if limit is None else limit * DEG,
-        processing=table.number("processing_s", default.processing, minimum=0.0),
-        validity=table.number("validity_s", default.validity, positive=True),
-        retry=table.number("retry_s", default.retry, positive=True),
-        attempts=table.integer("attempts", default.attempts, minimum=1),
-    )
-
-
-def _trend(table: Table) -> TrendSettings:
-    """How far (`wear_deg`) the gap may grow within how long (`over_s`)."""
-    if not table.values:
-        table.number("wear_deg", None)
-        table.number("over_s", None)
-        return TrendSettings()
-    gap, over = table.number("wear_deg", positive=True), table.number("over_s", positive=True)
-    return TrendSettings.for_wear(gap * DEG, over)

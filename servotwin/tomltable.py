@@ -9,7 +9,8 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -17,6 +18,7 @@ from typing import Any, TypeVar, cast
 from servotwin.errors import InvalidInput
 
 _Default = TypeVar("_Default")
+_Value = TypeVar("_Value")
 
 
 class _Required:
@@ -206,6 +208,27 @@ def given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
     """What a table gives of these keys, by the names they set."""
     table._asked.update(readers)
     return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
+
+
+@contextmanager
+def named(table: Table) -> Iterator[None]:
+    """Let what a constructor refuses be known by its file and table."""
+    try:
+        yield
+    except InvalidInput as error:
+        if str(error).startswith(table.source):
+            raise
+        where = f"{table.source}: [{table.name}]" if table.name else table.source
+        raise InvalidInput(f"{where}: {error}") from None
+
+
+def part(table: Table, key: str, read: Callable[[Table], _Value]) -> _Value:
+    """What `read` makes of an inner table, read to its last key."""
+    inner = table.table(key)
+    with named(inner):
+        value = read(inner)
+    inner.done()
+    return value
 
 
 def read_toml(path: str | os.PathLike[str]) -> Table:

@@ -31,6 +31,7 @@ SLOW = LinkSettings(delay_s=1.0)
 def short(**changes) -> Scenario:
     """A gap of 10 deg, steps of 1 mm at 0 and 5 s, the paper's delays."""
     values = {"reference": SquareWave(1e-3, 10.0), "gap": GAP, "uplink": SLOW, "downlink": SLOW, "duration": 9.0}
+    values["twin"] = TwinSettings(policy="paper")
     return Scenario(PAPER, **{**values, **changes})
 
 
@@ -59,7 +60,7 @@ def test_an_update_lands_three_seconds_after_the_reference_step(controller):
 
 @pytest.mark.parametrize(("method", "error_deg"), [("paper", 0.6), ("whitened", 0.02)])
 def test_the_estimate_is_near_the_truth_and_eq_21_follows_it(method, error_deg):
-    loop = cosimulate(short(twin=TwinSettings(method=method)))
+    loop = cosimulate(short(twin=TwinSettings(policy="paper", method=method)))
     for update, estimate in zip(loop.updates, loop.estimates, strict=True):
         assert abs(update.gap - GAP) < math.radians(error_deg)
         assert update.gap == estimate.gap
@@ -70,7 +71,7 @@ def test_the_estimate_is_near_the_truth_and_eq_21_follows_it(method, error_deg):
 
 def test_the_twin_settles_what_oscillates_without_it():
     with_twin = cosimulate(short(duration=30.0, reference=1e-3)).run
-    alone = cosimulate(short(duration=30.0, reference=1e-3, twin=TwinSettings(enabled=False))).run
+    alone = cosimulate(short(duration=30.0, reference=1e-3, twin=TwinSettings(policy="paper", enabled=False))).run
     last = slice(-25000, None)
     assert measures.amplitude(alone.position[last]) > 0.1e-3
     assert measures.amplitude(with_twin.position[last]) < 1e-6
@@ -84,7 +85,7 @@ def test_the_law_starts_linear_when_nothing_is_known():
 
 @pytest.mark.parametrize("controller", [None, SAMPLED], ids=["continuous", "sampled"])
 def test_a_twin_switched_off_is_a_plain_simulation(controller):
-    off = TwinSettings(enabled=False, initial_gap=GAP)
+    off = TwinSettings(policy="paper", enabled=False, initial_gap=GAP)
     loop = cosimulate(short(twin=off, controller=controller))
     tolerance = PAPER.tolerance_for(GAP)
     alone = simulate(PAPER, 9.0, controller=controller, reference=SquareWave(1e-3, 10.0), gap=GAP, tolerance=tolerance)
@@ -126,7 +127,7 @@ def test_the_digest_sees_every_difference(change):
 @pytest.mark.parametrize("controller", [None, SAMPLED], ids=["continuous", "sampled"])
 def test_no_fate_of_the_link_breaks_the_order(seed, controller):
     recording = Recording(retry=Retry(1.5, 2.0, 4.0))
-    twin = TwinSettings(retry=1.5, attempts=10)
+    twin = TwinSettings(policy="paper", retry=1.5, attempts=10)
     scenario = short(seed=seed, controller=controller, uplink=HOSTILE, downlink=HOSTILE, recording=recording, twin=twin)
     loop = cosimulate(scenario)
     versions = [receipt.version for receipt in loop.applied]
@@ -149,7 +150,7 @@ def test_a_lost_update_and_a_lost_acknowledgement_are_made_good():
 
 
 def test_an_update_that_comes_too_late_is_refused():
-    loop = cosimulate(short(duration=5.0, twin=TwinSettings(validity=2.5)))
+    loop = cosimulate(short(duration=5.0, twin=TwinSettings(policy="paper", validity=2.5)))
     assert [receipt.reason for receipt in loop.receipts] == [Reason.EXPIRED]
     assert not loop.run.tolerance.any()
 
@@ -162,7 +163,7 @@ def test_an_update_out_of_bounds_is_refused():
 
 
 def test_the_twins_processing_delays_the_update_alone():
-    loop = cosimulate(short(duration=5.0, twin=TwinSettings(processing=0.5)))
+    loop = cosimulate(short(duration=5.0, twin=TwinSettings(policy="paper", processing=0.5)))
     sent = {type(m.message): m.sent for m in loop.messages if m.direction == "down"}
     assert sent == {Acknowledge: 2.0, Update: 2.5}
     assert loop.receipts[0].sample == 17500

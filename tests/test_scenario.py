@@ -29,7 +29,7 @@ size_mm = 1.0
 [gap]
 total_deg = 10.0
 """
-PAPER = "[twin]\nmethod = 'paper'\n"
+PAPER = "[twin]\npolicy = 'paper'\nmethod = 'paper'\n"
 
 
 def load(tmp_path, text):
@@ -70,7 +70,7 @@ def test_fig16_adds_noise_and_filters_to_the_sampled_loop():
 
 
 def test_an_unknown_preset_is_named():
-    with pytest.raises(InvalidInput, match=r"'fig51'.*fig15, fig15-sampled, fig16, calm"):
+    with pytest.raises(InvalidInput, match=r"'fig51'.*fig15, fig15-sampled, fig16, calm, certified"):
         Scenario.preset("fig51")
     assert all(Scenario.preset(name).name == name for name in PRESETS)
 

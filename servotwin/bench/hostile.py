@@ -165,7 +165,7 @@ def scenario(machine: Case, band: Band | None, seed: int) -> Scenario:
         theta_d0=machine.theta_d0,
         controller=calm(machine.servo),
         recording=Recording(RATE, window=1.0, pre_trigger=0.0, limits=limits),
-        twin=TwinSettings(k_dz=0.0),
+        twin=TwinSettings(policy="paper", k_dz=0.0),
         supervision=None if band is None else Supervision(fallback),
         input_bias=machine.input_bias,
         friction=machine.friction,

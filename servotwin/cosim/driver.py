@@ -114,8 +114,8 @@ class Cosimulation:
         self.machine = machine
         self.agent = Agent(scenario.agent_settings())
         self.store = MemoryStore()
-        start = InForce(scenario.law, scenario.start_tolerance)
-        self.twin = twin or Twin.of(scenario.name, scenario.servo, self.store, scenario.twin, estimator, start)
+        start = InForce(scenario.start_law, scenario.start_tolerance)
+        self.twin = twin or Twin.of(scenario.name, scenario.model, self.store, scenario.twin, estimator, start)
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
@@ -238,7 +238,7 @@ def simulation_of(scenario: Scenario) -> Simulation:
     return Simulation(
         scenario.servo,
         scenario.duration,
-        controller=scenario.law,
+        controller=scenario.start_law,
         reference=scenario.reference,
         gap=scenario.gap,
         tolerance=scenario.start_tolerance,

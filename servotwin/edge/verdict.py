@@ -17,14 +17,19 @@ class Verdict(NamedTuple):
 
 
 def judged_by(predicted: Band | None, certified: Band | None) -> Band | None:
-    """What the loop is held to: error and settling are certified at worst, the effort is what its gains predict."""
+    """What the loop is held to: error and settling are certified at worst, the effort is what its gains predict.
+
+    A smaller error counts where the loop is predicted to come to it as soon as to what is certified.
+    """
     if predicted is None or certified is None:
         return predicted or certified
+    if predicted.settling > certified.settling:
+        return Band(certified.error, certified.error_rms, predicted.effort, certified.settling)
     return Band(
         min(predicted.error, certified.error),
         min(predicted.error_rms, certified.error_rms),
         predicted.effort,
-        min(predicted.settling, certified.settling),
+        predicted.settling,
     )
 
 

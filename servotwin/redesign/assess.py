@@ -20,7 +20,7 @@ STILL = 1e-6
 """m: half peak-to-peak of the error below which a loop counts as settled."""
 
 NEAR = 0.02
-"""Share of a step within which the loop has arrived."""
+"""Share of the largest step within which the loop has arrived."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Outcome:
     overshoot : array
         Beyond where it ends, per step and error at the end: what an input bias leaves is not overshoot.
     settling : array
-        s, last time at which the error exceeds 2 % of the step and what an input bias leaves.
+        s, last time at which the error is beyond `nearness`.
     cost : array
         s, integral of abs(error) over the whole run, per step.
     saturated : array of bool
@@ -93,7 +93,7 @@ def assess(settings: Sequence[Setting], members: Members, trial: Trial) -> list[
         trial.duration,
         Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias),
         trial.last,
-        {"error": np.stack([_near(setting, members) for setting in settings])},
+        {"error": np.stack([nearness(setting, members.input_bias, members.step.max()) for setting in settings])},
         ("error", "voltage"),
         trial.rate,
         trial.threads,
@@ -105,10 +105,14 @@ def assess(settings: Sequence[Setting], members: Members, trial: Trial) -> list[
     ]
 
 
-def _near(setting: Setting, members: Members) -> Array:
-    """(P, C) m: an error within which the loop is where it is to be, what an input bias leaves included."""
-    left = np.abs(members.input_bias + setting.controller.feedforward) / abs(setting.controller.Kp)
-    return np.maximum(NEAR * members.step, STILL) + left
+def nearness(setting: Setting, input_bias: Array, step: float) -> Array:
+    """m: an error within which the loop is where it is to be, for each input bias (V) and the largest step (m).
+
+    That is 2 % of the step, what an input bias leaves where nothing integrates, and the dead zone.
+    """
+    law = setting.controller
+    left = np.abs(input_bias + law.feedforward) / abs(law.Kp)
+    return np.asarray(max(NEAR * step, STILL) + left + law.leave * setting.tolerance)
 
 
 def _of(figures: Figures, setting: int) -> Figures:

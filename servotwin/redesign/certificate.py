@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from servotwin.redesign.setting import Setting
@@ -19,6 +20,8 @@ class Demands:
         Least share of the members that settle.
     overshoot : float
         Largest overshoot of a member, per step.
+    tail, tolerance : float
+        m: largest error of a member in the last part, widest dead zone.
     scales : tuple of float
         Factors on Kp and Kd.
     integral : tuple of float
@@ -38,6 +41,8 @@ class Demands:
     Ms: float = 2.0
     settled: float = 0.99
     overshoot: float = 0.3
+    tail: float = math.inf
+    tolerance: float = math.inf
     scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     integral: tuple[float, ...] = (0.0, 0.01, 0.05)
     bias_known: float = 0.01
@@ -69,7 +74,10 @@ class Certificate:
     overshoot : float
         Worst, per step.
     settling, settling_worst : float
-        s until the error stays below 2 % of the step: the 95th percentile, and the worst.
+        s until the error stays below 2 % of the largest step, what the input bias leaves and the dead zone: the 95th
+        percentile, and the worst.
+    within : float
+        m: that error, where it is largest.
     Ms, crossover, phase_margin : float
         Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad.
     saturated : bool
@@ -94,6 +102,7 @@ class Certificate:
     overshoot: float
     settling: float
     settling_worst: float
+    within: float
     Ms: float
     crossover: float
     phase_margin: float

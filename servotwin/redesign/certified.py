@@ -18,7 +18,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
-from servotwin.redesign.assess import Outcome, Trial, assess
+from servotwin.redesign.assess import Outcome, Trial, assess, nearness
 from servotwin.redesign.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.setting import Setting
 from servotwin.redesign.uncertainty import Members, Uncertainty, draw
@@ -99,7 +99,7 @@ def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, n
     hysteretic = [
         Setting(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
-    return plain + hysteretic if zone > 0.0 and noisy else plain
+    return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
 
 
 @lru_cache(maxsize=16)
@@ -129,6 +129,7 @@ def _ranked(candidates: list[Setting], members: Members, trial: Trial, demands: 
 
     def place(k: int) -> tuple[bool, float]:
         fails = float(np.mean(outcomes[k].settled)) < demands.settled or outcomes[k].overshoot.max() > demands.overshoot
+        fails = fails or bool(outcomes[k].tail.max() > demands.tail)
         return fails, _cost(candidates[k], outcomes[k], demands, noise)
 
     return [candidates[k] for k in sorted(range(len(candidates)), key=place)]
@@ -165,6 +166,7 @@ def _certificate(
         overshoot=float(outcome.overshoot.max()),
         settling=float(np.percentile(outcome.settling, 95.0)),
         settling_worst=float(outcome.settling.max()),
+        within=float(np.max(nearness(setting, np.array(uncertainty.input_bias), uncertainty.step[1]))),
         Ms=loop.Ms,
         crossover=crossover.omega,
         phase_margin=crossover.phase_margin,
@@ -178,6 +180,8 @@ def _shortcoming(tried: Certificate, demands: Demands) -> str:
     """What is missing, in words; empty: nothing."""
     if tried.settled < demands.settled:
         return f"settles on {100.0 * tried.settled:.1f} % of the members, and {100.0 * demands.settled:g} % are asked"
+    if tried.tail > demands.tail:
+        return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * demands.tail:.3g} mm are allowed"
     if tried.overshoot > demands.overshoot:
         return f"overshoots by {100.0 * tried.overshoot:.0f} %, and {100.0 * demands.overshoot:.0f} % are allowed"
     return ""

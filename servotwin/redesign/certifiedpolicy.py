@@ -62,6 +62,8 @@ class CertifiedPolicy:
     def redesign(self, evidence: Evidence) -> Redesign:
         """The proved setting for the evidence; without one the fallback set, and why.
 
+        Nothing is sent that may leave the fallback set's band: that is what the edge holds the loop to. Nor is anything
+        where the gap may be wider than the stated range: not even the fallback set is proved there.
         Where nothing may stand on the window's own estimate, what it says of the input bias still counts, with the gap
         as the trend knows it.
         """
@@ -71,14 +73,16 @@ class CertifiedPolicy:
         gap = self._gap(estimate, evidence.trend)
         if gap[1] > self.uncertainty.gap[1]:
             low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
-            reason = f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified"
-            return self._fallen_back(evidence, reason)
+            reason = (
+                f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
+            )
+            return Redesign(None, math.nan, reason)
         feedforward, bias = self._input_bias(evidence)
         noise = _noise(evidence)
         found = certify(
             self.servo,
             self.uncertainty.replace(gap=gap, input_bias=bias),
-            self.demands,
+            self.held(),
             self.trial,
             feedforward,
             noise,
@@ -89,6 +93,12 @@ class CertifiedPolicy:
         if _in_force(found.setting, evidence):
             return Redesign(None, estimate.gap, "what was proved is in force already", certificate=found)
         return _sent(found, noise, estimate.gap, "")
+
+    def held(self) -> Demands:
+        """The demands, and the fallback set's band; a dead zone opens the loop inside of it only."""
+        proved, leave = self.fallback(), max((leave for _, leave in self.demands.hysteresis), default=1.0)
+        tolerance = min(self.demands.tolerance, band_of(proved).error / leave)
+        return replace(self.demands, tail=min(self.demands.tail, proved.tail), tolerance=tolerance)
 
     def fallback(self) -> Certificate:
         """What holds for every gap and bias of the stated range, whatever is estimated.
@@ -146,11 +156,13 @@ def _in_force(setting: Setting, evidence: Evidence) -> bool:
 
 
 def band_of(proved: Certificate, noise: float = 0.0) -> Band:
-    """What the loop stays within once it has arrived: the worst member's tail, what is left of a step, and noise (m)."""
-    rest = NEAR * proved.step[1] + noise
-    error = proved.tail + rest
-    effort = proved.effort + abs(proved.setting.controller.Kp) * rest
-    return Band(error, error, effort, math.ceil(proved.settling_worst))
+    """What the loop stays within once it has arrived, `noise` (m rms) included.
+
+    The members are some of all machines there are: it may take half as long again as the slowest of them took.
+    """
+    error = max(proved.within, proved.tail) + noise
+    effort = proved.effort + abs(proved.setting.controller.Kp) * (NEAR * proved.step[1] + noise)
+    return Band(error, error, effort, math.ceil(1.5 * proved.settling_worst))
 
 
 @lru_cache(maxsize=16)

@@ -10,6 +10,12 @@ from servotwin.errors import InvalidInput
 from servotwin.identify import whitened
 from servotwin.identify.gap import settings_of
 from servotwin.identify.trend import TrendSettings
+from servotwin.redesign.certificate import Demands
+from servotwin.redesign.uncertainty import Uncertainty
+from servotwin.tomltable import did_you_mean
+
+POLICIES = ("certified", "margin", "hysteresis", "paper")
+_OWNERS = {"k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
 
 
 @dataclass(frozen=True)
@@ -25,10 +31,19 @@ class TwinSettings:
     estimator : object, optional
         Settings of that estimator; None: its defaults. Those of "whitened" must leave `combine` off, as the trend joins
         the windows already; where their `gap_rate` is 0, it is taken from the trend.
-    k_dz : float
-        Dead-zone gain of Eq 21.
-    smoothing : float
-        Share of the previous gap that the policy keeps at each update, 0 up to, but not including, 1.
+    policy : str
+        What makes a setting of an estimate: "certified" sends what it has proved, "margin" and "hysteresis" set a dead
+        zone, "paper" is Eq 21.
+    uncertainty : Uncertainty
+        How wrong the model may be, and the stated range of gaps, steps and input bias: what "certified" proves settings
+        for. "margin" needs the steps.
+    demands : Demands
+        What a certified setting must show.
+    k_dz, smoothing : float, optional
+        Of "paper": the dead-zone gain of Eq 21, 1 unless given; the share of the previous gap that is kept at each
+        update, 0 unless given, below 1.
+    k_noise : float, optional
+        Of "margin": tolerances per standard deviation of the measurement's noise.
     initial_gap : float
         rad; what is believed before the first estimate (section 4.2: zero).
     trend : TrendSettings
@@ -47,14 +62,19 @@ class TwinSettings:
     Raises
     ------
     InvalidInput
-        A value is not a finite number in its range, the method does not exist, the settings are another method's.
+        A value is not a finite number in its range, the method or the policy does not exist, the settings are another
+        method's or another policy's.
     """
 
     enabled: bool = True
     method: str = whitened.METHOD
     estimator: Any = None
-    k_dz: float = 1.0
-    smoothing: float = 0.0
+    policy: str = POLICIES[0]
+    uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
+    demands: Demands = field(default_factory=Demands)
+    k_dz: float | None = None
+    smoothing: float | None = None
+    k_noise: float | None = None
     initial_gap: float = 0.0
     trend: TrendSettings = field(default_factory=TrendSettings)
     gap_limit: float | None = None
@@ -64,7 +84,8 @@ class TwinSettings:
     attempts: int = 4
 
     def __post_init__(self) -> None:
-        for name, unit in {"k_dz": "", "initial_gap": " rad", "processing": " s"}.items():
+        self._check_policy()
+        for name, unit in {"initial_gap": " rad", "processing": " s"}.items():
             _check(name, getattr(self, name), unit, "finite and 0 or more", lambda x: x >= 0.0)
         for name, unit in {"validity": " s", "retry": " s"}.items():
             _check(name, getattr(self, name), unit, "finite and greater than 0", lambda x: x > 0.0)
@@ -74,6 +95,19 @@ class TwinSettings:
             _check("gap_limit", self.gap_limit, " rad", "finite and 0 or more", lambda x: x >= 0.0)
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False, as the trend already joins the windows")
+
+    def _check_policy(self) -> None:
+        """The policy exists, and has what is set of it."""
+        if self.policy not in POLICIES:
+            hint = did_you_mean(str(self.policy), POLICIES)
+            raise InvalidInput(f"twin policy = {self.policy!r} does not exist{hint}; give one of {', '.join(POLICIES)}")
+        for name, owner in _OWNERS.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if owner != self.policy:
+                raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
+            _check(name, value, "", "finite and 0 or more", lambda x: x >= 0.0)
 
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""

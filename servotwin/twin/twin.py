@@ -19,9 +19,10 @@ from servotwin.messages import Acknowledge, Fallback, Hello, InvalidMessage, Mes
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.evidence import UNASKED, Evidence
-from servotwin.redesign.policy import PaperPolicy, Policy, Redesign
+from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.decode import decode_window
 from servotwin.twin.inforce import InForce, Settings, gains_of
+from servotwin.twin.policies import policy_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
@@ -90,9 +91,10 @@ class Twin:
     ) -> Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs.
 
+        The model's controller is the one that runs: policies design for it.
         Without `start` the edge is taken to begin with the servo's own controller.
         """
-        policy = PaperPolicy(servo, settings.k_dz, settings.smoothing)
+        policy = policy_of(servo, settings)
         begins = start or InForce(servo.controller)
         chosen = estimator or estimator_of(servo, settings)
         return cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins)
