@@ -16,6 +16,7 @@ from servotwin.plant.noise import NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.run import Inputs, quantised
+from servotwin.simulation.splice import about
 from servotwin.simulation.swap import Place, swapped
 
 _NOISE_BLOCK = 4096
@@ -105,6 +106,13 @@ class ContinuousEngine:
         """A constant tolerance from now on."""
         self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
 
+    def set_reference(self, reference: PiecewiseCubic) -> None:
+        """Another reference from now on, which the inputs hold already; a higher degree needs another automaton."""
+        now = about(reference, self.index / self.inputs.sample_rate)
+        if len(self.loop.input_values("reference", now)) <= degree(reference):
+            self.set_controller(self.controller, None)
+        self.trajectory.set(self.loop.input_values("reference", now))
+
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
         """Another controller from now on, the voltage going on where it is; a constant tolerance unless None."""
         _refuse_rate_limit(controller)
@@ -179,13 +187,4 @@ def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float)
 
 def at_zero(pieces: PiecewiseCubic) -> Array:
     """Ascending coefficients, about time 0, of the piece in force there."""
-    piece = max(int(np.searchsorted(pieces.times, 0.0, side="right")) - 1, 0)
-    shift, c = -pieces.times[piece], pieces.coeffs[piece]
-    return np.array(
-        [
-            ((c[3] * shift + c[2]) * shift + c[1]) * shift + c[0],
-            (3.0 * c[3] * shift + 2.0 * c[2]) * shift + c[1],
-            3.0 * c[3] * shift + c[2],
-            c[3],
-        ]
-    )
+    return about(pieces, 0.0)

@@ -28,6 +28,7 @@ from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, t
 from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.run import Inputs, quantised
 from servotwin.simulation.ticks import Drive, Output, Port, run_ticks, tick_and_record
@@ -187,6 +188,9 @@ class SampledEngine:
 
     def set_tolerance(self, _tolerance: float) -> None:
         """Nothing to do: the ticks to come read the inputs."""
+
+    def set_reference(self, _reference: PiecewiseCubic) -> None:
+        """Nothing to do either."""
 
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
         """Another controller from the tick that is due on, its voltage at that tick the same; a constant tolerance

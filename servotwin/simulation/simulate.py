@@ -12,10 +12,11 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.run import Inputs, Run, quantised
 from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.splice import spliced
 
 SAMPLE_RATE = 5000.0
 
@@ -27,6 +28,7 @@ class Engine(Protocol):
     def index(self) -> int: ...
     def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
+    def set_reference(self, reference: PiecewiseCubic) -> None: ...
     def set_controller(self, controller: Controller, tolerance: float | None) -> None: ...
     def channel(self, name: str, first: int, last: int) -> Array: ...
     def events(self) -> list[tuple[float, str, int, bool]]: ...
@@ -127,6 +129,15 @@ class Simulation:
         self._check_tolerance(tolerance)
         self.inputs.retune(self.time, tolerance)
         self.engine.set_tolerance(tolerance)
+
+    def set_reference(self, reference: SignalLike) -> None:
+        """Another reference (m, number or signal on the run's own time) from the present sample on.
+
+        It replaces whatever was planned; what it does before the present sample does not matter.
+        """
+        horizon = (self.samples - 1) / self.inputs.sample_rate
+        self.inputs.reference = spliced(self.inputs.reference, as_pieces(reference, horizon), self.time)
+        self.engine.set_reference(self.inputs.reference)
 
     def set_controller(self, controller: Controller, tolerance: float | None = None) -> None:
         """Another controller from the present sample on, without a jump of the voltage.
