@@ -210,7 +210,8 @@ class Scenario:
     def pre_trigger(self) -> float:
         """How much of a window lies before the change of the reference, s."""
         given = self.recording.pre_trigger
-        return given if given is not None else (CALM_PRE_TRIGGER if self.calm else 0.0)
+        fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
+        return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
 
     @property
     def calm(self) -> bool:

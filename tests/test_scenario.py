@@ -117,6 +117,7 @@ to_s = 2
 loss = 0.2
 jitter_s = 0.3
 [twin]
+policy = "paper"
 method = "paper"
 k_dz = 1.5
 initial_gap_deg = 4
@@ -217,7 +218,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ),
         ("[gap]", f"[recording]\nwindow_s = 0.25\n{PAPER}[gap]", "window = 0.25 s is too short for the observer"),
         ("[gap]", "[recording]\nwindow_s = 0.90001\n[gap]", "must be a whole number of samples"),
-        ("[gap]", "[recording]\npre_trigger_s = 1.0\n[gap]", "pre_trigger_s = 1.0 s"),
+        ("[gap]", "[recording]\npre_trigger_s = 2.0\n[gap]", "pre_trigger_s = 2.0 s"),
         ("[gap]", "[link]\nloss = 1.5\n[gap]", "link.loss = 1.5 is not allowed"),
         ("[gap]", "[link]\ndelay_ms = 5\n[gap]", "unknown key 'link.delay_ms' (did you mean 'delay_s'?)"),
         ("[gap]", "[link.up]\nloss = 'no'\n[gap]", "link.up.loss = 'no' is not allowed"),
@@ -319,7 +320,9 @@ def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path,
     calm = SHORT.replace("[gap]", f"[recording]\n{recording}\n[controller]\nki_v_per_m_s = 0\n[gap]")
     agent = load(tmp_path, calm).agent_settings()
     assert (agent.window_s, agent.pre_trigger_s) == (window, pre_trigger)
-    usual = load(tmp_path, SHORT).agent_settings()
+    certified = load(tmp_path, SHORT.replace("[gap]", f"[recording]\n{recording}\n[gap]")).agent_settings()
+    assert (certified.window_s, certified.pre_trigger_s) == (window, pre_trigger)
+    usual = load(tmp_path, SHORT + PAPER).agent_settings()
     assert (usual.window_s, usual.pre_trigger_s) == (1.0, 0.0)
 
 
@@ -398,9 +401,10 @@ def test_the_edge_looks_after_itself_as_a_scenario_says(tmp_path):
 
 
 def test_without_an_edge_table_updates_set_the_tolerance_only(tmp_path):
-    scenario = load(tmp_path, SHORT)
-    assert scenario.supervision is None
-    assert scenario.agent_settings().controller is None
+    for policy in ("paper", "margin"):
+        scenario = load(tmp_path, SHORT + f"[twin]\npolicy = '{policy}'\n")
+        assert scenario.supervision is None
+        assert scenario.agent_settings().controller is None
     watchful = load(tmp_path, SHORT + "[edge]\nwatched = false\n")
     assert watchful.agent_settings().supervision == Supervision(watch=None)
 
