@@ -2,17 +2,23 @@
 
 It records, cuts a window after each change of the reference, repeats it until the twin acknowledges it, and lets its
 supervisor decide about parameters. It does not control: whoever ticks the law asks `parameters` before each sample, or
-`controller` where updates may set gains, and carries its state over by `servotwin.control.law.transfer`.
+`controller` where updates may set gains, and carries its state over by `servotwin.control.law.transfer`; it gives the
+law the wanted position plus `offset`, which is zero but for a probing move that the twin has requested and the edge's
+settings allow. Such a move begins while the reference rests, ends by itself, and ends at once when the reference moves.
 """
 
 from array import array
 from collections import Counter
+from dataclasses import replace
 from itertools import chain, pairwise
 from math import ceil, inf
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
+from servotwin.edge.desk import Granted, decide
+from servotwin.edge.guard import Instant
 from servotwin.edge.parameters import Parameters, with_gains
+from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import Store
@@ -23,9 +29,11 @@ from servotwin.link.session import Sender
 from servotwin.messages import (
     Acknowledge,
     Channel,
+    Fallback,
     Hello,
     InvalidMessage,
     Message,
+    Request,
     Update,
     Window,
     checksum,
@@ -45,6 +53,14 @@ class Outgoing(NamedTuple):
 
     sample: int
     message: Message
+
+
+class Opened(NamedTuple):
+    """A window that is being recorded, samples first .. last - 1, and why."""
+
+    first: int
+    last: int
+    reason: str
 
 
 class Agent:
@@ -68,12 +84,14 @@ class Agent:
         self.outbox = MemoryOutbox() if outbox is None else outbox
         self.windows_cut = 0
         self._sender = Sender(self.outbox, settings.retry)
-        self._recorder = Recorder(tuple(CHANNELS), max(settings.window_samples + 1, settings.period_samples))
+        capacity = max(settings.longest_samples + 1, settings.period_samples, settings.rest_samples)
+        self._recorder = Recorder(tuple(CHANNELS), capacity)
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outbox.pending():
             self._supervisor.asked(0.0)
-        self._reference = settings.reference
-        self._first: int | None = None
+        self._granted = Granted(settings.window_samples, settings.pre_trigger_samples)
+        self._reference = self._expected = settings.reference
+        self._opened: Opened | None = None
         self._unusable: Counter[str] = Counter()
         self._deadline = self._next_deadline()
 
@@ -87,6 +105,21 @@ class Agent:
         """The controller with the gains in force; None where updates set the tolerance only."""
         configured = self.settings.controller
         return None if configured is None else with_gains(configured, self.parameters.gains)
+
+    @property
+    def probe(self) -> ProbingMove | None:
+        """The probing move under way."""
+        return self._granted.probe
+
+    @property
+    def offset(self) -> float:
+        """m, what the reference of the next sample is to be beside what is wanted."""
+        return 0.0 if self.probe is None else self.probe.offset(self.samples)
+
+    @property
+    def shortest_wait(self) -> int:
+        """Samples from a change of the reference to the end of its window."""
+        return self._granted.window - self._granted.pre_trigger
 
     @property
     def samples(self) -> int:
@@ -111,7 +144,7 @@ class Agent:
     def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[Outgoing]:
         """Take one sample (m, rad, m, V); returns what is to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
-        if reference != self._reference:
+        if reference != self._expected:
             self._reference_changed(reference)
         return self._act() if self._recorder.samples >= self._deadline else []
 
@@ -125,7 +158,7 @@ class Agent:
         while done < len(blocks[0]):
             stop = self._stop(blocks[0], done)
             self._recorder.extend(*(block[done:stop] for block in blocks))
-            if blocks[0][stop - 1] != self._reference:
+            if blocks[0][stop - 1] != self._expected:
                 self._reference_changed(blocks[0][stop - 1])
             if self.samples >= self._deadline:
                 sent += self._act()
@@ -138,6 +171,8 @@ class Agent:
             said = self._supervisor.offer(message)
             self._heard(message.servo)
             return [Outgoing(self.samples, each) for each in said]
+        if isinstance(message, Request):
+            return self._requested(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self._sender.acknowledged(message)
             self._heard(message.servo)
@@ -151,9 +186,9 @@ class Agent:
     def _stop(self, reference: "array[float]", done: int) -> int:
         """Where in a block the next thing may happen: its end, the deadline, just after a change of the reference."""
         stop = int(min(len(reference), done + self._deadline - self.samples))
-        if self._first is not None:
+        if self._opened is not None and self.probe is None:
             return stop
-        last = self._reference
+        last = self._expected
         return next((k + 1 for k in range(done, stop) if reference[k] != last), stop)
 
     def _heard(self, servo: str) -> None:
@@ -162,35 +197,66 @@ class Agent:
             self._supervisor.answered(self.time, more=bool(self.outbox.pending()))
         self._deadline = self._next_deadline()
 
+    def _requested(self, request: Request) -> list[Outgoing]:
+        """Decide about a request; a probing move begins with the next sample."""
+        s, before = self.settings, self.probe
+        here = Instant(s.servo, s.boot, self.samples, s.sample_rate)
+        self._granted, answer = decide(request, self._granted, s, here, self._calm())
+        move = self.probe
+        if move is not None and move is not before:
+            self._opened = Opened(max(0, move.first - self._granted.pre_trigger), move.last, "probe")
+            self._expected = self._reference + self.offset
+        self._heard(request.servo)
+        return [Outgoing(self.samples, answer)]
+
+    def _calm(self) -> bool:
+        """Whether the reference rests and no window is being recorded."""
+        return self._opened is None and self._recorder.held("reference", self.settings.rest_samples) == self._reference
+
     def _reference_changed(self, reference: float) -> None:
-        """The sample just absorbed brought a new reference."""
+        """The sample just absorbed brought a new reference; until the next one, what a probing move added is in it."""
         self._reference = reference
-        if self._first is None:
-            self._first = max(0, self.samples - 1 - self.settings.pre_trigger_samples)
+        self._abort()
+        if self._opened is None:
+            first = max(0, self.samples - 1 - self._granted.pre_trigger)
+            self._opened = Opened(first, first + self._granted.window, "reference")
             self._deadline = self._next_deadline()
+
+    def _abort(self) -> None:
+        """No probing move, nor its window, any more."""
+        if self.probe is not None:
+            self._granted = replace(self._granted, probe=None)
+            self._opened = None
+        self._expected = self._reference
 
     def _act(self) -> list[Outgoing]:
         """Cut the window that is complete, and send what is due."""
-        if self._first is not None and self.samples >= self._first + self.settings.window_samples:
-            self._cut(self._first, "reference")
-            self._first = None
+        opened = self._opened
+        if opened is not None and self.samples >= opened.last:
+            self._cut(opened)
+            self._abort()
+            self._opened = None
         sent = [Outgoing(self.samples, window) for window in self._sender.due(self.time)]
-        sent += [Outgoing(self.samples, said) for said in self._supervisor.look()]
+        said = self._supervisor.look()
+        if any(isinstance(each, Fallback) for each in said):
+            self._abort()
+        self._expected = self._reference + self.offset
         self._deadline = self._next_deadline()
-        return sent
+        return sent + [Outgoing(self.samples, each) for each in said]
 
-    def _cut(self, first: int, reason: str) -> None:
+    def _cut(self, opened: Opened) -> None:
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
         try:
-            window = self._window(first, sequence, reason)
+            window = self._window(opened, sequence)
         except InvalidMessage:
             self._unusable["sample not finite"] += 1
         else:
             self._sender.offer(window, self.time)
             self._supervisor.asked(self.time)
 
-    def _window(self, first: int, sequence: int, reason: str) -> Window:
-        signals = self._recorder.cut(first, first + self.settings.window_samples)
+    def _window(self, opened: Opened, sequence: int) -> Window:
+        first = opened.first
+        signals = self._recorder.cut(first, opened.last)
         channels = tuple(chain.from_iterable(self._packed(name, values) for name, values in signals.items()))
         return Window(
             servo=self.settings.servo,
@@ -202,7 +268,7 @@ class Agent:
             reference_changes=self._changes(first, signals["reference"]),
             parameter_version=self.parameters.version,
             model_version=self.settings.model_version,
-            reason=reason,
+            reason=opened.reason,
             crc=checksum(channels),
         )
 
@@ -221,8 +287,10 @@ class Agent:
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
         wanted = self._supervisor.next_look
-        if self._first is not None:
-            wanted = min(wanted, self._first + self.settings.window_samples)
+        if self._opened is not None:
+            wanted = min(wanted, self._opened.last)
+        if self.probe is not None:
+            wanted = min(wanted, self.probe.next_change(self.samples))
         due = self._sender.next_time
         if due is None:
             return wanted

@@ -57,6 +57,13 @@ class Recorder:
             raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
         return {name: self._read(ring, first, last) for name, ring in zip(self.names, self._rings, strict=True)}
 
+    def held(self, name: str, count: int) -> float | None:
+        """The value of a channel in all of the last `count` samples; None: it changed, or there are too few."""
+        if not 0 < count <= self.samples:
+            return None
+        values = set(self.cut(self.samples - count, self.samples)[name])
+        return values.pop() if len(values) == 1 else None
+
     def _write(self, ring: "array[float]", block: "array[float]", end: int) -> None:
         """Put a block of at most `capacity` samples where it ends before index `end`."""
         place = (end - len(block)) % self.capacity

@@ -7,6 +7,7 @@ from math import inf, isfinite
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
+from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
@@ -54,6 +55,10 @@ class AgentSettings:
         Hz.
     window_s, pre_trigger_s : float
         Length of a window, and how much of it lies before the change of the reference; whole samples.
+    longest_window_s, longest_pre_trigger_s : float, optional
+        What the twin may request instead; None: no more than that.
+    probe : ProbeLimits, optional
+        Which probing moves of the reference the twin may request; None: none.
     retry : Retry
         When to repeat an unacknowledged window.
     limits : Limits
@@ -88,6 +93,9 @@ class AgentSettings:
     controller: Controller | None = None
     own: Gains | None = None
     supervision: Supervision = field(default_factory=Supervision)
+    longest_window_s: float | None = None
+    longest_pre_trigger_s: float | None = None
+    probe: ProbeLimits | None = None
 
     def __post_init__(self) -> None:
         for key in ("servo", "boot"):
@@ -102,9 +110,41 @@ class AgentSettings:
         if not 0 <= self.pre_trigger_samples < self.window_samples:
             allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
+        self._check_longest()
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
+
+    def _check_longest(self) -> None:
+        """What may be requested is at least what is configured, and fits together."""
+        for key in ("window_s", "pre_trigger_s"):
+            longest, configured = getattr(self, f"longest_{key}"), getattr(self, key)
+            if longest is None:
+                continue
+            _check_whole(f"longest_{key}", longest, self.sample_rate)
+            if longest < configured:
+                allowed = f"must be at least {key} = {configured!r} s"
+                raise InvalidInput(f"agent longest_{key} = {longest!r} s: {allowed}")
+        if not self.longest_pre_trigger_samples < self.longest_samples:
+            allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
+            raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")
+
+    @property
+    def longest_samples(self) -> int:
+        """Samples of the longest window."""
+        longest = self.longest_window_s
+        return self.window_samples if longest is None else round(longest * self.sample_rate)
+
+    @property
+    def longest_pre_trigger_samples(self) -> int:
+        """Samples of the longest pre-trigger."""
+        longest = self.longest_pre_trigger_s
+        return self.pre_trigger_samples if longest is None else round(longest * self.sample_rate)
+
+    @property
+    def rest_samples(self) -> int:
+        """Samples for which the reference rests before a probing move."""
+        return 0 if self.probe is None else max(1, round(self.probe.rest_s * self.sample_rate))
 
     @property
     def window_samples(self) -> int:

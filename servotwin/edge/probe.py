@@ -1,0 +1,78 @@
+"""A probing move of the reference: how large it may be, and the one under way."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+
+from servotwin.errors import InvalidInput
+from servotwin.messages import Probe
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeLimits:
+    """Which probing moves an edge makes.
+
+    Parameters
+    ----------
+    size : float
+        Largest move, m, either way.
+    interval_s : float
+        Shortest time from the beginning of one to the next.
+    rest_s : float
+        How long the reference must have rested before one.
+    """
+
+    size: float
+    interval_s: float = 60.0
+    rest_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, unit in (("size", "m"), ("rest_s", "s")):
+            if not 0.0 < getattr(self, name) < inf:
+                raise InvalidInput(f"probe {name} = {getattr(self, name)!r} {unit}: must be finite and greater than 0")
+        if not 0.0 <= self.interval_s < inf:
+            raise InvalidInput(f"probe interval_s = {self.interval_s!r} s: must be finite and at least 0")
+
+
+@dataclass(frozen=True, slots=True)
+class ProbingMove:
+    """What is added to the reference, sample by sample: away for `hold` samples, back for as many, `strokes` times.
+
+    Parameters
+    ----------
+    first : int
+        First sample of it.
+    size : float
+        m.
+    hold, strokes : int
+    """
+
+    first: int
+    size: float
+    hold: int
+    strokes: int
+
+    @classmethod
+    def of(cls, asked: Probe, first: int, rate: float) -> "ProbingMove":
+        """From a sample on, at `rate` Hz."""
+        return cls(first, asked.size, max(1, round(asked.hold_s * rate)), asked.strokes)
+
+    @property
+    def last(self) -> int:
+        """First sample after it."""
+        return self.first + 2 * self.strokes * self.hold
+
+    def offset(self, sample: int) -> float:
+        """m, at a sample."""
+        if not self.first <= sample < self.last:
+            return 0.0
+        return 0.0 if (sample - self.first) // self.hold % 2 else self.size
+
+    def changes(self) -> Iterator[tuple[int, float]]:
+        """Samples from which on the offset is another, with the offset."""
+        for sample in range(self.first, self.last, self.hold):
+            yield sample, self.offset(sample)
+
+    def next_change(self, sample: int) -> int:
+        """The first change after a sample, or the end."""
+        return min(self.last, self.first + ((sample - self.first) // self.hold + 1) * self.hold)
