@@ -22,6 +22,7 @@ from servotwin.messages import (
     Hello,
     InvalidMessage,
     Message,
+    Proof,
     Reason,
     Receipt,
     Update,
@@ -54,7 +55,8 @@ RECEIPT = Receipt("axis-1", 3, True, 110_000, Reason.APPLIED, 3, "b0")
 HELLO = Hello("axis-1", "b0", 0.0, 5000.0, 0, 0.0, "paper")
 ACKNOWLEDGE = Acknowledge("axis-1", "b0", 4)
 GAINS = Gains(1377.7, 0.0, -135.1, 0.1, 0.5, 1.5, -0.03)
-FULL_UPDATE = msgspec.structs.replace(UPDATE, controller=GAINS, band=Band(5e-5, 2e-5, 0.1, 2.0))
+PROOF = Proof(256, 16, 1.0, 1e-6, 0.1, 1.9, 4.2, 1.2, False)
+FULL_UPDATE = msgspec.structs.replace(UPDATE, controller=GAINS, band=Band(5e-5, 2e-5, 0.1, 2.0), proof=PROOF)
 FALLBACK = Fallback("axis-1", "b0", 110_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 3, 4, 0.0, GAINS)
 MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE]
 
@@ -269,8 +271,12 @@ def test_gains_and_bands_are_in_range_or_refused(part: str, changes: dict[str, f
         decode(msgspec.msgpack.encode(raw))
 
 
-def test_an_update_without_gains_and_band_does_not_mention_them() -> None:
-    assert set(msgspec.msgpack.decode(encode(UPDATE))) == {"type", *UPDATE.__struct_fields__} - {"controller", "band"}
+def test_an_update_without_gains_band_and_proof_does_not_mention_them() -> None:
+    assert set(msgspec.msgpack.decode(encode(UPDATE))) == {"type", *UPDATE.__struct_fields__} - {
+        "controller",
+        "band",
+        "proof",
+    }
 
 
 def test_an_unknown_schema_version_is_named() -> None:
@@ -288,3 +294,9 @@ def test_unknown_values_are_none() -> None:
     assert messages.finite(math.nan) is None
     assert messages.finite(math.inf) is None
     assert messages.finite(0.25) == 0.25
+
+
+@pytest.mark.parametrize(("name", "value"), [("tail", math.inf), ("Ms", math.nan), ("settled", 1.5)])
+def test_a_proof_is_of_finite_numbers(name: str, value: float) -> None:
+    with pytest.raises(InvalidMessage, match=f"proof {name}"):
+        msgspec.structs.replace(PROOF, **{name: value})

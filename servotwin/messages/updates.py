@@ -94,6 +94,39 @@ class Band(Struct, frozen=True):
             require(isfinite(value) and value >= 0.0, f"band {name} {value} is not allowed")
 
 
+class Proof(Struct, frozen=True):
+    """What a setting showed in simulation before it was sent; numbers that another twin finds again.
+
+    Attributes
+    ----------
+    members, looked_at : int
+        Machines that the setting was tried on; settings simulated until this one was chosen.
+    settled : float
+        Share of the machines that settled.
+    tail, overshoot : float
+        Worst of all: m, error in the end; per step.
+    Ms, crossover, phase_margin : float
+        Of the model without a gap: the sensitivity's peak; rad/s and rad.
+    saturated : bool
+        Whether a machine met the voltage limit.
+    """
+
+    members: Count
+    looked_at: Count
+    settled: float
+    tail: float
+    overshoot: float
+    Ms: float
+    crossover: float
+    phase_margin: float
+    saturated: bool
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            require(isfinite(getattr(self, name)), f"proof {name} {getattr(self, name)} is not finite")
+        require(0.0 <= self.settled <= 1.0, f"proof settled {self.settled} is no share")
+
+
 class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
     """New parameters for the edge, and what they stand on.
 
@@ -117,6 +150,8 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
         None: the gains stay.
     band : Band, optional
         What the loop is predicted to stay within; None: nothing is predicted.
+    proof : Proof, optional
+        What the setting showed in simulation; None: nothing was proved.
     """
 
     servo: Name
@@ -132,6 +167,7 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
     not_after: float
     controller: Gains | None = None
     band: Band | None = None
+    proof: Proof | None = None
 
     def __post_init__(self) -> None:
         require(isfinite(self.data_time), f"update data_time {self.data_time} s is not finite")

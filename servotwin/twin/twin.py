@@ -23,6 +23,7 @@ from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.decode import decode_window
 from servotwin.twin.inforce import InForce, Settings, gains_of
 from servotwin.twin.policies import policy_of
+from servotwin.twin.proof import proof_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
@@ -221,6 +222,7 @@ class Twin:
             not_after=message.start + self.settings.validity,
             controller=None if redesign.controller is None else gains_of(redesign.controller),
             band=redesign.band,
+            proof=None if redesign.certificate is None else proof_of(redesign.certificate),
         )
 
     def _send(self, update: Update | None, now: float) -> list[Message]:
