@@ -344,3 +344,15 @@ def one_contact():
                 case = cut(run, start, 2.0)
                 yield case.window, gap
                 yield measured(case), gap
+
+
+def test_rounding_proves_nothing():
+    """A window that the model explains to 1e-18 m, whatever the gap: how the sum rounds is no evidence."""
+    servo = Servo.preset("table1")
+    calm, gap = servo.controller.replace(Ki=0.0), math.radians(2.2616)
+    wave = SquareWave(1.9107e-3, 11.5652)
+    run = simulate(servo, 9.0, controller=calm, reference=wave, gap=gap, theta_d0=math.radians(-0.1167))
+    for start in (7.4, 7.5223, 7.6):
+        estimate = estimate_gap(cut(run, start, 1.0).window, servo)
+        assert not estimate.ok
+        assert estimate.status is not GapStatus.LOWER_BOUND or estimate.gap <= gap

@@ -36,6 +36,10 @@ class Autoregression:
         """No memory."""
         return cls(np.ones((1, 1)), np.array([std]))
 
+    def at_least(self, spread: float) -> Autoregression:
+        """With innovations of a standard deviation of at least `spread`."""
+        return Autoregression(self.predictors, np.maximum(self.spread, spread))
+
     @property
     def order(self) -> int:
         """p."""

@@ -54,7 +54,7 @@ def model_shift(found: Found, servo: Servo, order: int) -> Shift:
     free = reduction.decimation.rows(np.vstack(motions)) * np.array(list(TOLERANCES.values()))[:, None]
     table, size = np.vstack([reduction.table(found.point), free]), len(free)
     shares = _within_tolerance(reduction.prepared(found.noise, table, CONSTANT), size).coefficients
-    noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order)
+    noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
     rows = reduction.prepared(noise, table, CONSTANT)
     solved = _within_tolerance(rows, size)
     own = spread(rows[GAP], rows[PLACE:-size])

@@ -136,7 +136,7 @@ def noise_left(reduction: Reduction, point: Point, noise: Autoregression, order:
     if not np.any(left):
         return Autoregression.white(1.0)
     if not put:
-        return burg(left[None], order)
+        return burg(left[None], order).at_least(reduction.rounding)
     root = least_squares(rows[GAP:], rows[RESIDUAL]).root
     taken = math.sqrt(len(root)) * (root @ table[GAP:])
-    return burg(np.vstack([left + taken, left - taken]), order)
+    return burg(np.vstack([left + taken, left - taken]), order).at_least(reduction.rounding)

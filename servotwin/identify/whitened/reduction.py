@@ -25,6 +25,7 @@ from servotwin.plant.signals import Array
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
 _SAMPLES_PER_PERIOD, _SLOWEST, _FEWEST = 40.0, 400.0, 100  # kept at least: of the fastest mode; Hz; in all
 
+_ROUNDING = 1e-13  # of the largest motion, some hundred times a float's
 _MOST_GROWTH = 4.0  # standard deviations of the gap's rate
 
 
@@ -54,6 +55,8 @@ class Reduction:
         Of the gap's rate, rad per sample; None: the gap is constant.
     rate : float
         rad per sample: the rate at which the screw is followed; what is left of the rate is a nuisance.
+    rounding : float
+        m: noise below this is rounding, which changes with every point, and proves nothing.
     skew : bool
         Whether a delay between the channels is a nuisance.
     """
@@ -66,6 +69,7 @@ class Reduction:
     growth: Prior | None = None
     skew: bool = True
     rate: float = 0.0
+    rounding: float = 0.0
 
     @classmethod
     def of(
@@ -80,7 +84,9 @@ class Reduction:
         """From theta_m (n,) rad and position (n,) m, both from any origin."""
         reduce = decimation(factor_for(model, theta_m.size))
         rows = reduce.rows(np.asarray(position - position[0])[None])
-        return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew)
+        largest = max(float(np.abs(position).max()), abs(model.static_gain) * float(np.abs(theta_m).max()))
+        rounding = _ROUNDING * largest
+        return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew, rounding=rounding)
 
     def fixed(self) -> Array:
         """(r, m) nuisances that do not depend on the gap: the constant, the free motions."""
