@@ -91,7 +91,7 @@ def assess(settings: Sequence[Setting], members: Members, trial: Trial) -> list[
         plants,
         laws,
         trial.duration,
-        Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias),
+        Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias, members.friction),
         trial.last,
         {"error": np.stack([nearness(setting, members.input_bias, members.step.max()) for setting in settings])},
         ("error", "voltage"),

@@ -25,7 +25,7 @@ class Demands:
     scales : tuple of float
         Factors on Kp and Kd.
     integral : tuple of float
-        Factors on Ki, tried where the input bias is known to no better than `bias_known`.
+        Factors on Ki, tried where there is friction, or the input bias is known to no better than `bias_known`.
     bias_known : float
         V.
     hysteresis : tuple of (float, float)
@@ -62,8 +62,8 @@ class Certificate:
     Attributes
     ----------
     setting : Setting
-    gap, input_bias, step : (float, float)
-        rad, V, m: ranges of the members.
+    gap, input_bias, step, friction : (float, float)
+        rad, V, m, N m: ranges of the members.
     members : int
     settled : float
         Share that settled.
@@ -92,6 +92,7 @@ class Certificate:
     gap: tuple[float, float]
     input_bias: tuple[float, float]
     step: tuple[float, float]
+    friction: tuple[float, float]
     members: int
     settled: float
     cost: float

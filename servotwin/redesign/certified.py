@@ -7,6 +7,7 @@ tried on many, and sent only if these settle. Nothing is extrapolated from the e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -60,7 +61,10 @@ def certify(
     begin = clock()
     demands, trial = demands or Demands(), trial or Trial()
     low, high = (bias + feedforward for bias in uncertainty.input_bias)
-    disturbed = max(abs(low), abs(high)) > demands.bias_known
+    disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
+    if disturbed:
+        # The members' bias sets in together with the step: what it adds to the overshoot says nothing.
+        demands = replace(demands, overshoot=math.inf)
     laws = candidates_of(servo, demands, uncertainty.gap[1], disturbed, noise > 0.0)
     candidates = [_fed(setting, feedforward) for setting in laws]
     ranked = _ranked(candidates, draw(servo, uncertainty, 2, demands.screened, demands.seed), trial, demands, noise)
@@ -80,8 +84,8 @@ def certify(
 def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Setting]:
     """Every combination of scales, integral action and dead zone within the bound on Ms.
 
-    Integral action is for an input bias that is not known, a dead zone keeps noise out of the voltage: they are looked
-    at only where there is something for them to do.
+    Integral action is for friction and for an input bias that is not known, a dead zone keeps noise out of the voltage:
+    they are looked at only where there is something for them to do.
 
     Raises
     ------
@@ -156,6 +160,7 @@ def _certificate(
         gap=uncertainty.gap,
         input_bias=uncertainty.input_bias,
         step=uncertainty.step,
+        friction=uncertainty.friction,
         members=members.count,
         settled=float(np.mean(outcome.settled)),
         cost=_cost(setting, outcome, demands, noise),

@@ -43,6 +43,9 @@ class CertifiedPolicy:
         V, either sign.
     bias_floor : float
         V: the input bias is never taken to be known better.
+    bias_moved : float
+        V: a voltage at rest that is that far from what was fed forward speaks of friction, which holds the motor short
+        of its place.
     horizon : float
         s for which a setting is to hold: the gap may grow meanwhile as fast as the trend says.
     clock : callable
@@ -54,7 +57,8 @@ class CertifiedPolicy:
     demands: Demands = field(default_factory=Demands)
     trial: Trial = field(default_factory=Trial)
     feedforward_limit: float = 0.2
-    bias_floor: float = 2e-3
+    bias_floor: float = 2e-4
+    bias_moved: float = 5e-3
     horizon: float = 40.0
     needs_estimate: ClassVar[bool] = False
     clock: Callable[[], float] = field(default=perf_counter, compare=False)
@@ -81,7 +85,7 @@ class CertifiedPolicy:
         noise = _noise(evidence)
         found = certify(
             self.servo,
-            self.uncertainty.replace(gap=gap, input_bias=bias),
+            self.uncertainty.replace(gap=gap, input_bias=bias, friction=self._friction(evidence)),
             self.held(),
             self.trial,
             feedforward,
@@ -137,6 +141,15 @@ class CertifiedPolicy:
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * told.bias_std, self.bias_floor)
         return min(max(-told.bias, -limit), limit), (told.bias - spread, told.bias + spread)
+
+    def _friction(self, evidence: Evidence) -> Range:
+        """Torques (N m) to reckon with: those stated, and what the last feedforward left at rest."""
+        told, now = evidence.disturbance, evidence.controller
+        low, high = self.uncertainty.friction
+        if evidence.tuned_for is None or now is None or not math.isfinite(told.bias_std):
+            return low, high
+        left = abs(told.bias + now.feedforward)
+        return low, max(high, left * self.servo.k_T / self.servo.R) if left > self.bias_moved else high
 
 
 def _noise(evidence: Evidence) -> float:

@@ -15,7 +15,7 @@ from servotwin.plant.servo import Servo
 
 Range = tuple[float, float]
 _PARAMETERS = ("k", "c", "k_B", "m")
-_UNITS = {"gap": "rad", "step": "m", "input_bias": "V"}
+_UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class Uncertainty:
         m, size of the steps that the reference makes; one is as likely as another on a logarithmic scale.
     input_bias : (float, float)
         V, added to the voltage behind the controller.
+    friction : (float, float)
+        N m, Coulomb's on the motor's shaft.
 
     Raises
     ------
@@ -46,6 +48,7 @@ class Uncertainty:
     gap: Range = (0.0, math.radians(60.0))
     step: Range = (1e-4, 2.5e-3)
     input_bias: Range = (0.0, 0.0)
+    friction: Range = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in _PARAMETERS:
@@ -56,8 +59,8 @@ class Uncertainty:
             low, high = getattr(self, name)
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
                 raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be finite and in order")
-        if self.gap[0] < 0.0 or self.step[0] <= 0.0:
-            raise InvalidInput("uncertainty: the gap must be 0 or more, and steps greater than 0")
+        if min(self.gap[0], self.friction[0]) < 0.0 or self.step[0] <= 0.0:
+            raise InvalidInput("uncertainty: gap and friction must be 0 or more, and steps greater than 0")
 
     def replace(self, **changes: object) -> Uncertainty:
         """A copy with some values changed, validated again."""
@@ -74,8 +77,8 @@ class Members:
     Attributes
     ----------
     plants : tuple of P Servo
-    gap, step, input_bias, theta_d0 : (P, C) array
-        rad, m, V, rad.
+    gap, step, input_bias, theta_d0, friction : (P, C) array
+        rad, m, V, rad, N m.
     """
 
     plants: tuple[Servo, ...]
@@ -83,6 +86,7 @@ class Members:
     step: Array
     input_bias: Array
     theta_d0: Array
+    friction: Array
 
     @property
     def count(self) -> int:
@@ -96,7 +100,7 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
     The first plant is the model itself. The first two conditions of every plant have the widest and the narrowest gap:
     the ends of an estimate's interval are where a setting fails first.
     """
-    conditioned = _sobol(4, plants * conditions, seed + 1).reshape(plants, conditions, 4)
+    conditioned = _sobol(5, plants * conditions, seed + 1).reshape(plants, conditions, 5)
     if conditions > 1:
         conditioned[:, 0, 0], conditioned[:, 1, 0] = 1.0, 0.0
     gap = _spread(uncertainty.gap, conditioned[..., 0])
@@ -107,6 +111,7 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
         step,
         _spread(uncertainty.input_bias, conditioned[..., 2]),
         (conditioned[..., 3] - 0.5) * gap,
+        _spread(uncertainty.friction, conditioned[..., 4]),
     )
 
 

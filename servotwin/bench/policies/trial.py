@@ -1,4 +1,4 @@
-"""One machine under one policy: a step, 60 s, and two windows of rest from which the policy may learn."""
+"""One machine under one policy: 10 s of rest, a step, 60 s after it, and windows of rest from which it may learn."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from servotwin.identify.disturbance import disturbance
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Step
 from servotwin.redesign.assess import NEAR, STILL
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.setting import Setting
 from servotwin.simulation import Run, Simulation
 
-DURATION, LAST = 60.0, 10.0
-UPDATES = (20.0, 40.0)  # s, ends of the windows
+REST, DURATION, LAST = 10.0, 60.0, 10.0
+UPDATES = (8.0, 30.0, 50.0)  # s, ends of the windows
 WINDOW, DELAY = 2.0, 1.0
 SPREAD = math.radians(0.05)
 _RATES = {"noise": 5000.0}
@@ -83,29 +84,29 @@ class Told:
 
 def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Scores:
     """The gap's estimate is right to 0.05 deg (standard deviation) and says so; of the rest a policy knows what its
-    windows show: 2 s that end 20 and 40 s after the step, its setting in force a second later."""
+    windows show: 2 s that end 2 s before the step, 20 and 40 s after it, its setting in force a second later."""
     rng = np.random.default_rng(machine.seed)
     believed = max(0.0, machine.gap + SPREAD * rng.standard_normal())
     setting = _redesigned(told, Evidence(_estimate(believed)), told.start)
-    simulation = _simulation(machine, block, setting, rng)
+    simulation, told_for = _simulation(machine, block, setting, rng), None
     for end in UPDATES if told.policy is not None else ():
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
         seen = disturbance(window, model)
-        now = _redesigned(
-            told, Evidence(_estimate(believed), seen, None, setting.controller, setting.tolerance), setting
-        )
+        evidence = Evidence(_estimate(believed), seen, None, setting.controller, setting.tolerance, told_for)
+        now = _redesigned(told, evidence, setting)
+        told_for = believed
         if now != setting:
             simulation.advance(_sample(end + DELAY, block))
             simulation.set_controller(_law(now.controller, block), now.tolerance)
             setting = now
-    simulation.advance(_sample(DURATION, block))
+    simulation.advance(_sample(REST + DURATION, block))
     return scores(simulation.run(), machine.step)
 
 
 def scores(run: Run, step: float) -> Scores:
-    """Measures of a run of one step at time 0."""
-    error = run.reference - run.position
+    """Measures of a run with one step, from there on."""
+    error = (run.reference - run.position)[round(REST * run.sample_rate) :]
     last = slice(-round(LAST * run.sample_rate), None)
     outside = np.flatnonzero(np.abs(error) > NEAR * step)
     return Scores(
@@ -113,7 +114,7 @@ def scores(run: Run, step: float) -> Scores:
         tail=float(np.abs(error[last]).max()),
         cost=float(np.abs(error).mean()) * DURATION / step,
         overshoot=max(0.0, -float(error.min())) / step,
-        settling=0.0 if outside.size == 0 else float(run.time[outside[-1]]),
+        settling=0.0 if outside.size == 0 else float(outside[-1] / run.sample_rate),
         voltage=float(np.sqrt(np.mean(run.voltage[last] ** 2))),
         travel=float(np.abs(np.diff(run.theta_m[last])).sum()) / LAST,
         position=float(np.sqrt(np.mean(error[last] ** 2))),
@@ -138,9 +139,9 @@ def _estimate(gap: float) -> GapEstimate:
 def _simulation(machine: Machine, block: str, setting: Setting, rng: np.random.Generator) -> Simulation:
     return Simulation(
         machine.servo,
-        DURATION,
+        REST + DURATION,
         _law(setting.controller, block),
-        reference=machine.step,
+        reference=Step(machine.step, REST),
         gap=machine.gap,
         tolerance=setting.tolerance,
         theta_d0=machine.theta_d0,
