@@ -20,8 +20,8 @@ from servotwin.identify.trend import Trend, TrendSettings
 from servotwin.identify.window import Window
 from servotwin.logfile import Log, read_log
 from servotwin.plant.servo import Servo
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.twin import estimator_of
 from servotwin.twin.wear import Wear
 
 WINDOW = 1.0  # s

@@ -9,7 +9,7 @@ from servotwin.identify.window import Window as NumericWindow
 from servotwin.messages import Window
 from servotwin.simulation import Run
 from servotwin.twin.decode import decode_window
-from servotwin.twin.twin import estimator_of
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.wear import Expectation
 
 

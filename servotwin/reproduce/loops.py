@@ -15,8 +15,8 @@ from servotwin.identify.window import Window
 from servotwin.plant.signals import as_pieces
 from servotwin.reproduce.measures import Step
 from servotwin.reproduce.runs import BIPOLAR, Square, Trace
+from servotwin.twin.estimating import Estimator, estimator_of
 from servotwin.twin.known import known_gap
-from servotwin.twin.twin import Estimator, estimator_of
 from servotwin.twin.wear import Expectation
 
 PUBLISHED, OURS = paper.METHOD, whitened.METHOD

@@ -5,7 +5,7 @@ from __future__ import annotations
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.signals import SignalLike, as_nonnegative
-from servotwin.twin.twin import Estimator
+from servotwin.twin.estimating import Estimator
 from servotwin.twin.wear import Expectation
 
 

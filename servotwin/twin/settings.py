@@ -11,6 +11,7 @@ from servotwin.identify import whitened
 from servotwin.identify.gap import settings_of
 from servotwin.identify.trend import TrendSettings
 from servotwin.redesign.certificate import Demands
+from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.uncertainty import Uncertainty
 from servotwin.tomltable import did_you_mean
 
@@ -44,6 +45,8 @@ class TwinSettings:
         update, 0 unless given, below 1.
     k_noise : float, optional
         Of "margin": tolerances per standard deviation of the measurement's noise.
+    excitation : ExcitationSettings, optional
+        What is asked of the edge when windows tell too little of the gap; None: nothing.
     initial_gap : float
         rad; what is believed before the first estimate (section 4.2: zero).
     trend : TrendSettings
@@ -75,6 +78,7 @@ class TwinSettings:
     k_dz: float | None = None
     smoothing: float | None = None
     k_noise: float | None = None
+    excitation: ExcitationSettings | None = None
     initial_gap: float = 0.0
     trend: TrendSettings = field(default_factory=TrendSettings)
     gap_limit: float | None = None

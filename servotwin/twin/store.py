@@ -8,7 +8,8 @@ from typing import Protocol
 from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
-from servotwin.messages import Fallback, Receipt, Update, Window
+from servotwin.messages import Answer, Fallback, Receipt, Request, Update, Window
+from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 
 Identity = tuple[str, str, int]
@@ -50,6 +51,18 @@ class Store(Protocol):
         """Keep what the edge did by itself."""
         ...
 
+    def add_excitation(self, window: Window, decision: Decision) -> None:
+        """Keep what was asked for after a window, and why, or why nothing."""
+        ...
+
+    def add_request(self, request: Request) -> None:
+        """Keep a request before it is sent."""
+        ...
+
+    def add_answer(self, answer: Answer) -> None:
+        """Keep what the edge says to a request."""
+        ...
+
 
 @dataclass
 class MemoryStore:
@@ -63,6 +76,9 @@ class MemoryStore:
     updates: list[Update] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
     fallbacks: list[Fallback] = field(default_factory=list)
+    excitations: dict[Identity, Decision] = field(default_factory=dict)
+    requests: list[Request] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
 
     def add_window(self, window: Window) -> bool:
         """Keep a window under its identity; False when it was there already."""
@@ -97,3 +113,15 @@ class MemoryStore:
     def add_fallback(self, fallback: Fallback) -> None:
         """Keep a fallback."""
         self.fallbacks.append(fallback)
+
+    def add_excitation(self, window: Window, decision: Decision) -> None:
+        """Keep a decision."""
+        self.excitations[window.identity] = decision
+
+    def add_request(self, request: Request) -> None:
+        """Keep a request."""
+        self.requests.append(request)
+
+    def add_answer(self, answer: Answer) -> None:
+        """Keep an answer."""
+        self.answers.append(answer)

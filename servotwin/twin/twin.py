@@ -4,33 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 from servotwin.errors import InvalidInput
-from servotwin.identify import whitened
 from servotwin.identify.disturbance import Disturbance, disturbance, nothing_known
-from servotwin.identify.estimate import GapEstimate, no_estimate
-from servotwin.identify.gap import estimate_gap, settings_of
-from servotwin.identify.offset import estimate_carrying
+from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
 from servotwin.identify.window import Window
-from servotwin.messages import Acknowledge, Fallback, Hello, InvalidMessage, Message, Receipt, Update, finite
+from servotwin.messages import (
+    Acknowledge,
+    Answer,
+    Fallback,
+    Hello,
+    InvalidMessage,
+    Message,
+    Receipt,
+    Request,
+    Update,
+    finite,
+)
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.evidence import UNASKED, Evidence
 from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.decode import decode_window
+from servotwin.twin.estimating import UNUSABLE, Estimator, estimator_of, no_use
 from servotwin.twin.inforce import InForce, Settings, gains_of
 from servotwin.twin.policies import policy_of
 from servotwin.twin.proof import proof_of
+from servotwin.twin.requests import Requests, requests_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
-from servotwin.twin.wear import Expectation, Wear
+from servotwin.twin.wear import Wear
 
-Estimator = Callable[[Window, Expectation], GapEstimate]
-"""(window, what is known before it) -> estimate."""
 Observer = Callable[[Window], Disturbance]
 """window -> input bias and noise."""
 
@@ -60,6 +67,8 @@ class Twin:
         identify.Window -> Disturbance; None: nobody looks.
     start : InForce, optional
         What the edge runs before the first update.
+    requests : Requests, optional
+        Asks for windows that tell more; None: takes them as they come.
     """
 
     def __init__(
@@ -71,8 +80,9 @@ class Twin:
         settings: TwinSettings | None = None,
         observer: Observer | None = None,
         start: InForce | None = None,
+        requests: Requests | None = None,
     ) -> None:
-        self.servo = servo
+        self.servo, self._requests = servo, requests
         self.settings = settings or TwinSettings()
         self._estimator, self._policy, self._store, self._observer = estimator, policy, store, observer
         self._versions, self._known = Versions(), Settings({0: start or InForce()})
@@ -98,7 +108,8 @@ class Twin:
         policy = policy_of(servo, settings)
         begins = start or InForce(servo.controller)
         chosen = estimator or estimator_of(servo, settings)
-        return cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins)
+        asks = requests_of(name, servo, settings)
+        return cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks)
 
     @property
     def trend(self) -> Trend | None:
@@ -122,6 +133,8 @@ class Twin:
             return self._send(self._versions.settle(message), now)
         if isinstance(message, Fallback):
             return self._fallen_back(message)
+        if isinstance(message, Answer):
+            return self._answered(message, now)
         if isinstance(message, Hello):
             self._versions.hear(message.boot, message.parameter_version)
             return []
@@ -129,17 +142,19 @@ class Twin:
 
     def next_wake(self) -> float | None:
         """When `wake` is due, s; None: nothing is waited for."""
-        return None if self._versions.pending is None else self._sent_at + self.settings.retry
+        due = [] if self._versions.pending is None else [self._sent_at + self.settings.retry]
+        asked = None if self._requests is None else self._requests.next_wake()
+        return min(due if asked is None else [*due, asked], default=None)
 
     def wake(self, now: float) -> list[Message]:
-        """The pending update once more when its receipt is overdue; given up after `attempts`."""
-        due = self.next_wake()
-        if due is None or now < due:
-            return []
+        """The pending update and request once more when their answers are overdue; given up after `attempts`."""
+        again: list[Message] = [] if self._requests is None else [*self._requests.wake(now)]
+        if self._versions.pending is None or now < self._sent_at + self.settings.retry:
+            return again
         if self._attempts >= self.settings.attempts:
             self._versions.give_up()
-            return []
-        return self._again(now)
+            return again
+        return self._again(now) + again
 
     def estimate(self, message: WindowMessage, now: float) -> GapEstimate:
         """What a window says about the gap; where it cannot be used at all, UNIDENTIFIABLE and why."""
@@ -147,7 +162,7 @@ class Twin:
             window = decode_window(message)
             return self._estimator(window, self._wear.expect(message.boot, window.mid_time, now))
         except InvalidInput as error:
-            return _nothing(message, str(error))
+            return no_use(message, str(error))
 
     def observe(self, message: WindowMessage) -> Disturbance:
         """What a window says about input bias and noise; where it cannot be used at all, nothing and why."""
@@ -174,10 +189,33 @@ class Twin:
         unasked = stale or (why_not and self._policy.needs_estimate)
         redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
+        asked = [] if stale or estimate.method == UNUSABLE else self._ask(message, estimate, now)
         if redesign.tolerance is None:
-            return []
+            return asked
         self._tuned_for = redesign.gap
-        return self._send(self._versions.issue(self._draft(message, estimate, redesign)), now)
+        return self._send(self._versions.issue(self._draft(message, estimate, redesign)), now) + asked
+
+    def _ask(self, message: WindowMessage, estimate: GapEstimate, now: float) -> list[Message]:
+        """A request, where windows tell too little."""
+        if self._requests is None:
+            return []
+        trend = self._wear.expect(message.boot, estimate.time, now).trend
+        widest = math.inf if trend is None else trend.gap_interval[1]
+        runs = self._known.of(self._versions.in_force)
+        decision = self._requests.learn(message, estimate, widest, runs, now)
+        self._store.add_excitation(message, decision)
+        return self._request(self._requests.pending if decision.ask else None, now)
+
+    def _answered(self, answer: Answer, now: float) -> list[Message]:
+        self._store.add_answer(answer)
+        return [] if self._requests is None else self._request(self._requests.settle(answer), now)
+
+    def _request(self, request: Request | None, now: float) -> list[Message]:
+        """Store and send a new request."""
+        if request is None or self._requests is None:
+            return []
+        self._store.add_request(request)
+        return [*self._requests.send(now)]
 
     def _refusal(self, message: WindowMessage, estimate: GapEstimate, now: float) -> str:
         """Why no parameters may stand on an estimate; empty where they may, and the trend has learnt from it."""
@@ -237,26 +275,3 @@ class Twin:
         pending = self._versions.pending
         self._sent_at, self._attempts = now, self._attempts + 1
         return [] if pending is None else [pending]
-
-
-def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
-    """The estimator that `settings` name, with a servo as its model.
-
-    The published one starts from the previous gap, as printed. The default one is told what the trend predicts, how
-    fast the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
-    """
-    given = settings_of(settings.method, settings.estimator)
-
-    def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        if not isinstance(given, whitened.Settings):
-            return estimate_gap(window, servo, settings.method, expected.previous, given)
-        drift = given.gap_rate or expected.gap_rate(settings.trend)
-        return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)
-
-    return estimate
-
-
-def _nothing(message: WindowMessage, reason: str) -> GapEstimate:
-    """The estimate from a window that no estimator accepts."""
-    middle = message.start + 0.5 * (message.samples - 1) / message.rate
-    return no_estimate(middle, (reason,))

@@ -1,0 +1,45 @@
+"""How a twin estimates: the method that its settings name, told what is expected of the window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from servotwin.identify import whitened
+from servotwin.identify.estimate import GapEstimate, no_estimate
+from servotwin.identify.gap import estimate_gap, settings_of
+from servotwin.identify.offset import estimate_carrying
+from servotwin.identify.window import Window
+from servotwin.messages import Window as WindowMessage
+from servotwin.plant.servo import Servo
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.wear import Expectation
+
+Estimator = Callable[[Window, Expectation], GapEstimate]
+"""(window, what is known before it) -> estimate."""
+
+UNUSABLE = "none"
+"""Method of what is stated where no estimator took the window: no motion would make it better."""
+
+
+def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
+    """The estimator that `settings` name, with a servo as its model.
+
+    The published one starts from the previous gap, as printed. The default one is told what the trend predicts, how
+    fast the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
+    """
+    given = settings_of(settings.method, settings.estimator)
+
+    def estimate(window: Window, expected: Expectation) -> GapEstimate:
+        if not isinstance(given, whitened.Settings):
+            return estimate_gap(window, servo, settings.method, expected.previous, given)
+        drift = given.gap_rate or expected.gap_rate(settings.trend)
+        return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)
+
+    return estimate
+
+
+def no_use(message: WindowMessage, reason: str) -> GapEstimate:
+    """The estimate from a window that no estimator accepts."""
+    middle = message.start + 0.5 * (message.samples - 1) / message.rate
+    return no_estimate(middle, (reason,), method=UNUSABLE)

@@ -1,0 +1,146 @@
+"""What a twin asks its edge for when windows tell too little: one request at a time, repeated until it is answered."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import msgspec
+
+from servotwin.identify.estimate import GapEstimate
+from servotwin.messages import Answer, Outcome, Probe, Request, Window
+from servotwin.plant.servo import Servo
+from servotwin.redesign.excitation import Decision, ExcitationPolicy, Memory, Seen, long_enough
+from servotwin.twin.inforce import InForce
+from servotwin.twin.settings import TwinSettings
+
+
+@dataclass(frozen=True)
+class Insistence:
+    """How a twin insists.
+
+    Attributes
+    ----------
+    retry : float
+        s without an answer after which a request is sent again.
+    attempts : int
+        How often it is sent before it is given up.
+    validity : float
+        s after a window's first sample for which a request that stands on it may still be begun.
+    """
+
+    retry: float = 5.0
+    attempts: int = 4
+    validity: float = 60.0
+
+
+class Requests:
+    """Windows and answers in, requests out.
+
+    Parameters
+    ----------
+    servo : str
+    policy : ExcitationPolicy
+    insistence : Insistence
+    widest : float
+        rad: the gap is no wider than this.
+    """
+
+    def __init__(self, servo: str, policy: ExcitationPolicy, insistence: Insistence, widest: float) -> None:
+        self.servo, self.policy, self.insistence, self.widest = servo, policy, insistence, widest
+        self.pending: Request | None = None
+        self._memory, self._boot, self._serial = Memory(), "", 0
+        self._sent_at, self._attempts = -math.inf, 0
+
+    def learn(self, window: Window, estimate: GapEstimate, widest: float, runs: InForce, now: float) -> Decision:
+        """Decide after a window; what is asked for is `pending` then.
+
+        Parameters
+        ----------
+        window : Window
+        estimate : GapEstimate
+            What it says of the gap.
+        widest : float
+            rad: what else bounds the gap from above.
+        runs : InForce
+            Controller and dead zone.
+        now : float
+            s.
+        """
+        if window.boot != self._boot:
+            self._boot, self._serial, self._memory, self.pending = window.boot, 0, self._memory.rebooted(), None
+        long = window.reason == "probe" or long_enough(*_extent(window), self.policy.settings)
+        upper = min(self.widest, widest, estimate.interval[1])
+        decision = self.policy.look(self._memory, Seen(now, estimate.status, long, upper, _slack(runs)))
+        self._memory = decision.memory
+        if estimate.ok and self.pending is not None and isinstance(self.pending.ask, Probe):
+            self._close(None)
+        if decision.ask is not None:
+            until = window.start + self.insistence.validity
+            self._serial += 1
+            self.pending = Request(self.servo, self._boot, self._serial, decision.ask, until, decision.reason[:256])
+            self._attempts = 0
+        return decision
+
+    def settle(self, answer: Answer) -> Request | None:
+        """Note an answer; the request to send instead, where this twin had forgotten how far its numbers went."""
+        asked = self.pending
+        if asked is None or (answer.boot, answer.serial) != (asked.boot, asked.serial) or answer.outcome.passing:
+            return None
+        if answer.outcome is Outcome.DUPLICATE:
+            self._serial = max(self._serial, answer.newest) + 1
+            self.pending = msgspec.structs.replace(asked, serial=self._serial)
+            self._attempts = 0
+            return self.pending
+        self._close(answer.outcome)
+        return None
+
+    def send(self, now: float) -> list[Request]:
+        """The pending request, which counts as sent."""
+        if self.pending is None:
+            return []
+        self._sent_at, self._attempts = now, self._attempts + 1
+        return [self.pending]
+
+    def next_wake(self) -> float | None:
+        """When `wake` is due, s; None: nothing is waited for."""
+        return None if self.pending is None else self._sent_at + self.insistence.retry
+
+    def wake(self, now: float) -> list[Request]:
+        """The pending request once more when its answer is overdue; given up after `attempts`."""
+        due = self.next_wake()
+        if due is None or now < due:
+            return []
+        if self._attempts >= self.insistence.attempts:
+            self._close(None)
+        return self.send(now)
+
+    def _close(self, outcome: Outcome | None) -> None:
+        """The pending request is over."""
+        assert self.pending is not None
+        self._memory = self._memory.answered(self.pending.ask, outcome)
+        self.pending = None
+
+
+def requests_of(name: str, servo: Servo, settings: TwinSettings) -> Requests | None:
+    """What a twin's settings ask for, of a servo of that name and model; None: nothing."""
+    if settings.excitation is None:
+        return None
+    insistence = Insistence(settings.retry, settings.attempts, settings.validity)
+    return Requests(name, ExcitationPolicy(servo.p, settings.excitation), insistence, settings.uncertainty.gap[1])
+
+
+def _extent(window: Window) -> tuple[float, float]:
+    """Length, and how much of it lies before the first change of the reference, s.
+
+    Nothing lies before a boot's first sample: there, no longer pre-trigger could be had.
+    """
+    first = next((time for time, _ in window.reference_changes), window.start)
+    return window.samples / window.rate, math.inf if window.start == 0.0 else first - window.start
+
+
+def _slack(runs: InForce) -> float:
+    """m: both thresholds of the dead zone together; NaN: not known."""
+    if runs.controller is None or runs.tolerance is None:
+        return math.nan
+    return (runs.controller.enter + runs.controller.leave) * runs.tolerance
