@@ -33,14 +33,14 @@ class Demands:
     effort_weight : float
         s/V: what a volt (rms) of measurement noise in the voltage costs, beside seconds of error.
     screened, plants, conditions : int
-        Conditions of the two plants that rank the candidates; plants and conditions of the proof.
+        Plants that rank the candidates, plants of the proof, and conditions of each.
     attempts : int
         Candidates that are tried before none is found.
     """
 
     Ms: float = 2.0
     settled: float = 0.99
-    overshoot: float = 0.3
+    overshoot: float = 0.5
     tail: float = math.inf
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
@@ -48,7 +48,7 @@ class Demands:
     bias_known: float = 0.01
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
     effort_weight: float = 1.0
-    screened: int = 8
+    screened: int = 4
     plants: int = 32
     conditions: int = 8
     attempts: int = 4

@@ -97,12 +97,12 @@ class Members:
 def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> Members:
     """`plants` times `conditions` members, spread evenly (scrambled Sobol sequences); equal calls draw equal members.
 
-    The first plant is the model itself. The first two conditions of every plant have the widest and the narrowest gap:
-    the ends of an estimate's interval are where a setting fails first.
+    The first plant is the model itself. The first two conditions of every plant have the largest and the smallest gap
+    and input bias: the ends of an estimate's interval are where a setting fails first.
     """
     conditioned = _sobol(5, plants * conditions, seed + 1).reshape(plants, conditions, 5)
     if conditions > 1:
-        conditioned[:, 0, 0], conditioned[:, 1, 0] = 1.0, 0.0
+        conditioned[:, 0, :3:2], conditioned[:, 1, :3:2] = 1.0, 0.0
     gap = _spread(uncertainty.gap, conditioned[..., 0])
     step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), conditioned[..., 1]))
     return Members(
