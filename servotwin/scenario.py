@@ -255,6 +255,7 @@ class Scenario:
             retry=r.retry,
             limits=r.limits,
             model_version=self.servo.version,
+            **r.requests,
         )
 
     def seed_of(self, source: str) -> int:
@@ -282,7 +283,7 @@ class Scenario:
 
     def _check_size(self, rate: float) -> None:
         """All samples and one window fit into memory."""
-        for key, seconds in (("duration", self.duration), ("window", self.window)):
+        for key, seconds in (("duration", self.duration), ("window", self.recording.longest_window or self.window)):
             if not seconds * rate <= MOST_SAMPLES:
                 raise InvalidInput(
                     f"{key} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} "

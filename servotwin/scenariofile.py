@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from servotwin.control.controller import Controller
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import gains_of
+from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
@@ -39,6 +40,10 @@ class Recording:
     window, pre_trigger : float, optional
         s, length of a window and how much of it lies before the change of the reference; None: as the controller asks
         for, see `Scenario`.
+    longest_window, longest_pre_trigger : float, optional
+        s, what the twin may request instead; None: no more than that.
+    probe : ProbeLimits, optional
+        Which probing moves of the reference it may request; None: none. In a file, [edge.probe].
     retry : Retry
         When a window without acknowledgement is sent again.
     limits : Limits
@@ -54,6 +59,15 @@ class Recording:
     retry: Retry = field(default_factory=Retry)
     limits: Limits = field(default_factory=Limits)
     fine_angle: bool = True
+    longest_window: float | None = None
+    longest_pre_trigger: float | None = None
+    probe: ProbeLimits | None = None
+
+    @property
+    def requests(self) -> dict[str, Any]:
+        """What the twin may request, as `AgentSettings` call it."""
+        before = self.longest_pre_trigger
+        return {"longest_window_s": self.longest_window, "longest_pre_trigger_s": before, "probe": self.probe}
 
 
 def read(table: Table, folder: Path) -> dict[str, Any]:
@@ -73,7 +87,7 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "theta_d0": table.number("theta_d0_deg", 0.0) * DEG,
         "reference": part(table, "reference", _reference),
         "gap": part(table, "gap", _gap),
-        "recording": part(table, "recording", _recording),
+        "recording": replace(part(table, "recording", _recording), probe=_probe(table)),
         "twin": part(table, "twin", twinfile.twin),
         **part(table, "disturbances", _disturbances),
     }
@@ -196,6 +210,8 @@ def _recording(table: Table) -> Recording:
         fine_angle=table.boolean("fine_angle", default.fine_angle),
         retry=_retry(table, default.retry),
         limits=part(table, "limits", edgefile.limits),
+        longest_window=table.number("longest_window_s", None, positive=True),
+        longest_pre_trigger=table.number("longest_pre_trigger_s", None, minimum=0.0),
     )
 
 
@@ -208,8 +224,11 @@ def _retry(table: Table, default: Retry) -> Retry:
 
 
 def _supervision(table: Table, controller: Controller) -> Supervision | None:
-    """[edge]: updates may set gains, and the edge looks after itself; without it, they set the tolerance only."""
-    if "edge" not in table.values:
+    """[edge]: updates may set gains, and the edge looks after itself; without it, they set the tolerance only.
+
+    What it says of probing moves changes nothing of this.
+    """
+    if not table.table("edge").values.keys() - {"probe"}:
         return None
 
     def gains(inner: Table) -> Gains:
@@ -217,6 +236,12 @@ def _supervision(table: Table, controller: Controller) -> Supervision | None:
         return gains_of(controller.replace(**changed))
 
     return part(table, "edge", lambda inner: edgefile.supervision(inner, gains))
+
+
+def _probe(table: Table) -> ProbeLimits | None:
+    """[edge.probe]: the twin may request probing moves of the reference."""
+    inner = table.table("edge")
+    return part(inner, "probe", edgefile.probe) if "probe" in inner.values else None
 
 
 def _disturbances(table: Table) -> dict[str, float]:

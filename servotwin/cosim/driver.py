@@ -3,7 +3,7 @@
 Time is event time in seconds; the machine moves in whole samples. Something that happens between two samples, or
 exactly at one, takes effect at the later one, before that sample is taken. The plant runs ahead only as far as nothing
 can happen to it: to the next event, to what the agent waits for, at most to where a change not seen yet could complete
-a window.
+a window; during a probing move, to where the wanted position changes.
 """
 
 from __future__ import annotations
@@ -14,18 +14,25 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
+import numpy as np
+
 from servotwin.clock import Event, VirtualClock
 from servotwin.control.controller import Controller
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.simulated import SimulatedLink
-from servotwin.messages import Fallback, Message, Receipt, Update, decode, encode
+from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, decode, encode
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run, Simulation
+from servotwin.simulation.splice import shifted
+from servotwin.twin.estimating import Estimator
 from servotwin.twin.inforce import InForce
 from servotwin.twin.store import MemoryStore
-from servotwin.twin.twin import Estimator, Twin
+from servotwin.twin.twin import Twin
 
 Progress = Callable[[float], object]
 """Called with the share done, 0 .. 1."""
@@ -76,6 +83,9 @@ class Machine(Protocol):
     def set_tolerance(self, tolerance: float) -> None:
         """A new dead zone (m) from the present sample on."""
 
+    def set_reference(self, reference: PiecewiseCubic) -> None:
+        """Another reference (m) from the present sample on."""
+
     def set_controller(self, controller: Controller, tolerance: float) -> None:
         """Another controller and dead zone (m) from the present sample on, the voltage unchanged by it."""
 
@@ -120,7 +130,10 @@ class Cosimulation:
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
         self.fallbacks: list[Fallback] = []
+        self.answers: list[Answer] = []
         self._in_force = self.agent.parameters
+        self._wanted = as_pieces(scenario.reference, scenario.duration)
+        self._probe: ProbingMove | None = None
         self._wake: Event | None = None
 
     @property
@@ -139,7 +152,7 @@ class Cosimulation:
         self.machine.advance(stop)
         blocks = (self.machine.measured(name, first, stop) for name in CHANNELS)
         sent = self.agent.absorb_block(*blocks)
-        self._retune()
+        self._follow()
         for outgoing in sent:
             time = outgoing.sample / self.scenario.recording.sample_rate
             self.clock.schedule(max(time, self.clock.now), partial(self._send_up, outgoing))
@@ -159,19 +172,29 @@ class Cosimulation:
             updates=tuple(self.store.updates),
             receipts=tuple(self.receipts),
             fallbacks=tuple(self.fallbacks),
+            excitations=tuple(self.store.excitations.values()),
+            requests=tuple(self.store.requests),
+            answers=tuple(self.answers),
             messages=tuple(sorted(self._transmissions(), key=lambda m: (m.sent, m.direction, m.serial, m.copy))),
             accounts=self._accounts(),
         )
 
     def _next_stop(self) -> int:
         """The next event, what the agent waits for, or where a change not seen yet could complete a window."""
-        index, settings = self.machine.index, self.agent.settings
-        stops = [index + settings.window_samples - settings.pre_trigger_samples, self.machine.samples - 1]
+        index = self.machine.index
+        stops = [index + self.agent.shortest_wait, self.machine.samples - 1]
         if self.clock.next_time is not None:
             stops.append(self._sample_at(self.clock.next_time))
         if self.agent.deadline is not None:
             stops.append(self.agent.deadline)
-        return max(min(stops), index + 1)
+        return max(min(stops) if self._probe is None else self._before_moving(min(stops)), index + 1)
+
+    def _before_moving(self, stop: int) -> int:
+        """With the first sample at which the wanted position is another than at the last one; at most `stop`."""
+        first = self.machine.index - 1
+        wanted = self._wanted.on(np.arange(first, stop) / self.scenario.recording.sample_rate)
+        moved = np.flatnonzero(wanted != wanted[0])
+        return first + int(moved[0]) + 1 if moved.size else stop
 
     def _sample_at(self, time: float) -> int:
         """The first sample at or after a time."""
@@ -182,14 +205,29 @@ class Cosimulation:
             self.receipts.append(outgoing.message)
         elif isinstance(outgoing.message, Fallback):
             self.fallbacks.append(outgoing.message)
+        elif isinstance(outgoing.message, Answer):
+            self.answers.append(outgoing.message)
         self.link.up.send(encode(outgoing.message))
 
     def _at_edge(self, data: bytes) -> None:
         """Bytes arrive at the machine."""
         sent = self.agent.receive(decode(data))
-        self._retune()
+        self._follow()
         for outgoing in sent:
             self._send_up(outgoing)
+
+    def _follow(self) -> None:
+        """Let the machine run as the agent wants it to."""
+        self._retune()
+        if self.agent.probe is not self._probe:
+            self._probe = self.agent.probe
+            self.machine.set_reference(self._wanted if self._probe is None else self._moved(self._probe))
+
+    def _moved(self, move: ProbingMove) -> PiecewiseCubic:
+        """The wanted position with a probing move on top."""
+        changes = [(0, 0.0), *move.changes(), (move.last, 0.0)]
+        times = [sample / self.scenario.recording.sample_rate for sample, _ in changes]
+        return shifted(self._wanted, PiecewiseCubic.held(times, [offset for _, offset in changes]))
 
     def _retune(self) -> None:
         """Let the machine run on what the agent has put in force."""
@@ -212,9 +250,9 @@ class Cosimulation:
         self._answer(self.twin.wake(self.clock.now))
 
     def _answer(self, messages: Iterable[Message]) -> None:
-        """Send what the twin says, updates after its processing time, and note when it wants to be woken."""
+        """Send what the twin says, what it worked out after its processing time, and note when it wants to be woken."""
         for message in messages:
-            delay = self.scenario.twin.processing if isinstance(message, Update) else 0.0
+            delay = self.scenario.twin.processing if isinstance(message, Update | Request) else 0.0
             self.clock.schedule(self.clock.now + delay, partial(self.link.down.send, encode(message)))
         if self._wake is not None:
             self.clock.cancel(self._wake)
@@ -233,10 +271,11 @@ class Cosimulation:
         return +(counts + self.agent.dropped)
 
 
-def simulation_of(scenario: Scenario) -> Simulation:
-    """The plant and its controller at the start of a scenario."""
+def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
+    """The plant and its controller at the start of a scenario; `plant` where the machine is another than twin and edge
+    take it for."""
     return Simulation(
-        scenario.servo,
+        scenario.servo if plant is None else plant,
         scenario.duration,
         controller=scenario.start_law,
         reference=scenario.reference,

@@ -11,7 +11,8 @@ from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.passage import Passage
 from servotwin.identify.trend import Trend
 from servotwin.link.simulated import Fate
-from servotwin.messages import Fallback, Message, Receipt, Update, Window, decode
+from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, Window, decode
+from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.scenario import Scenario
 from servotwin.simulation import Run
@@ -74,6 +75,12 @@ class Loop:
         Every decision of the edge, in its order (repeated answers included).
     fallbacks : tuple of messages.Fallback
         When and why the edge left the twin's parameters.
+    excitations : tuple of redesign.excitation.Decision
+        What the twin asked for after a window, or why nothing; one for each window that was looked at.
+    requests : tuple of messages.Request
+        Every request of the twin for windows that tell more.
+    answers : tuple of messages.Answer
+        Every answer of the edge to one, repeated answers included.
     messages : tuple of Transmission
         Every copy of every message, in the order of sending.
     accounts : Counter
@@ -90,6 +97,9 @@ class Loop:
     updates: tuple[Update, ...]
     receipts: tuple[Receipt, ...]
     fallbacks: tuple[Fallback, ...]
+    excitations: tuple[Decision, ...]
+    requests: tuple[Request, ...]
+    answers: tuple[Answer, ...]
     messages: tuple[Transmission, ...]
     accounts: Counter[str]
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from math import inf
 
 from servotwin.edge.limits import Limits
+from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
@@ -39,6 +40,10 @@ LIMITS: Mapping[str, Reader] = {
     "gain_factor_per_s": ("gain_rate", _number),
     "feedforward_v": ("feedforward", _number),
 }
+PROBE: Mapping[str, Reader] = {
+    "interval_s": ("interval_s", Table.number),
+    "rest_s": ("rest_s", Table.number),
+}
 WATCH: Mapping[str, Reader] = {
     "slot_s": ("slot_s", Table.number),
     "window_s": ("window_s", Table.number),
@@ -51,6 +56,11 @@ WATCH: Mapping[str, Reader] = {
     "swings": ("swings", Table.integer),
     "similarity": ("similarity", Table.number),
 }
+
+
+def probe(table: Table) -> ProbeLimits:
+    """Which probing moves the twin may request."""
+    return ProbeLimits(**{"size": table.number("size_mm") * MM, **given(table, PROBE)})
 
 
 def limits(table: Table) -> Limits:

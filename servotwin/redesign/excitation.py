@@ -176,7 +176,10 @@ class ExcitationPolicy:
         return seen.slack + self.pitch * (seen.upper + self.settings.margin)
 
     def _missed(self, memory: Memory) -> str:
-        return f"{memory.misses} of {self.settings.after} windows in a row tell too little of the gap"
+        several = f"{memory.misses} windows in a row tell" if memory.misses > 1 else "1 window tells"
+        enough = "" if memory.misses >= self.settings.after else f", {self.settings.after} are waited for"
+        refused = ", longer ones are refused" if memory.window is Stage.REFUSED else ""
+        return f"{several} too little of the gap{enough}{refused}"
 
     def _window(self, memory: Memory) -> Decision:
         """Shorter windows than could be had: they count until longer ones are asked for, and not against those."""
@@ -185,7 +188,7 @@ class ExcitationPolicy:
             return Decision(replace(memory, misses=0), None, f"a longer window is {memory.window.value} already")
         if memory.misses < s.after:
             return Decision(memory, None, self._missed(memory))
-        why = f"{self._missed(memory)}: windows of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tell more"
+        why = f"{self._missed(memory)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
         asked = replace(memory, misses=0, window=Stage.ASKED)
         return Decision(asked, LongerWindow(s.window, s.pre_trigger), why)
 

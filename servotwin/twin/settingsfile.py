@@ -9,6 +9,7 @@ from servotwin.identify import settingsfile
 from servotwin.identify.gap import METHODS
 from servotwin.identify.trend import TrendSettings
 from servotwin.redesign.certificate import Demands
+from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.uncertainty import Range
 from servotwin.tomltable import Reader, Table, given, part
 from servotwin.twin.settings import POLICIES, TwinSettings
@@ -44,8 +45,24 @@ DEMANDS: Mapping[str, Reader] = {
 }
 
 
+EXCITATION: Mapping[str, Reader] = {
+    "after": ("after", Table.integer),
+    "window_s": ("window", Table.number),
+    "pre_trigger_s": ("pre_trigger", Table.number),
+    "probe_mm": ("probe", lambda table, key: table.number(key, minimum=0.0) * MM),
+    "interval_s": ("interval", Table.number),
+    "hold_s": ("hold", Table.number),
+    "strokes": ("strokes", Table.integer),
+    "margin_deg": ("margin", lambda table, key: table.number(key) * DEG),
+}
+
+
+def _excitation(table: Table) -> ExcitationSettings:
+    return ExcitationSettings(**given(table, EXCITATION))
+
+
 def twin(table: Table) -> TwinSettings:
-    """[twin] with its tables `estimator`, `trend`, `uncertainty` and `demands`."""
+    """[twin] with its tables `estimator`, `trend`, `excitation`, `uncertainty` and `demands`."""
     default = TwinSettings()
     method = table.text("method", default.method, choices=tuple(METHODS))
     limit = table.number("gap_limit_deg", None, minimum=0.0)
@@ -59,6 +76,7 @@ def twin(table: Table) -> TwinSettings:
         k_dz=table.number("k_dz", None, minimum=0.0),
         smoothing=table.number("smoothing", None, minimum=0.0, maximum=1.0),
         k_noise=table.number("k_noise", None, minimum=0.0),
+        excitation=part(table, "excitation", _excitation) if "excitation" in table.values else None,
         initial_gap=table.number("initial_gap_deg", 0.0, minimum=0.0) * DEG,
         trend=part(table, "trend", _trend),
         gap_limit=None if limit is None else limit * DEG,
