@@ -142,7 +142,7 @@ def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path)
     assert fallback.silence_s == certified(scenario.model, scenario.twin).horizon
 
 
-@pytest.mark.parametrize("text", ["[controller]\nki_v_per_m_s = 100.0\n", "[edge]\n"])
+@pytest.mark.parametrize("text", ["[controller]\nki_v_per_m_s = 100.0\n", "[edge]\nwatched = true\n"])
 def test_unless_the_scenario_says_what_it_begins_with(tmp_path, text):
     scenario = load(tmp_path, text)
     assert scenario.start_law == scenario.law

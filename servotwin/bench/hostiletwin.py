@@ -7,13 +7,25 @@ import random
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 
 from msgspec import structs
 
-from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Update, Window
+from servotwin.identify.disturbance import disturbance
+from servotwin.identify.estimate import GapEstimate, GapStatus
+from servotwin.identify.window import Window as NumericWindow
+from servotwin.messages import Band, Fallback, Gains, Message, Receipt, Update, Window
+from servotwin.scenario import Scenario
+from servotwin.twin.inforce import InForce
+from servotwin.twin.policies import policy_of
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+from servotwin.twin.wear import Expectation
 
-HONEST = 2  # updates before a twin falls silent
+HONEST = 2  # windows that are answered before a twin falls silent
 FACTOR = 3.0  # of a lie, either way
+SPREAD = math.radians(0.05)  # of an estimate, so it says
+UNBOUNDED = Band(1.0, 1.0, 10.0, 1e6)
 
 
 class Kind(StrEnum):
@@ -27,45 +39,63 @@ class Kind(StrEnum):
     WANTON = "anything in bounds"
 
 
+_LIES = {Kind.LIES_HIGH: FACTOR, Kind.LIES_LOW: 1.0 / FACTOR}
+
+
+def deceived(scenario: Scenario, gap: float) -> Twin:
+    """The scenario's own twin with its certified policy, but that its estimator always says `gap` (rad)."""
+
+    def estimate(window: NumericWindow, _expected: Expectation) -> GapEstimate:
+        interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
+        return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="told")
+
+    start = InForce(scenario.start_law, scenario.start_tolerance)
+    policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
+    return Twin(scenario.name, estimate, policy, MemoryStore(), scenario.twin, observer, start)
+
+
 @dataclass
 class HostileTwin:
-    """Acknowledges windows and answers them with updates that are wrong in one way.
+    """A twin that is right in everything but one.
 
     Attributes
     ----------
-    name : str
-        The servo's.
     kind : Kind
+    twin : Twin
+        What it would say otherwise.
     own : Gains
         The servo's own.
-    pitch : float
-        m/rad.
-    gap : float
-        rad, the true one.
     draw : random.Random
     """
 
-    name: str
     kind: Kind
+    twin: Twin
     own: Gains
-    pitch: float
-    gap: float
     draw: random.Random
     version: int = 0
     in_force: int = 0
+    windows: int = 0
     said: list[Update] = field(default_factory=list)
 
-    def receive(self, message: Message, _now: float) -> list[Message]:
+    @classmethod
+    def of(cls, kind: Kind, scenario: Scenario, gap: float, draw: random.Random) -> HostileTwin:
+        """For a scenario whose machine has this gap (rad)."""
+        twin = deceived(scenario, gap * _LIES.get(kind, 1.0))
+        return cls(kind, twin, gains(scenario), draw)
+
+    def receive(self, message: Message, now: float) -> list[Message]:
         """What it says to a message."""
+        self.windows += isinstance(message, Window)
+        if self.kind is Kind.NONE or (self.kind is Kind.SILENT and self.windows > HONEST):
+            return []
         if isinstance(message, Receipt | Fallback):
             self.in_force = max(self.in_force, message.parameter_version)
-            return []
-        if not isinstance(message, Window):
-            return []
-        if self.kind is Kind.NONE or (self.kind is Kind.SILENT and len(self.said) >= HONEST):
-            return []
-        acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
-        return [acknowledge, *self._repeated(), self._update(message)]
+        if self.kind is Kind.WANTON:
+            return [self._wanton(message)] if isinstance(message, Window) else []
+        answer = self.twin.receive(message, now)
+        repeated = self._repeated() if isinstance(message, Window) else ()
+        self.said += [each for each in answer if isinstance(each, Update)]
+        return [*repeated, *answer]
 
     def next_wake(self) -> float | None:
         """It never speaks first."""
@@ -86,40 +116,21 @@ class HostileTwin:
         self.version = max(self.version, self.in_force) + 1
         return self.version
 
-    def _update(self, window: Window) -> Update:
-        gains, tolerance = self._wanton() if self.kind is Kind.WANTON else self._setting(self._claimed())
-        update = Update(
-            servo=self.name,
-            version=self._next(),
-            base_version=self.in_force,
-            window=(window.boot, window.sequence),
-            data_time=window.start,
-            gap=self._claimed(),
-            std=0.0,
-            interval=(self._claimed(), self._claimed()),
-            status="OK",
-            tolerance=tolerance,
-            not_after=window.start + 60.0,
-            controller=gains,
-            band=Band(1.0, 1.0, 10.0, 1e6),
-        )
+    def _wanton(self, window: Window) -> Update:
+        """Each value by itself anywhere in its range and a little beyond; its prediction cannot be held against it."""
+        draw, own, none = self.draw, self.own, (None, None)
+        kp, kd, tf = (g * math.exp(draw.uniform(-0.75, 0.1)) for g in (own.Kp, own.Kd, own.Tf))
+        ki, feedforward, leave = own.Ki * draw.uniform(0.0, 0.055), draw.uniform(-0.11, 0.11), draw.uniform(0.0, 1.6)
+        setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
+        version, identity = self._next(), (window.boot, window.sequence)
+        end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 9e-5)])
+        known = (None, None, none, "OK", tolerance, end, setting, UNBOUNDED)
+        update = Update(window.servo, version, self.in_force, identity, window.start, *known)
         self.said.append(update)
         return update
 
-    def _claimed(self) -> float:
-        return self.gap * {Kind.LIES_HIGH: FACTOR, Kind.LIES_LOW: 1.0 / FACTOR}.get(self.kind, 1.0)
 
-    def _setting(self, gap: float) -> tuple[Gains, float]:
-        """Gains that fall and a dead zone that grows with the gap: too quick for a gap told too small, too slow and too
-        wide for one told too large."""
-        scale = 1.5 / (1.0 + 1.5 * gap / math.radians(60.0))
-        gains = Gains(self.own.Kp * scale, 0.0, self.own.Kd * scale, self.own.Tf, 0.5, 1.5)
-        return gains, 0.25 * self.pitch * gap
-
-    def _wanton(self) -> tuple[Gains, float]:
-        """Each value by itself anywhere in its range, and a little beyond."""
-        draw, own = self.draw, self.own
-        kp, kd, tf = (g * math.exp(draw.uniform(-1.0, 1.0)) for g in (own.Kp, own.Kd, own.Tf))
-        ki, feedforward = own.Ki * draw.uniform(0.0, 0.06), draw.uniform(-0.12, 0.12)
-        leave = draw.uniform(0.0, 2.0)
-        return Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward), draw.uniform(0.0, 1e-4)
+def gains(scenario: Scenario) -> Gains:
+    """The servo's own."""
+    own = scenario.law
+    return Gains(own.Kp, own.Ki, own.Kd, own.Tf)
