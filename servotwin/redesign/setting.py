@@ -9,7 +9,6 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 
-# Noise below this is the loop's to follow; above it is passed by the controller as it stands.
 _GRID = 512
 
 
@@ -39,8 +38,9 @@ class Setting:
         loop filter.
         """
         law = self.controller
-        s = 2j * math.pi * np.linspace(*band, _GRID)
+        hertz = np.geomspace(*band, _GRID)
+        s = 2j * math.pi * hertz
         gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
         if law.loop_filter_hz is not None:
             gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
-        return noise * float(np.sqrt(np.mean(np.abs(gain) ** 2)))
+        return noise * float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))
