@@ -235,7 +235,11 @@ def _supervision(table: Table, controller: Controller) -> Supervision | None:
         changed = given(inner, {key.name: (key.symbol, key.read) for key in _GAINS})
         return gains_of(controller.replace(**changed))
 
-    return part(table, "edge", lambda inner: edgefile.supervision(inner, gains))
+    def whole(inner: Table) -> Supervision:
+        inner.table("probe")
+        return edgefile.supervision(inner, gains)
+
+    return part(table, "edge", whole)
 
 
 def _probe(table: Table) -> ProbeLimits | None:
