@@ -13,6 +13,7 @@ from servotwin.identify.estimate import GapStatus
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import LongerWindow, Outcome, Probe, Request
+from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Samples, SignalLike, SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.scenario import Recording, Scenario
@@ -211,3 +212,28 @@ def test_it_is_configured_in_the_file(tmp_path: Path) -> None:
 def test_bad_configuration_is_named(change: tuple[str, str], words: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=words):
         load(tmp_path, TOML.replace(*change))
+
+
+@pytest.mark.parametrize("degrees", [3.0, 15.0, 25.0])
+def test_noise_makes_estimates_of_a_probe_worse_or_none_but_not_wrong(degrees: float) -> None:
+    scenario = calm(
+        MAY_PROBE,
+        1000.0,
+        noise=Noise(1e-6, kind="white"),
+        gap=degrees * DEG,
+        theta_d0=0.3 * degrees * DEG,
+        reference=SquareWave(0.35 * CALM.servo.p * degrees * DEG, 20.0),
+        recording=PROBED,
+        duration=50.0,
+    )
+    loop = cosimulate(scenario)
+    probed = [estimate for (kind, _), estimate in zip(kinds(loop), loop.estimates, strict=True) if kind == "probe"]
+    assert any(estimate.ok for estimate in probed)
+    assert all(estimate.interval[0] < degrees * DEG < estimate.interval[1] for estimate in probed)
+
+
+def test_the_page_shows_a_scenario_that_probes(tmp_path: Path) -> None:
+    page = (Path(__file__).parent.parent / "docs/excitation.md").read_text(encoding="utf-8")
+    scenario = load(tmp_path, page.split("```toml\n")[1].split("```")[0])
+    loop = cosimulate(scenario)
+    assert ("probe", GapStatus.OK) in kinds(loop)
