@@ -129,7 +129,7 @@ def identify(
 @app.command()
 def bench(
     workloads: Annotated[
-        list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start (all by default); or estimator.")
+        list[str] | None, typer.Argument(help="W1, W2, W3, sampled, start (all by default); or estimator, or hostile.")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
@@ -140,14 +140,11 @@ def bench(
     """Speed and accuracy beside what one would use instead, side by side."""
     from datetime import UTC, datetime
 
-    date = datetime.now(UTC).isoformat(timespec="seconds")
-    if workloads and "estimator" in workloads:
-        from servotwin.bench.accuracy import accuracy
-        from servotwin.errors import InvalidInput
+    from servotwin.bench.alone import run_alone
 
-        if len(workloads) > 1 or slow or runs is not None or reference is not None:
-            raise InvalidInput("bench estimator stands alone: of the options it takes --json and --quick only")
-        accuracy(date, json, 0.02 if quick else 1.0)
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    others = slow or runs is not None or reference is not None
+    if run_alone(tuple(workloads or ()), date, json, quick, others):
         return
     from servotwin.bench.catalogue import Options
     from servotwin.bench.command import bench as run

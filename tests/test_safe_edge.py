@@ -5,22 +5,25 @@ import math
 import random
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from servotwin.bench import hostile
-from servotwin.bench.hostile import MARGIN
 from servotwin.bench.hostiletwin import HONEST, HostileTwin, Kind
 from servotwin.control.controller import Controller
 from servotwin.cosim import Cosimulation, simulation_of
-from servotwin.edge.parameters import gains_of
-from servotwin.messages import Band, Cause, Gains, Reason
+from servotwin.messages import Cause, Gains, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
+from servotwin.redesign.assess import Trial, assess
+from servotwin.redesign.certificate import Demands
+from servotwin.redesign.certified import candidates_of
+from servotwin.redesign.certifiedpolicy import CertifiedPolicy
+from servotwin.redesign.uncertainty import draw as members_of
 from servotwin.simulation import Simulation
+from servotwin.twin.settings import TwinSettings
 
-BAND = Band(error=1.06e-4, error_rms=7.82e-5, effort=0.108, settling=hostile.SETTLING)
-"""Measured: `hostile.certified(range(10_000, 10_300))`."""
+QUICK = TwinSettings(demands=Demands(plants=8, screened=4, scales=(0.7, 1.0)))
+"""Settings proved on fewer machines than usual."""
 
 
 def drawn(own: Controller, draw: random.Random) -> Controller:
@@ -55,70 +58,72 @@ def test_a_swap_does_not_move_the_voltage_on_identical_inputs(rate: float | None
     assert abs(voltages[0] - voltages[1]) <= 0.01
 
 
-def test_the_fallback_set_keeps_to_its_band() -> None:
-    band = hostile.certified(range(500, 506))
-    assert band.error < BAND.error
-    assert band.error_rms < BAND.error_rms
-    assert band.effort < BAND.effort
+def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -> None:
+    for seed in range(500, 510):
+        assert hostile.endured(seed, Kind.NONE, QUICK).worst < 1.0
+
+
+def test_a_lie_about_the_gap_alone_cannot_leave_the_band() -> None:
+    """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be."""
+    policy = CertifiedPolicy(hostile.model())
+    candidates = candidates_of(policy.servo, policy.held(), 0.0, disturbed=True, noisy=False)
+    known = policy.uncertainty.replace(input_bias=(-policy.bias_floor, policy.bias_floor))
+    for outcome in assess(candidates, members_of(policy.servo, known, 16, 8, seed=3), Trial()):
+        assert outcome.tail.max() < hostile.band().error
 
 
 @pytest.mark.parametrize("kind", hostile.KINDS)
-def test_the_loop_stays_in_its_band(kind: Kind) -> None:
-    for outcome in hostile.endure(3, BAND, (kind,), first=20):
-        assert outcome.worst < MARGIN
-        assert outcome.outside == 0.0
-        assert outcome.applied > 0 or Reason.OUT_OF_BOUNDS in outcome.refused
+def test_the_loop_stays_in_the_certified_band(kind: Kind) -> None:
+    outcome = hostile.endured(20, kind, QUICK)
+    assert outcome.worst <= 1.0
+    assert outcome.outside == 0.0
 
 
 def test_silence_ends_in_the_fallback_set() -> None:
-    (outcome,) = hostile.endure(1, BAND, (Kind.SILENT,), first=21)
+    outcome = hostile.endured(21, Kind.SILENT, QUICK)
     assert outcome.fallbacks == (Cause.SILENCE,)
     assert 1 <= outcome.applied <= HONEST
 
 
 def test_old_updates_are_refused_however_they_are_numbered() -> None:
-    (outcome,) = hostile.endure(1, BAND, (Kind.REPLAYS,), first=22)
+    outcome = hostile.endured(22, Kind.REPLAYS, QUICK)
     assert outcome.refused[Reason.OLD_DATA] > 0
     assert outcome.refused[Reason.OLD_VERSION] > 0
 
 
 def test_what_leaves_the_band_is_brought_back() -> None:
-    """Settings that nobody certified: some are unstable, and every loop recovers."""
-    outcomes = hostile.endure(6, BAND, (Kind.WANTON,))
+    """Settings that nobody certified, in bounds and a little beyond: every loop recovers."""
+    outcomes = [hostile.endured(seed, Kind.WANTON, QUICK) for seed in (6, 8, 11)]
     assert all(outcome.recovered for outcome in outcomes)
     assert any(Cause.ERROR in outcome.fallbacks for outcome in outcomes)
+    assert sum(outcome.refused[Reason.GAINS_OUT_OF_BOUNDS] for outcome in outcomes) > 0
     assert max(outcome.worst for outcome in outcomes) < 4.0
+
+
+def cosimulated(kind: Kind, gap: float, machine: hostile.Case) -> tuple[Cosimulation, Simulation, HostileTwin]:
+    """The first 30 s."""
+    scenario = hostile.scenario(machine, 3, QUICK).replace(duration=30.0)
+    twin = HostileTwin.of(kind, scenario, gap, random.Random(3))
+    plant = simulation_of(scenario, machine.servo)
+    loop = Cosimulation(scenario, plant, twin=twin)
+    while not loop.done:
+        loop.advance()
+    return loop, plant, twin
 
 
 def test_equal_seeds_give_equal_bytes() -> None:
     digests = set()
     for _ in range(2):
-        machine = hostile.case(3)
-        scenario = hostile.scenario(machine, BAND, 3).replace(duration=30.0)
-        own = gains_of(machine.servo.controller)
-        twin = HostileTwin(scenario.name, Kind.WANTON, own, machine.servo.p, machine.gap, random.Random(3))
-        plant = simulation_of(scenario)
-        loop = Cosimulation(scenario, plant, twin=twin)
-        while not loop.done:
-            loop.advance()
+        loop, plant, _twin = cosimulated(Kind.WANTON, 0.1, hostile.case(3))
         digests.add(loop.loop(plant.run()).digest())
     assert len(digests) == 1
 
 
 def test_the_machine_runs_on_what_the_edge_put_in_force() -> None:
-    machine = replace(hostile.case(3), input_bias=0.0, friction=0.0)
-    scenario = hostile.scenario(machine, BAND, 3).replace(duration=12.0)
-    own = gains_of(machine.servo.controller)
-    twin = HostileTwin(scenario.name, Kind.LIES_LOW, own, machine.servo.p, 0.3, random.Random(3))
-    plant = simulation_of(scenario)
-    loop = Cosimulation(scenario, plant, twin=twin)
-    while not loop.done:
-        loop.advance()
+    machine = replace(hostile.case(3), input_bias=0.03, friction=0.0)
+    loop, plant, twin = cosimulated(Kind.LIES_LOW, 0.3, machine)
     assert loop.agent.parameters.version > 0
     assert isinstance(loop.agent.parameters.gains, Gains)
     assert plant.controller == loop.agent.controller
-    assert plant.controller.Kp == twin.said[loop.agent.parameters.version - 1].controller.Kp
-    applied = next(receipt for receipt in loop.receipts if receipt.applied).sample
-    tolerance = plant.run().tolerance
-    assert np.all(tolerance[:applied] == 0.0)
-    assert np.all(tolerance[applied : applied + 100] > 0.0)
+    assert plant.controller.feedforward == twin.said[-1].controller.feedforward
+    assert plant.controller.feedforward == pytest.approx(-0.03, abs=2e-3)

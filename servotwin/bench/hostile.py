@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import random
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from servotwin.bench.hostiletwin import HostileTwin, Kind
 from servotwin.cosim.driver import Cosimulation, simulation_of
+from servotwin.edge.watch import WatchSettings
 from servotwin.hybrid.automaton import Array
 from servotwin.messages import Band, Cause, Reason
 from servotwin.plant.servo import Servo
@@ -32,6 +33,7 @@ from servotwin.twin.settings import TwinSettings
 RATE = 1000.0  # Hz, ticks and records
 PERIOD = 20.0  # s of the reference's square wave
 DURATION = 100.0  # s
+MARGIN = WatchSettings().margin
 KINDS = (Kind.SILENT, Kind.LIES_HIGH, Kind.LIES_LOW, Kind.REPLAYS)
 
 
@@ -92,7 +94,7 @@ class Outcome:
     outside : float
         s, longest stretch outside of the band.
     recovered : bool
-        Whether every step that began after the last fallback ended inside the band.
+        Whether every step that began after the last fallback ended inside of what the watch allows.
     applied : int
         Updates put in force.
     fallbacks : tuple of Cause
@@ -109,24 +111,19 @@ class Outcome:
     refused: Counter[Reason]
 
 
-def endure(count: int, kinds: Sequence[Kind] = KINDS, first: int = 0) -> Iterator[Outcome]:
-    """`count` machines, the kinds of twins in turn."""
-    return (endured(first + k, kinds[k % len(kinds)]) for k in range(count))
-
-
 @cache
-def band() -> Band:
+def band(settings: TwinSettings | None = None) -> Band:
     """What is certified for the whole stated range."""
-    fallback = scenario(case(0), 0).agent_settings().supervision.fallback
+    fallback = scenario(case(0), 0, settings).agent_settings().supervision.fallback
     assert fallback is not None
     assert fallback.band is not None
     return fallback.band
 
 
-def endured(seed: int, kind: Kind) -> Outcome:
+def endured(seed: int, kind: Kind, settings: TwinSettings | None = None) -> Outcome:
     """The machine of a seed with a twin of a kind."""
-    machine, certified = case(seed), band()
-    loop, run = cosimulated(machine, kind, seed)
+    machine, certified = case(seed), band(settings)
+    loop, run = cosimulated(machine, kind, seed, settings)
     error = np.abs(_settled(run, certified.settling)) / certified.error
     last = max((fallback.sample for fallback in loop.fallbacks), default=0) / RATE
     return Outcome(
@@ -134,14 +131,14 @@ def endured(seed: int, kind: Kind) -> Outcome:
         machine,
         float(error.max()),
         max(map(_longest, error > 1.0)) / RATE,
-        bool(np.all(error[math.ceil(2.0 * last / PERIOD) :] <= 1.0)),
+        bool(np.all(error[math.ceil(2.0 * last / PERIOD) :] <= MARGIN)),
         sum(receipt.applied for receipt in loop.receipts),
         tuple(fallback.cause for fallback in loop.fallbacks),
         Counter(receipt.reason for receipt in loop.receipts if not receipt.applied),
     )
 
 
-def scenario(machine: Case, seed: int) -> Scenario:
+def scenario(machine: Case, seed: int, settings: TwinSettings | None = None) -> Scenario:
     """What edge and twin take the machine for."""
     return Scenario(
         model(),
@@ -151,14 +148,15 @@ def scenario(machine: Case, seed: int) -> Scenario:
         gap=machine.gap,
         theta_d0=machine.theta_d0,
         recording=Recording(RATE),
+        twin=settings or TwinSettings(),
         input_bias=machine.input_bias,
         friction=machine.friction,
     )
 
 
-def cosimulated(machine: Case, kind: Kind, seed: int) -> tuple[Cosimulation, Run]:
+def cosimulated(machine: Case, kind: Kind, seed: int, settings: TwinSettings | None = None) -> tuple[Cosimulation, Run]:
     """The machine with a twin of a kind."""
-    known = scenario(machine, seed)
+    known = scenario(machine, seed, settings)
     twin = HostileTwin.of(kind, known, machine.gap, random.Random(f"{kind} {seed}"))
     plant = simulation_of(known, machine.servo)
     loop = Cosimulation(known, plant, twin=twin)

@@ -14,7 +14,7 @@ from msgspec import structs
 from servotwin.identify.disturbance import disturbance
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window as NumericWindow
-from servotwin.messages import Band, Fallback, Gains, Message, Receipt, Update, Window
+from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Update, Window
 from servotwin.scenario import Scenario
 from servotwin.twin.inforce import InForce
 from servotwin.twin.policies import policy_of
@@ -91,7 +91,7 @@ class HostileTwin:
         if isinstance(message, Receipt | Fallback):
             self.in_force = max(self.in_force, message.parameter_version)
         if self.kind is Kind.WANTON:
-            return [self._wanton(message)] if isinstance(message, Window) else []
+            return self._wanton(message) if isinstance(message, Window) else []
         answer = self.twin.receive(message, now)
         repeated = self._repeated() if isinstance(message, Window) else ()
         self.said += [each for each in answer if isinstance(each, Update)]
@@ -116,18 +116,22 @@ class HostileTwin:
         self.version = max(self.version, self.in_force) + 1
         return self.version
 
-    def _wanton(self, window: Window) -> Update:
+    def _wanton(self, window: Window) -> list[Message]:
         """Each value by itself anywhere in its range and a little beyond; its prediction cannot be held against it."""
         draw, own, none = self.draw, self.own, (None, None)
-        kp, kd, tf = (g * math.exp(draw.uniform(-0.75, 0.1)) for g in (own.Kp, own.Kd, own.Tf))
-        ki, feedforward, leave = own.Ki * draw.uniform(0.0, 0.055), draw.uniform(-0.11, 0.11), draw.uniform(0.0, 1.6)
+        kp, kd, tf = (
+            own.Kp * draw.uniform(0.66, 1.04),
+            own.Kd * draw.uniform(0.66, 1.04),
+            own.Tf * draw.uniform(0.8, 1.2),
+        )
+        ki, feedforward, leave = own.Ki * draw.uniform(0.0, 0.052), draw.uniform(-0.104, 0.104), draw.uniform(0.0, 1.55)
         setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
         version, identity = self._next(), (window.boot, window.sequence)
-        end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 9e-5)])
+        end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
         known = (None, None, none, "OK", tolerance, end, setting, UNBOUNDED)
         update = Update(window.servo, version, self.in_force, identity, window.start, *known)
         self.said.append(update)
-        return update
+        return [Acknowledge(window.servo, window.boot, window.sequence), update]
 
 
 def gains(scenario: Scenario) -> Gains:

@@ -1,0 +1,42 @@
+"""Benches that stand alone: they measure how good something is, not how fast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from servotwin.bench import accuracy, endurance
+from servotwin.errors import InvalidInput
+
+QUICK_SIZE = 0.02
+
+
+def _estimator(date: str, output: Path | None, quick: bool) -> None:
+    accuracy.accuracy(date, output, QUICK_SIZE if quick else 1.0)
+
+
+def _hostile(date: str, output: Path | None, quick: bool) -> None:
+    endurance.endurance(date, output, endurance.QUICK if quick else endurance.MACHINES)
+
+
+ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
+    accuracy.NAME: _estimator,
+    endurance.NAME: _hostile,
+}
+
+
+def run_alone(names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool) -> bool:
+    """Run the one that is named, if one is; `others`: whether options were given that only the speeds take.
+
+    Raises
+    ------
+    InvalidInput
+        It is not alone.
+    """
+    name = next((name for name in names if name in ALONE), None)
+    if name is None:
+        return False
+    if len(names) > 1 or others:
+        raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
+    ALONE[name](date, output, quick)
+    return True

@@ -1,0 +1,110 @@
+"""`servotwin bench hostile`: does the loop stay in its certified band, whatever its twin does?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from servotwin import outputs
+from servotwin.bench import hostile
+from servotwin.bench.hostile import Outcome
+from servotwin.bench.hostiletwin import Kind
+from servotwin.bench.machine import machine
+from servotwin.maps.pool import shared, workplace
+
+SCHEMA = "servotwin-bench-hostile/1"
+NAME = "hostile"
+MACHINES, QUICK = 200, 8
+HEADS = ("twin", "machines", "worst, bands", "outside", "updates applied", "fell back")
+
+Task = tuple[int, Kind]
+
+
+def endurance(
+    date: str = "",
+    output: Path | None = None,
+    count: int = MACHINES,
+    kinds: Sequence[Kind] = hostile.KINDS,
+    console: Console | None = None,
+) -> tuple[Outcome, ...]:
+    """Let machines endure their twins, show what came of it, and write JSON when asked to.
+
+    Parameters
+    ----------
+    date : str
+        Written into the JSON.
+    output : Path, optional
+        File to write, suffix .json.
+    count : int
+        Machines; the kinds of twins take turns.
+    kinds : sequence of Kind
+    console : Console, optional
+
+    Raises
+    ------
+    InvalidInput
+        An output that cannot be written.
+    """
+    console = console or Console()
+    if output is not None:
+        outputs.check_file(output, (".json",))
+    tasks = [(seed, kinds[seed % len(kinds)]) for seed in range(count)]
+    with workplace():
+        running = track(shared(endured, tasks), "enduring", count, console=console, transient=True)
+        found = dict(running)
+    outcomes = tuple(found[task] for task in tasks)
+    console.print(shown(outcomes))
+    console.print(verdict(outcomes), highlight=False)
+    if output is not None:
+        outputs.write_text(output, dumps(outcomes, date))
+        console.print(f"written: {output}", soft_wrap=True, highlight=False)
+    return outcomes
+
+
+def endured(task: Task) -> Outcome:
+    """One machine with its twin."""
+    return hostile.endured(*task)
+
+
+def verdict(outcomes: Sequence[Outcome]) -> str:
+    """One sentence."""
+    band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in outcomes)
+    limit = f"{band.error * 1e3:.3f} mm from {band.settling:g} s after each step on"
+    return f"{inside} of {len(outcomes)} machines stay within {limit}."
+
+
+def shown(outcomes: Sequence[Outcome]) -> Table:
+    """A row for each kind of twin."""
+    result = Table(title="hostile: what the edge endures", title_justify="left", box=None, pad_edge=False)
+    for head in HEADS:
+        result.add_column(head, justify="left" if head == HEADS[0] else "right")
+    for kind in dict.fromkeys(outcome.kind for outcome in outcomes):
+        some = [outcome for outcome in outcomes if outcome.kind is kind]
+        numbers = f"{max(o.worst for o in some):.2f}", sum(o.worst > 1.0 for o in some), sum(o.applied for o in some)
+        result.add_row(kind.value, str(len(some)), *map(str, numbers), str(sum(bool(o.fallbacks) for o in some)))
+    return result
+
+
+def dumps(outcomes: Sequence[Outcome], date: str) -> str:
+    """The document: schema, date, machine, band, and every outcome; the seed of each is its place."""
+    band = hostile.band()
+    rows = [
+        {
+            "twin": outcome.kind.value,
+            "worst_bands": outcome.worst,
+            "outside_s": outcome.outside,
+            "recovered": outcome.recovered,
+            "applied": outcome.applied,
+            "fallbacks": [cause.value for cause in outcome.fallbacks],
+            "refused": {reason.value: number for reason, number in sorted(outcome.refused.items())},
+        }
+        for outcome in outcomes
+    ]
+    head = {"schema": SCHEMA, "date": date, "machine": dict(machine())}
+    limits = {"error_m": band.error, "settling_s": band.settling}
+    return json.dumps({**head, "band": limits, "outcomes": rows}, indent=1, allow_nan=False) + "\n"
