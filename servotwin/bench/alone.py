@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from servotwin.bench import accuracy, endurance
+from servotwin.bench.policies import command as side_by_side
 from servotwin.errors import InvalidInput
 
 QUICK_SIZE = 0.02
@@ -19,9 +20,14 @@ def _hostile(date: str, output: Path | None, quick: bool) -> None:
     endurance.endurance(date, output, endurance.QUICK if quick else endurance.MACHINES)
 
 
+def _policies(date: str, output: Path | None, quick: bool) -> None:
+    side_by_side.policies(date, output, side_by_side.QUICK if quick else side_by_side.MACHINES)
+
+
 ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     accuracy.NAME: _estimator,
     endurance.NAME: _hostile,
+    side_by_side.NAME: _policies,
 }
 
 

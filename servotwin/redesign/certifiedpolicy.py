@@ -134,13 +134,16 @@ class CertifiedPolicy:
         return _sent(sent, _noise(evidence), math.nan, f"{reason}; the fallback set is sent")
 
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
-        """What to feed forward (V), and the range of biases to reckon with."""
+        """What to feed forward (V), and the range of biases to reckon with; what cannot be told from the feedforward
+        in force leaves it."""
         told = evidence.disturbance
+        fed = evidence.controller.feedforward if evidence.controller is not None else 0.0
         if not math.isfinite(told.bias_std):
-            fed = evidence.controller.feedforward if evidence.controller is not None else 0.0
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * told.bias_std, self.bias_floor)
-        return min(max(-told.bias, -limit), limit), (told.bias - spread, told.bias + spread)
+        if abs(told.bias + fed) > spread:
+            fed = min(max(-told.bias, -limit), limit)
+        return fed, (told.bias - spread, told.bias + spread)
 
     def _friction(self, evidence: Evidence) -> Range:
         """Torques (N m) to reckon with: those stated, and what the last feedforward left at rest."""

@@ -2,95 +2,100 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-import joblib
 import numpy as np
 
 from servotwin.bench.policies.contenders import POLICIES, constants, contender
 from servotwin.bench.policies.machines import BLOCKS, Machine, machines
 from servotwin.bench.policies.trial import Scores, Told, run_machine
-from servotwin.hybrid.automaton import Array
+from servotwin.maps.pool import shared
 from servotwin.plant.servo import Servo
+from servotwin.redesign.assess import STILL
 from servotwin.redesign.uncertainty import Uncertainty
 
 LEAST_SETTLED = 0.99
-_SCREENED = 0.2
+_SCREENED, _FEWEST, _FINALISTS = 0.2, 20, 4
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One contender in one block; arrays have a value per machine.
+    """One contender in one block.
 
     Attributes
     ----------
     block, name : str
     scores : Scores
-        Of arrays.
+        Of (N,) arrays, a value per machine.
+    machines : tuple of N Machine
     """
 
     block: str
     name: str
     scores: Scores
+    machines: tuple[Machine, ...]
 
     @property
     def settled(self) -> float:
-        """Share of the machines that settled."""
-        return float(np.mean(np.asarray(self.scores.ripple) < 1e-6))
+        """Share of the machines whose error's half peak-to-peak ends below 1 um."""
+        return float(np.mean(np.asarray(self.scores.ripple) < STILL))
 
-    def p95(self, measure: str) -> float:
-        """95th percentile of a measure."""
-        return float(np.percentile(getattr(self.scores, measure), 95.0))
+    def at(self, measure: str, percent: float) -> float:
+        """A percentile of a measure."""
+        return float(np.percentile(getattr(self.scores, measure), percent))
+
+
+class _Task(NamedTuple):
+    place: int
+    machine: Machine
+    block: str
+    model: Servo
+    told: Told
 
 
 def compare(
-    model: Servo,
-    known: Uncertainty,
-    count: int,
-    seed: int = 2026,
-    blocks: Sequence[str] = BLOCKS,
-    jobs: int = 2,
-    notice: Callable[[str], None] = lambda _: None,
-) -> list[Row]:
-    """All rows, in the order of blocks and contenders; the last of each block is the best constant controller."""
-    rows = []
-    with joblib.Parallel(n_jobs=jobs) as pool:
-        for block in blocks:
-            those = machines(model, known, block, count, seed)
-            for name in POLICIES:
-                notice(f"{block}: {name}")
-                rows.append(_row(pool, block, name, those, model, contender(name, model, known)))
-            notice(f"{block}: constant controllers")
-            rows.append(_best_constant(pool, block, those, model, known))
-    return rows
+    model: Servo, known: Uncertainty, count: int, seed: int = 2026, blocks: Sequence[str] = BLOCKS
+) -> Iterator[Row]:
+    """All rows, in the order of blocks and contenders; the last of each block is the best constant controller.
+
+    Parameters
+    ----------
+    model : Servo
+        What policies know.
+    known : Uncertainty
+        Of which the machines are drawn, and which the certified policy is told.
+    count, seed : int
+        Machines of each block.
+    blocks : sequence of str
+    """
+    for block in blocks:
+        those = machines(model, known, block, count, seed)
+        for name in POLICIES:
+            yield _row(block, name, those, model, contender(name, model, known))
+        yield _best_constant(block, those, model, known)
 
 
-def _row(pool: joblib.Parallel, block: str, name: str, those: Sequence[Machine], model: Servo, told: Told) -> Row:
-    found = pool(joblib.delayed(run_machine)(machine, block, model, told) for machine in those)
-    return Row(block, name, Scores(*np.array(found).T))
+def _row(block: str, name: str, those: Sequence[Machine], model: Servo, told: Told) -> Row:
+    tasks = [_Task(place, machine, block, model, told) for place, machine in enumerate(those)]
+    found = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
+    return Row(block, name, Scores(*np.array([scores for _, scores in found]).T), tuple(those))
 
 
-def _best_constant(
-    pool: joblib.Parallel, block: str, those: Sequence[Machine], model: Servo, known: Uncertainty
-) -> Row:
-    """The best of those that would be best on a fifth of the machines, on all of them: with hindsight."""
-    few = those[: max(20, round(_SCREENED * len(those)))]
-    tried = [
-        (_row(pool, block, f"constant: {name}", few, model, Told(None, setting)), setting)
-        for name, setting in constants(model, known).items()
-    ]
-    tried.sort(key=lambda pair: _rank(pair[0]))
-    finals = [_row(pool, block, row.name, those, model, Told(None, setting)) for row, setting in tried[:4]]
-    return min(finals, key=_rank)
+def _tried(task: _Task) -> Scores:
+    return run_machine(task.machine, task.block, task.model, task.told)
+
+
+def _best_constant(block: str, those: Sequence[Machine], model: Servo, known: Uncertainty) -> Row:
+    """The best on all machines of those that are best on a fifth of them: with hindsight."""
+    few = those[: max(_FEWEST, round(_SCREENED * len(those)))]
+    settings = {f"constant: {name}": setting for name, setting in constants(model, known).items()}
+    tried = [_row(block, name, few, model, Told(None, setting)) for name, setting in settings.items()]
+    finalists = [row.name for row in sorted(tried, key=_rank)[:_FINALISTS]]
+    return min((_row(block, name, those, model, Told(None, settings[name])) for name in finalists), key=_rank)
 
 
 def _rank(row: Row) -> tuple[bool, float]:
-    """Cheapest of those that settle, where settling is asked; noise never does."""
-    return row.block != "noise" and row.settled < LEAST_SETTLED, row.p95("cost")
-
-
-def quantiles(values: Array) -> tuple[float, float]:
-    """Median and 95th percentile."""
-    low, high = np.percentile(values, [50.0, 95.0])
-    return float(low), float(high)
+    """The cheapest of those that settle; in noise nothing does."""
+    return row.block != "noise" and row.settled < LEAST_SETTLED, row.at("cost", 95.0)

@@ -15,7 +15,7 @@ from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
-from servotwin.redesign.assess import NEAR, STILL
+from servotwin.redesign.assess import NEAR
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.setting import Setting
@@ -50,6 +50,8 @@ class Scores(NamedTuple):
         rad/s, mean speed of the motor there, either way.
     position : float
         m, root mean square error there.
+    scale, integral, width : float
+        What was in force at the end: Kp and Ki in the model's own, tolerance in m.
     """
 
     ripple: float
@@ -60,11 +62,9 @@ class Scores(NamedTuple):
     voltage: float
     travel: float
     position: float
-
-    @property
-    def settled(self) -> bool:
-        """Half peak-to-peak below 1 um."""
-        return self.ripple < STILL
+    scale: float
+    integral: float
+    width: float
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,12 @@ def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Score
             simulation.set_controller(_law(now.controller, block), now.tolerance)
             setting = now
     simulation.advance(_sample(REST + DURATION, block))
-    return scores(simulation.run(), machine.step)
+    return scores(simulation.run(), machine.step, setting, model)
 
 
-def scores(run: Run, step: float) -> Scores:
-    """Measures of a run with one step, from there on."""
+def scores(run: Run, step: float, setting: Setting, model: Servo) -> Scores:
+    """Measures of a run with one step, from there on, and the setting at its end."""
+    law, own = setting.controller, model.controller
     error = (run.reference - run.position)[round(REST * run.sample_rate) :]
     last = slice(-round(LAST * run.sample_rate), None)
     outside = np.flatnonzero(np.abs(error) > NEAR * step)
@@ -118,6 +119,9 @@ def scores(run: Run, step: float) -> Scores:
         voltage=float(np.sqrt(np.mean(run.voltage[last] ** 2))),
         travel=float(np.abs(np.diff(run.theta_m[last])).sum()) / LAST,
         position=float(np.sqrt(np.mean(error[last] ** 2))),
+        scale=law.Kp / own.Kp,
+        integral=law.Ki / own.Ki,
+        width=setting.tolerance,
     )
 
 
