@@ -38,6 +38,7 @@ m_percent = 2
 gap_deg = [1, 30]
 step_mm = [0.5, 2]
 input_bias_v = [-0.02, 0.05]
+friction_n_m = [0.0, 0.001]
 [twin.demands]
 Ms = 1.9
 settled_percent = 98
@@ -81,7 +82,7 @@ def test_certified_designs_for_the_controller_that_runs():
 def test_ranges_and_demands_carry_their_units(tmp_path):
     twin = load(tmp_path, NARROW).twin
     assert twin.uncertainty == Uncertainty(
-        0.05, 0.2, 0.03, 0.02, (math.radians(1.0), math.radians(30.0)), (0.5e-3, 2e-3), (-0.02, 0.05)
+        0.05, 0.2, 0.03, 0.02, (math.radians(1.0), math.radians(30.0)), (0.5e-3, 2e-3), (-0.02, 0.05), (0.0, 0.001)
     )
     assert (twin.demands.Ms, twin.demands.settled, twin.demands.overshoot) == (1.9, 0.98, 0.2)
 

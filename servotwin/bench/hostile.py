@@ -1,9 +1,9 @@
 """Is the edge safe from its twin? Random machines, and twins that are silent, lie, repeat themselves or send anything.
 
 The machines are those that the certified policy's default uncertainty stands for: stiffness within 15 %, damping 50 %,
-back-EMF and masses 10 % of the model, gaps from 0 to 60 deg, steps of 0.1 to 2.5 mm, input bias up to 0.1 V either way;
-or, half of them, Coulomb friction worth as much, which is not part of that uncertainty. Edge and twin know the model
-only. The fallback set, its band and the limits are those of every scenario with that policy.
+back-EMF and masses 10 % of the model, gaps from 0 to 60 deg, steps of 0.1 to 2.5 mm, input bias up to 0.1 V either way.
+Others have Coulomb friction worth as much instead, which nobody stated. Edge and twin know the model only. The fallback
+set, its band and the limits are those of every scenario with that policy.
 """
 
 from __future__ import annotations
@@ -65,15 +65,15 @@ def model() -> Servo:
     return Servo.preset("paper").replace(sample_rate=RATE)
 
 
-def case(seed: int) -> Case:
-    """The machine of a seed."""
+def case(seed: int, rubs: bool = False) -> Case:
+    """The machine of a seed; `rubs`: with friction instead of an input bias."""
     draw, servo, known = random.Random(seed), model(), TwinSettings().uncertainty
     plant = {name: getattr(servo, name) * (1.0 + _within(draw, name, known)) for name in ("k", "c", "k_B", "m")}
     gap = draw.uniform(*known.gap)
     step = math.exp(draw.uniform(*map(math.log, known.step)))
-    biased, size = draw.random() < 0.5, draw.uniform(*known.input_bias)
-    friction = 0.0 if biased else abs(size) * servo.k_T / servo.R
-    return Case(servo.replace(**plant), gap, draw.uniform(-0.5, 0.5) * gap, step, size if biased else 0.0, friction)
+    bias, theta_d0 = draw.uniform(*known.input_bias), draw.uniform(-0.5, 0.5) * gap
+    disturbed = (0.0, abs(bias) * servo.k_T / servo.R) if rubs else (bias, 0.0)
+    return Case(servo.replace(**plant), gap, theta_d0, step, *disturbed)
 
 
 def _within(draw: random.Random, name: str, known: Uncertainty) -> float:
@@ -120,9 +120,9 @@ def band(settings: TwinSettings | None = None) -> Band:
     return fallback.band
 
 
-def endured(seed: int, kind: Kind, settings: TwinSettings | None = None) -> Outcome:
+def endured(seed: int, kind: Kind, settings: TwinSettings | None = None, rubs: bool = False) -> Outcome:
     """The machine of a seed with a twin of a kind."""
-    machine, certified = case(seed), band(settings)
+    machine, certified = case(seed, rubs), band(settings)
     loop, run = cosimulated(machine, kind, seed, settings)
     error = np.abs(_settled(run, certified.settling)) / certified.error
     last = max((fallback.sample for fallback in loop.fallbacks), default=0) / RATE

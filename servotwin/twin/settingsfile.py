@@ -37,6 +37,7 @@ UNCERTAINTY: Mapping[str, Reader] = {
     "gap_deg": ("gap", lambda table, key: _range(table, key, DEG)),
     "step_mm": ("step", lambda table, key: _range(table, key, MM)),
     "input_bias_v": ("input_bias", lambda table, key: _range(table, key, 1.0)),
+    "friction_n_m": ("friction", lambda table, key: _range(table, key, 1.0)),
 }
 DEMANDS: Mapping[str, Reader] = {
     "Ms": ("Ms", lambda table, key: table.number(key, minimum=1.0)),
