@@ -68,6 +68,8 @@ class Record:
         Bytes of each whole window message as sent.
     quantisation : float
         Largest half step of the decoded position, m.
+    updates : tuple of messages.Update
+        What the twin sent.
     """
 
     trace: Trace
@@ -77,6 +79,7 @@ class Record:
     channel_bytes: tuple[int, ...]
     message_bytes: tuple[int, ...]
     quantisation: float
+    updates: tuple[messages.Update, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +141,7 @@ def record(scenario: st.Scenario, exact: bool = False, progress: Progress | None
         channel_bytes=tuple(sum(len(c.data) for c in _channels(w)) for w in loop.windows),
         message_bytes=_window_bytes(loop),
         quantisation=max((_half_step(window) for window in loop.windows), default=0.0),
+        updates=loop.updates,
     )
 
 

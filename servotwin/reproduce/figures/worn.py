@@ -59,6 +59,11 @@ def gaps(axes: Axes, record: Record, pitch: float) -> None:
     """The gap, the twin's estimates with their spread, and what the dead zone in force is made for."""
     true_gap(axes, record.trace)
     gap_in_force(axes, record.trace, pitch, "dead zone in force")
+    estimates(axes, record)
+
+
+def estimates(axes: Axes, record: Record) -> None:
+    """The twin's estimates with their spread."""
     time, value, spread = _columns((e.time, e.gap * style.DEG, e.std * style.DEG) for e in record.estimates if e.ok)
     axes.errorbar(time, value, spread, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
     refused = _columns((e.time, e.gap * style.DEG) for e in record.estimates if not e.ok)
