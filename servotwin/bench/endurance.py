@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -58,7 +59,9 @@ def endurance(
         outputs.check_file(output, (".json",))
     tasks = [(seed, kinds[seed % len(kinds)], False) for seed in range(count)]
     tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // RUBBING)]
-    with workplace():
+    with workplace(), warnings.catch_warnings():
+        # A process whose caches have grown is replaced by another; its jobs are not lost.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         running = track(shared(endured, tasks), "enduring", len(tasks), console=console, transient=True)
         found = dict(running)
     outcomes = tuple(found[task] for task in tasks)
