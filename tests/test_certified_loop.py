@@ -9,9 +9,10 @@ import pytest
 from servotwin.cosim import Loop, cosimulate
 from servotwin.identify.estimate import GapStatus
 from servotwin.redesign.certificate import Certificate
-from servotwin.scenario import Scenario
+from servotwin.scenario import Recording, Scenario
 from servotwin.twin.policies import certified
 from servotwin.twin.proof import proof_of
+from servotwin.twin.settings import TwinSettings
 
 LEARNT = 20.0  # s, the second step begins
 
@@ -87,3 +88,22 @@ def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
     left = scenario.input_bias / proved.setting.controller.Kp
     assert error[settled].max() == pytest.approx(left, rel=0.02)
     assert left < proved.tail < proved.within
+
+
+@pytest.mark.parametrize("policy", ["margin", "hysteresis"])
+def test_the_other_policies_close_the_loop_too(policy):
+    """What hysteresis sends passes the limits that are made for it."""
+    scenario = Scenario.preset("fig15").replace(
+        duration=45.0, gap=math.radians(10.0), recording=Recording(), twin=TwinSettings(policy=policy)
+    )
+    found = cosimulate(scenario)
+    assert len(found.applied) == len(found.updates) == 3
+    assert not found.fallbacks
+    error = np.abs(found.run.reference - found.run.position)
+    assert error[round(30.0 * found.run.sample_rate) : round(40.0 * found.run.sample_rate) - 1].max() < 0.1e-3
+
+
+def test_noise_and_a_loop_filter_are_no_reason_to_fall_back():
+    found = cosimulate(Scenario.preset("fig16").replace(duration=45.0, twin=TwinSettings()))
+    assert not found.fallbacks
+    assert len(found.applied) == len(found.updates) >= 1
