@@ -79,7 +79,8 @@ def _look_around(
     """Where the search at the full rate begins."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
     angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
-    slow = Reduction.of(angle, seen, response(servo, rate / reduce.factor))
+    model = response(servo, rate / reduce.factor)
+    slow = Reduction.of(angle, seen, model, _offset(settings, model.static_gain, float(theta_m[0]), float(position[0])))
     span = float(np.ptp(angle))
     starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
     return candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)

@@ -114,9 +114,15 @@ class Reduction:
         return np.hstack(columns) if known else columns[0]
 
     def coarse(self) -> Misfit:
-        """The misfit in white noise, with the fixed nuisances only: for the first search."""
-        basis = _fixed_basis(self.response, self.decimation, self.theta_m.size)
-        return Misfit(self.theta_m, self.position, basis, self.response, self.decimation, rate=self.rate)
+        """The misfit in white noise, with the fixed nuisances only: for the first search.
+
+        A constant that is known is taken off: as if it were free, the search would end where it is not, and the noise
+        would be made of what that leaves.
+        """
+        fixed = self.fixed()
+        known = 0.0 if self.offset is None else self.offset.mean * fixed[0]
+        basis = _fixed_basis(self.response, self.decimation, self.theta_m.size, self.offset is None)
+        return Misfit(self.theta_m, self.position - known, basis, self.response, self.decimation, rate=self.rate)
 
     def misfit(self, noise: Autoregression, point: Point) -> Misfit:
         """The misfit in noise of a known kind, its nuisances taken at a point."""
@@ -147,8 +153,8 @@ def _fixed(model: Response, reduce: Decimation, samples: int) -> Array:
 
 
 @lru_cache(maxsize=32)
-def _fixed_basis(model: Response, reduce: Decimation, samples: int) -> Array:
-    return orthonormal(_fixed(model, reduce, samples))
+def _fixed_basis(model: Response, reduce: Decimation, samples: int, constant: bool) -> Array:
+    return orthonormal(_fixed(model, reduce, samples)[0 if constant else 1 :])
 
 
 def factor_for(model: Response, samples: int) -> int:
