@@ -29,6 +29,7 @@ from_deg = 4.0
 to_deg = 8.0
 over_s = 80.0
 [twin]
+policy = "paper"
 enabled = false
 """
 WEAR = SCurve(math.radians(4.0), math.radians(8.0), 80.0)
