@@ -356,3 +356,23 @@ def test_rounding_proves_nothing():
         estimate = estimate_gap(cut(run, start, 1.0).window, servo)
         assert not estimate.ok
         assert estimate.status is not GapStatus.LOWER_BOUND or estimate.gap <= gap
+
+
+def test_a_gap_taken_for_constant_that_grows_is_covered_or_refused():
+    """Accepted once as 0.8 deg where it was 15.6: one contact, and the growth looked like another."""
+    servo = Servo.preset("paper").replace(n=5)
+    law = servo.controller
+    servo = servo.replace(Kp=0.343 * law.Kp, Ki=0.125 * law.Ki, Kd=0.343 * law.Kd)
+    gap, wave = SCurve(math.radians(14.64), math.radians(17.0), 20.0), SquareWave(1.5924e-3, 8.7105)
+    run = simulate(servo, 18.0, reference=wave, gap=gap, tolerance=servo.tolerance_for(math.radians(14.64)))
+    cases = [cut(run, float(start), 1.0) for start in np.arange(4.0, 17.0, 0.5)]
+    estimates = [estimate_gap(case.window, servo) for case in cases]
+    accepted = [(e, case.gap) for e, case in zip(estimates, cases, strict=True) if e.ok]
+    assert len(accepted) >= 5
+    assert all(e.interval[0] < gap < e.interval[1] for e, gap in accepted)
+
+
+def test_growth_is_among_the_reasons():
+    run = simulate(SERVO, 22.0, reference=SquareWave(1e-3, 20.0), gap=SCurve(0.0, math.radians(60.0), 40.0))
+    refused = [estimate_gap(cut(run, start, 1.0).window, SERVO) for start in (9.9, 10.2, 20.0)]
+    assert any("grows by +" in reason for estimate in refused for reason in estimate.reasons), refused

@@ -2,7 +2,8 @@
 
 Near the fit, a model that is a little off adds multiples of a few known motions to the position: those of a stiffer or
 more damped structure, of another pitch or scale, of a compliant screw. Let free within wide tolerances, they take what
-they can of the residual, and the gap moves with them.
+they can of the residual, and the gap moves with them. So does a gap that grows within the window, where it counts as
+constant.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.identify.core.between import polygon
+from servotwin.identify.core.contacts import BY_RATE
 from servotwin.identify.core.normal import LeastSquares, least_squares
 from servotwin.identify.core.projection import orthonormal, project_out, spread
 from servotwin.identify.core.response import Response, response
@@ -28,6 +30,7 @@ from servotwin.plant.signals import Array
 _STEP = 1e-3  # relative
 _STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
 TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
+GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
 _ALPHA = 40.0  # rad/s, the paper's observer
 
 
@@ -47,11 +50,16 @@ def model_shift(found: Found, servo: Servo, order: int) -> Shift:
     Whitening takes a wrong model for noise; with the model free it is seen for what it is.
     """
     model, reduction = found.reduction.response, found.reduction
-    screw = polygon(reduction.theta_m, found.point.screw(0.0, reduction.rate))[:1]
+    seen = polygon(reduction.theta_m, found.point.screw(0.0, reduction.rate))
+    screw = seen[:1]
     here = model.respond(screw)
     motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
     motions.insert(2, here)
-    free = reduction.decimation.rows(np.vstack(motions)) * np.array(list(TOLERANCES.values()))[:, None]
+    sizes = list(TOLERANCES.values())
+    if reduction.growth is None:
+        motions.append(model.respond(seen[BY_RATE:]))
+        sizes.append(GROWTH * model.interval)
+    free = reduction.decimation.rows(np.vstack(motions)) * np.array(sizes)[:, None]
     table, size = np.vstack([reduction.table(found.point), free]), len(free)
     shares = _within_tolerance(reduction.prepared(found.noise, table, CONSTANT), size).coefficients
     noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
@@ -75,6 +83,8 @@ def _within_tolerance(rows: Array, free: int) -> LeastSquares:
 def _words(shares: Array, deviations: Array) -> str:
     """Which direction is needed most, and by how much."""
     index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
+    if index == len(TOLERANCES):
+        return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
     name = list(TOLERANCES)[index]
     return f"a {name} off by {100.0 * TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
 

@@ -13,13 +13,21 @@ from servotwin.identify.core.projection import spread
 from servotwin.identify.core.whitening import Autoregression, burg
 from servotwin.identify.whitened.misfit import Misfit, Point
 from servotwin.identify.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
-from servotwin.identify.whitened.search import ROUGH, Fit, continued, descend, in_contact, off_the_plain, search
+from servotwin.identify.whitened.search import (
+    Fit,
+    continued,
+    descend,
+    in_contact,
+    off_the_plain,
+    off_the_plateau,
+    search,
+)
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
 _EARLY, _PLACES = 1, (-0.85, 0.0, 0.85)  # the pass in which a growing gap is looked at from other places, and these
 _GLANCE = 8  # steps from there
-_FINE = 1e-6  # of the cost: what the last descent may leave, a hundredth of a standard deviation
+_ROUGH, _FINE = 1e-5, 1e-7  # of the cost: what a descent may leave; 1e-7 is below a hundredth of a standard deviation
 _SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
 
 
@@ -75,7 +83,9 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
     count : int
         At most as many.
     """
-    fits = sorted(search(slow.coarse(), gaps, largest, tolerance), key=lambda fit: fit.slopes.cost)
+    misfit = slow.coarse()
+    fits = sorted(search(misfit, gaps, largest, tolerance), key=lambda fit: fit.slopes.cost)
+    fits.insert(0, off_the_plateau(misfit, fits[0], largest, tolerance))
     different = fits[:1]
     for fit in fits[1:]:
         if fit.slopes.cost > (1.0 + _SAME) * different[-1].slopes.cost:
@@ -85,7 +95,7 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
 
 def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60) -> Fit:
     """The lowest of the minima nearest to some points, or of what so many steps lead to."""
-    fits = [descend(misfit, point, largest, tolerance, steps, gain=ROUGH) for point in points]
+    fits = [descend(misfit, point, largest, tolerance, steps, gain=_ROUGH) for point in points]
     best = min(fits, key=lambda fit: fit.slopes.cost)
     return Fit(best.point, best.slopes, sum(fit.evaluations for fit in fits), best.converged)
 

@@ -15,7 +15,7 @@ from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
-ROUGH = 1e-5  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
+ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
 
 
 class Free(NamedTuple):
@@ -26,6 +26,8 @@ class Free(NamedTuple):
 
 
 BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
+_ROUND = tuple(0.1 * step for step in range(-9, 10))
+_LOWER = 1e-3  # of the cost: how much another place must promise
 _PLAIN = 1e-4  # of the information: below it gap and place are not told apart
 PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85), (0.002, 0.01, 0.03, 0.08, 0.2)
 
@@ -133,6 +135,22 @@ def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit
 def in_contact(point: Point) -> list[Point]:
     """The point with the screw in the contact that it is close to, if it is and does not begin there."""
     return [point._replace(place=math.copysign(1.0, point.place))] if _WITHIN[-1] <= abs(point.place) < 1.0 else []
+
+
+def off_the_plateau(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """A fit, or a lower one from the lowest of other places in the same gap.
+
+    A contact in the first moments of a window looks like motion from before it: over much of the gap the place makes no
+    difference, nothing leads away from there, and a place that makes one may lie beyond.
+    """
+    points = [fit.point._replace(place=place) for place in _ROUND]
+    costs = [misfit.cost(point) for point in points]
+    lowest = int(np.argmin(costs))
+    if not costs[lowest] < (1.0 - _LOWER) * fit.slopes.cost:
+        return fit
+    other = descend(misfit, points[lowest], largest, tolerance, gain=ROUGH)
+    best = min(fit, other, key=lambda one: one.slopes.cost)
+    return Fit(best.point, best.slopes, fit.evaluations + other.evaluations, best.converged)
 
 
 def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
