@@ -130,7 +130,9 @@ def identify(
 def bench(
     workloads: Annotated[
         list[str] | None,
-        typer.Argument(help="W1, W2, W3, sampled, start (all by default); or one of estimator, hostile, policies."),
+        typer.Argument(
+            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies."
+        ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,

@@ -159,9 +159,9 @@ def test_slow_contestants_are_asked_for():
 
 
 def test_workloads_are_chosen_by_name():
-    assert catalogue.chosen([]) == ("W1", "W2", "W3", "sampled", "start")
+    assert catalogue.chosen([]) == ("W1", "W2", "W3", "sampled", "decision", "start")
     assert catalogue.chosen(["SAMPLED", "w1"]) == ("W1", "sampled")
-    with pytest.raises(InvalidInput, match=r"workload 'W9' does not exist.*W1, W2, W3, sampled, start"):
+    with pytest.raises(InvalidInput, match=r"workload 'W9' does not exist.*W1, W2, W3, sampled, decision, start"):
         catalogue.chosen(["W9"])
 
 

@@ -323,3 +323,21 @@ def test_hysteresis_enters_inside_and_leaves_outside() -> None:
     assert made.controller is not None
     assert (made.controller.enter, made.controller.leave) == (0.5, 1.5)
     assert made.tolerance == SERVO.tolerance_for(10.0 * DEG)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0])
+def test_on_the_model_a_millimetre_step_is_quick_and_hardly_overshoots(degrees: float) -> None:
+    found = certify(SERVO, Uncertainty(gap=gaps(max(0.0, degrees - 0.1), degrees + 0.1)), SMALL, SHORT)
+    assert isinstance(found, Certificate)
+    run = simulate(
+        SERVO,
+        10.0,
+        controller=found.setting.controller,
+        reference=1e-3,
+        gap=degrees * DEG,
+        tolerance=found.setting.tolerance or None,
+        sample_rate=500.0,
+    )
+    off = run.position / 1e-3 - 1.0
+    assert off.max() <= 0.1
+    assert run.time[np.flatnonzero(np.abs(off) > 0.02)[-1]] <= 2.0

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from servotwin.bench import fits, hold, ours, solver, startup, taylor
+from servotwin.bench import decisions, fits, hold, ours, solver, startup, taylor
 from servotwin.bench.contest import Check, Contestant, Workload
 from servotwin.bench.machine import cores
 from servotwin.bench.workloads import UNIT, Noisy, Sweep, Wear
@@ -152,6 +152,18 @@ def sampled(options: Options) -> Workload:
     )
 
 
+def decision(options: Options) -> Workload:
+    """What the certified policy takes to decide."""
+    size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
+    return Workload(
+        "decision",
+        f"settings proved on {size} each",
+        decisions.decisions(options.quick),
+        (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
+        lambda _: "",
+    )
+
+
 def start(options: Options) -> Workload:
     """A process's first run."""
     return Workload(
@@ -159,7 +171,7 @@ def start(options: Options) -> Workload:
     )
 
 
-WORKLOADS: dict[str, Build] = {"W1": w1, "W2": w2, "W3": w3, "sampled": sampled, "start": start}
+WORKLOADS: dict[str, Build] = {"W1": w1, "W2": w2, "W3": w3, "sampled": sampled, "decision": decision, "start": start}
 
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
