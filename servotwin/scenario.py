@@ -14,8 +14,9 @@ from typing import Any
 
 from servotwin import scenariofile
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters, gains_of, with_gains
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import shortest_window

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import gains_of
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.link.session import Retry

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from servotwin.control.gains import gains_of
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters, gains_of
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.messages import Gains

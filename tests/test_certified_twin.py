@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from servotwin import messages
+from servotwin.control.gains import gains_of
 from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate, GapStatus
 from servotwin.messages import Acknowledge, Gains, Update, pack_channel
@@ -14,7 +15,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certificate import Demands
 from servotwin.redesign.certifiedpolicy import band_of
 from servotwin.redesign.uncertainty import Uncertainty
-from servotwin.twin.inforce import InForce, gains_of
+from servotwin.twin.inforce import InForce
 from servotwin.twin.policies import certified, policy_of
 from servotwin.twin.proof import proof_of
 from servotwin.twin.settings import TwinSettings

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from servotwin.control.gains import gains_of
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.servo import Servo

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
+from servotwin.control.gains import gains_of
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import gains_of
 from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings

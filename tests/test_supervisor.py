@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from servotwin.control import Controller
+from servotwin.control.gains import gains_of
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import gains_of
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.store import MemoryStore
 from servotwin.edge.verdict import FallbackSet

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from servotwin.control import Controller
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters, gains_of, with_gains
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.switch import Rules, Switch, Waiting, fall_back, is_safe, offer, settle
 from servotwin.edge.verdict import FallbackSet, Verdict
 from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Update

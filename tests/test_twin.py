@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from servotwin import messages
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate, GapStatus
@@ -30,7 +31,7 @@ from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.simulation import simulate
 from servotwin.twin.decode import decode_channel, decode_window
-from servotwin.twin.inforce import InForce, gains_of
+from servotwin.twin.inforce import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin

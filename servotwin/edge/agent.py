@@ -15,9 +15,10 @@ from math import ceil, inf
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import with_gains
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
-from servotwin.edge.parameters import Parameters, with_gains
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings

@@ -1,11 +1,8 @@
-"""What the edge runs on, and how it becomes a controller."""
+"""What the edge runs on."""
 
 from dataclasses import dataclass
 from math import inf
 
-import msgspec
-
-from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Gains
 
@@ -51,13 +48,3 @@ class Parameters:
             raise InvalidInput(f"tolerance in force = {self.tolerance!r} m: must be finite and at least 0")
         if self.version < 0:
             raise InvalidInput(f"version in force = {self.version!r}: must be at least 0")
-
-
-def gains_of(controller: Controller) -> Gains:
-    """The part of a controller that updates may set."""
-    return Gains(*(float(getattr(controller, name)) for name in Gains.__struct_fields__))
-
-
-def with_gains(controller: Controller, gains: Gains | None) -> Controller:
-    """The controller with other gains; its limits, filters and rates stay."""
-    return controller if gains is None else controller.replace(**msgspec.structs.asdict(gains))

@@ -7,9 +7,10 @@ the same whether samples come one by one or in blocks.
 from dataclasses import replace
 from math import ceil, inf
 
+from servotwin.control.gains import gains_of
 from servotwin.edge import switch
 from servotwin.edge.guard import Instant
-from servotwin.edge.parameters import Parameters, gains_of
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Recorder
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import Store

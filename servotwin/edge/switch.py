@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant, applied, judge, receipt, repeats
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters, gains_of, with_gains
+from servotwin.edge.parameters import Parameters
 from servotwin.edge.verdict import FallbackSet, Verdict
 from servotwin.messages import Fallback, Gains, Reason, Receipt, Update
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import msgspec
-
 from servotwin.control.controller import Controller
+from servotwin.control.gains import with_gains
 from servotwin.messages import Fallback, Gains, Update
 
 
@@ -36,21 +35,13 @@ class Settings:
     def issue(self, update: Update) -> None:
         """Note what an update sets; without gains those of its base stay."""
         base = self.of(update.base_version).controller
-        self.by_version[update.version] = InForce(with_gains(base, update.controller), update.tolerance)
+        self.by_version[update.version] = InForce(_changed(base, update.controller), update.tolerance)
 
     def fall_back(self, message: Fallback) -> None:
         """Note what the edge has set by itself."""
         base = self.of(message.replaced).controller
-        self.by_version[message.parameter_version] = InForce(with_gains(base, message.controller), message.tolerance)
+        self.by_version[message.parameter_version] = InForce(_changed(base, message.controller), message.tolerance)
 
 
-def gains_of(controller: Controller) -> Gains:
-    """What of a controller an update carries."""
-    return Gains(**{name: getattr(controller, name) for name in Gains.__struct_fields__})
-
-
-def with_gains(controller: Controller | None, gains: Gains | None) -> Controller | None:
-    """A controller with other gains; its limits and rates stay."""
-    if controller is None or gains is None:
-        return controller
-    return controller.replace(**msgspec.structs.asdict(gains))
+def _changed(base: Controller | None, gains: Gains | None) -> Controller | None:
+    return base and with_gains(base, gains)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.identify.disturbance import Disturbance, disturbance, nothing_known
 from servotwin.identify.estimate import GapEstimate
@@ -29,7 +30,7 @@ from servotwin.redesign.evidence import UNASKED, Evidence
 from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.decode import decode_window
 from servotwin.twin.estimating import UNUSABLE, Estimator, estimator_of, no_use
-from servotwin.twin.inforce import InForce, Settings, gains_of
+from servotwin.twin.inforce import InForce, Settings
 from servotwin.twin.policies import policy_of
 from servotwin.twin.proof import proof_of
 from servotwin.twin.requests import Requests, requests_of
