@@ -27,9 +27,10 @@ def quiet():
     return Console(file=io.StringIO())
 
 
-def test_every_figure_of_the_paper_is_there():
+def test_every_figure_of_the_paper_is_there_and_ours_come_last():
     names = [plate.name for plate in figures.PLATES]
-    assert names == ["fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1", "estimator"]
+    ours = ["estimator", "policies", "policies-noise", "policies-bias"]
+    assert names == [*("fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1"), *ours]
     assert all(plate.title and plate.caption for plate in figures.PLATES)
 
 

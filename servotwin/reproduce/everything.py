@@ -15,7 +15,7 @@ from rich.table import Table
 from servotwin import outputs
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import PRESETS
-from servotwin.reproduce import claims, document, figures
+from servotwin.reproduce import chapter, claims, document, figures
 from servotwin.reproduce.claims import Claim, Result, Verdict
 from servotwin.reproduce.report import report
 from servotwin.reproduce.tasks import ClaimsTask, Drawn, FigureTask, Task, perform
@@ -44,7 +44,8 @@ def reproduce(
     Parameters
     ----------
     out : Path
-        Made if missing. Gets NAME.svg and NAME.png for each figure, claims.json (see `document`) and report.html.
+        Made if missing. Gets NAME.svg and NAME.png for each figure, claims.json (see `document`), report.html, and
+        where policies are compared beyond.json (see `chapter`).
     only : sequence of str
         Names of figures and claims; empty: all.
     preset : str
@@ -72,6 +73,9 @@ def reproduce(
     tasks = planned(selection, preset, outputs.make_directory(out))
     drawn, results = _sorted(_watched(tasks, workers or _workers(tasks), console), selection)
     outputs.write_text(out / "claims.json", document.dumps(results))
+    compared = {one.name: one.outcomes for one in drawn if one.outcomes}
+    if compared:
+        outputs.write_text(out / "beyond.json", chapter.dumps(compared, preset))
     path = outputs.write_text(out / "report.html", report(results, drawn, preset))
     _tell(results, path, console)
     return path
@@ -123,7 +127,7 @@ def _watched(tasks: Sequence[Task[Outcome]], workers: int, console: Console) -> 
 
 
 def _sorted(outcomes: Iterable[Outcome], selection: Selection) -> tuple[list[Drawn], list[Result]]:
-    """Figures and results in the paper's order."""
+    """Figures and results in the paper's order, figures of ours last."""
     outcomes = list(outcomes)
     by_name = {one.name: one for one in outcomes if isinstance(one, Drawn)}
     by_key = {(r.claim.id, r.preset): r for found in outcomes if isinstance(found, tuple) for r in found}

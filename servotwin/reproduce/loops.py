@@ -13,6 +13,7 @@ from servotwin.identify import paper, whitened
 from servotwin.identify.estimate import GapStatus
 from servotwin.identify.window import Window
 from servotwin.plant.signals import as_pieces
+from servotwin.reproduce.inforce import Change, changes
 from servotwin.reproduce.measures import Step
 from servotwin.reproduce.runs import BIPOLAR, Square, Trace
 from servotwin.twin.estimating import Estimator, estimator_of
@@ -70,6 +71,8 @@ class Record:
         Largest half step of the decoded position, m.
     updates : tuple of messages.Update
         What the twin sent.
+    changes : tuple of Change
+        What was in force at the edge, and since when.
     """
 
     trace: Trace
@@ -80,6 +83,7 @@ class Record:
     message_bytes: tuple[int, ...]
     quantisation: float
     updates: tuple[messages.Update, ...] = ()
+    changes: tuple[Change, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +146,7 @@ def record(scenario: st.Scenario, exact: bool = False, progress: Progress | None
         message_bytes=_window_bytes(loop),
         quantisation=max((_half_step(window) for window in loop.windows), default=0.0),
         updates=loop.updates,
+        changes=changes(loop),
     )
 
 

@@ -10,7 +10,7 @@ from html import escape
 from importlib import resources
 
 import servotwin as st
-from servotwin.reproduce import page
+from servotwin.reproduce import chapter, figures, page
 from servotwin.reproduce.claims import Claim, Finding, Result, Value, Verdict
 from servotwin.reproduce.document import DEFINITIONS, PAPER, by_claim
 from servotwin.reproduce.tasks import Drawn, plate
@@ -25,8 +25,11 @@ def report(results: Sequence[Result], drawn: Sequence[Drawn], preset: str) -> st
     body = [*_head(rows, drawn)]
     if rows:
         body += _claims(rows)
-    if drawn:
-        body += _figures(drawn, preset)
+    papers, ours = split(drawn)
+    if papers:
+        body += _figures(papers, preset)
+    if ours:
+        body += _beyond(ours, preset)
     body += [*_errata(), *_how()]
     return page.page(TITLE, body)
 
@@ -42,7 +45,8 @@ def _head(rows: Mapping[Claim, Row], drawn: Sequence[Drawn]) -> Iterator[str]:
     yield f"<p>What {escape(PAPER)} says, beside what this package measures by running the code.</p>"
     links = [
         ("claims", "Claims", rows),
-        ("figures", "Figures", drawn),
+        ("figures", "Figures", split(drawn)[0]),
+        ("beyond", "Beyond the paper", split(drawn)[1]),
         ("errata", "Errata", True),
         ("how", "How", True),
     ]
@@ -139,9 +143,33 @@ def shown(value: Value | None) -> str:
 def _figures(drawn: Sequence[Drawn], preset: str) -> Iterator[str]:
     yield '<h2 id="figures">Figures</h2>'
     yield f"<p>Drawn with the preset <code>{escape(preset)}</code>.</p>"
+    yield from map(_figure, drawn)
+
+
+def _beyond(drawn: Sequence[Drawn], preset: str) -> Iterator[str]:
+    """Our own figures, with a table where they compare policies."""
+    yield '<h2 id="beyond">Beyond the paper</h2>'
+    yield (
+        f"<p>None of this is in the paper, and nothing here is a claim about its numbers. Preset"
+        f" <code>{escape(preset)}</code>.</p>"
+    )
     for one in drawn:
-        shape = plate(one.name)
-        yield page.figure(one.vector, shape.title, shape.caption)
+        yield _figure(one)
+        if one.outcomes:
+            yield from chapter.tables(one.outcomes)
+    if any(one.outcomes for one in drawn):
+        yield page.table(["Word", "Meaning"], [[word, text] for word, text in chapter.words().items()], stack=True)
+
+
+def split(drawn: Sequence[Drawn]) -> tuple[list[Drawn], list[Drawn]]:
+    """The paper's figures, and ours."""
+    ours = {one.name for one in figures.OURS}
+    return [one for one in drawn if one.name not in ours], [one for one in drawn if one.name in ours]
+
+
+def _figure(one: Drawn) -> str:
+    shape = plate(one.name)
+    return page.figure(one.vector, shape.title, shape.caption)
 
 
 def _errata() -> Iterator[str]:

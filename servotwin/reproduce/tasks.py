@@ -6,13 +6,14 @@ import multiprocessing
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from servotwin.reproduce import figures
+from servotwin.reproduce.beyond import Outcome
 from servotwin.reproduce.claims import Claim, Result, measure
 from servotwin.reproduce.figures import Plate, style
 from servotwin.reproduce.runs import Runs
@@ -46,10 +47,11 @@ class ClaimsTask:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure as drawn: its name and the vector image."""
+    """A figure as drawn: its name, the vector image, and what came of the policies it compares, without their runs."""
 
     name: str
     vector: bytes
+    outcomes: tuple[Outcome, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,10 @@ class FigureTask:
 
     def run(self) -> Drawn:
         """The vector image, which is also in NAME.svg, beside NAME.png."""
-        path = style.save(plate(self.name).draw(runs_of(self.preset)), self.directory, self.name)
-        return Drawn(self.name, path.read_bytes())
+        runs, chosen = runs_of(self.preset), plate(self.name)
+        path = style.save(chosen.draw(runs), self.directory, self.name)
+        outcomes = tuple(replace(one, record=None) for one in chosen.measure(runs))
+        return Drawn(self.name, path.read_bytes(), outcomes)
 
 
 def plate(name: str) -> Plate[object]:

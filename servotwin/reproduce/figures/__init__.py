@@ -1,12 +1,27 @@
-"""The paper's figures and one of ours, one module each; `PLATES` lists them in the paper's order, ours last."""
+"""The paper's figures in its order, then ours; `PLATES` lists them."""
 
 from typing import Any
 
-from servotwin.reproduce.figures import estimator, fig4, fig5, fig7, fig9, fig10b, fig11, fig12, fig15, fig16, figA1
+from servotwin.reproduce.figures import (
+    estimator,
+    fig4,
+    fig5,
+    fig7,
+    fig9,
+    fig10b,
+    fig11,
+    fig12,
+    fig15,
+    fig16,
+    figA1,
+    policies,
+)
 from servotwin.reproduce.figures.plate import Plate
 
-PLATES: tuple[Plate[Any], ...] = tuple(
-    module.PLATE for module in (fig4, fig5, fig7, fig9, fig10b, fig11, fig12, fig15, fig16, figA1, estimator)
+OURS: tuple[Plate[Any], ...] = (estimator.PLATE, *policies.PLATES)
+PLATES: tuple[Plate[Any], ...] = (
+    *(module.PLATE for module in (fig4, fig5, fig7, fig9, fig10b, fig11, fig12, fig15, fig16, figA1)),
+    *OURS,
 )
 
-__all__ = ["PLATES", "Plate"]
+__all__ = ["OURS", "PLATES", "Plate"]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from matplotlib.figure import Figure
 
+from servotwin.reproduce.beyond import Outcome
 from servotwin.reproduce.figures import style
 from servotwin.reproduce.runs import Runs
 
@@ -16,7 +17,7 @@ _Data = TypeVar("_Data")
 
 @dataclass(frozen=True)
 class Plate(Generic[_Data]):
-    """One figure of the paper.
+    """One figure, of the paper or beyond it.
 
     Attributes
     ----------
@@ -27,6 +28,8 @@ class Plate(Generic[_Data]):
         Runs -> arrays, SI units; no drawing.
     plot : callable
         Arrays -> Figure; no computing.
+    outcomes : callable, optional
+        Of figures beyond the paper that compare policies: arrays -> what came of each, for tables.
     """
 
     name: str
@@ -34,8 +37,13 @@ class Plate(Generic[_Data]):
     caption: str
     data: Callable[[Runs], _Data]
     plot: Callable[[_Data], Figure]
+    outcomes: Callable[[_Data], Sequence[Outcome]] | None = None
 
     def draw(self, runs: Runs) -> Figure:
         """The figure for a preset."""
         with style.look():
             return self.plot(self.data(runs))
+
+    def measure(self, runs: Runs) -> tuple[Outcome, ...]:
+        """What is to be tabled for a preset."""
+        return () if self.outcomes is None else tuple(self.outcomes(self.data(runs)))

@@ -61,7 +61,7 @@ def panels(
 
 def letter(axes: Sequence[Axes]) -> None:
     """(a), (b), ... at the panels' upper left, beside the titles."""
-    for one, name in zip(axes, "abcdefgh", strict=False):
+    for one, name in zip(axes, "abcdefghij", strict=False):
         one.set_title(f"({name})", loc="left", fontweight="bold")
 
 
