@@ -51,9 +51,14 @@ class Evidence:
 
 
 def judge(seen: Evidence, settings: Settings) -> tuple[GapStatus, tuple[str, ...]]:
-    """Status and reasons."""
-    mismatches = tuple(filter(None, (_unexplained(seen), _delayed(seen, settings), *_disagreements(seen, settings))))
-    silence = tuple(filter(None, (_one_sided(seen, settings), _spread(seen, settings))))
+    """Status and reasons.
+
+    Where the screw was not pushed as it must, the fitted gap is nobody's: that other views put it elsewhere is no news.
+    """
+    one_sided = _one_sided(seen, settings)
+    disagreements = () if one_sided else _disagreements(seen, settings)
+    mismatches = tuple(filter(None, (_unexplained(seen), _delayed(seen, settings), *disagreements)))
+    silence = tuple(filter(None, (one_sided, _spread(seen, settings))))
     bound = lower_bound(seen, settings) > _SMALLEST_BOUND and math.isinf(seen.interval[1])
     if seen.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(seen.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
