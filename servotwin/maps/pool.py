@@ -73,7 +73,12 @@ def _performed(function: Callable[[_T], _R], task: _T) -> tuple[_T, _R]:
 @contextmanager
 def _processes(workers: int) -> Iterator[None]:
     try:
-        with parallel_config(backend="loky", n_jobs=workers, initializer=_ignore_interrupts):
+        with (
+            parallel_config(backend="loky", n_jobs=workers, initializer=_ignore_interrupts),
+            warnings.catch_warnings(),
+        ):
+            # A worker whose caches have grown is replaced, which is no news.
+            warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
             yield
     finally:
         if workers > 1:
