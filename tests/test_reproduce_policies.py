@@ -109,13 +109,22 @@ def test_totals_of_known_signals(outcomes):
     assert [step.error for step in beyond.measured(shifted)] == pytest.approx([2e-6, 2e-6])
 
 
-def test_a_policy_that_cannot_design_says_so():
+def test_a_policy_that_cannot_design_says_so(monkeypatch):
+    scenario = PolicyJob("paper", "margin", NOISE, SHORT).described()
+    limited = scenario.replace(controller=scenario.law.replace(voltage_limit=24.0))
+    monkeypatch.setattr(PolicyJob, "described", lambda _: limited)
     found = PolicyJob("paper", "margin", NOISE, SHORT).run()
-    assert "loop filter" in found.refused
+    assert "voltage limit" in found.refused
     assert (found.record, found.steps, found.total) == (None, (), None)
     (html, *rest) = chapter.tables([found])
     assert html.count("–") >= len(chapter.HEADS) - 1
-    assert any("loop filter" in text for text in rest)
+    assert any("voltage limit" in text for text in rest)
+
+
+def test_every_policy_designs_in_noise():
+    """The map behind `margin` is that of the loop that runs, its loop filter included."""
+    found = PolicyJob("paper", "margin", NOISE, SHORT).run()
+    assert (found.refused, len(found.steps)) == ("", 2)
 
 
 def test_gains_that_a_message_leaves_out_stay():

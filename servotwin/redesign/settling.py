@@ -1,28 +1,31 @@
 """How wide a dead zone must be before the loop settles: the map behind the policy `margin`.
 
-Backlash and dead zone are homogeneous of degree one, so with lengths in units of p gap (the screw's lost motion) a map
-over (tolerance, step) holds for every gap. Settling is not monotone in the tolerance; what is told is therefore the
-least tolerance from which on every wider one settled too.
+Settling is not monotone in the tolerance; what is told is therefore the least tolerance from which on every wider one
+settled too.
 """
 
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.redesign.map import joined, measured
+from servotwin.redesign.mapaxes import RatioAxes
+from servotwin.redesign.mapsettings import MapSettings
 
-# Settled means as still as 1 um in a gap of 1 mm.
-_STILL = 1e-3
-_DURATION, _LAST = 60.0, 20.0
-_RATE = 50.0
+# In units of p gap, the screw's lost motion: two of the map's own.
+_K_DZ, _STEPS = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)
+_UNITS = 2.0
+# The scale of a map is free; settled means as still as 1 um where the lost motion is 1 mm.
+_GAP, _STILL = 1.0, 1e-3
+_STARTS, _DURATION, _LAST = 4, 60.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,19 +60,17 @@ class SettlingMap:
 
 
 @lru_cache(maxsize=8)
-def settling_map(servo: Servo, controller: Controller | None = None, starts: int = 4) -> SettlingMap:
-    """The map of a servo with its own or another continuous controller, about a second of simulation.
+def settling_map(servo: Servo) -> SettlingMap:
+    """The map of a servo with its own continuous controller, from rest; some seconds of simulation.
 
     Raises
     ------
     InvalidInput
-        The controller is sampled, saturates or has a loop filter.
+        The controller is sampled, or does not even stabilise the servo without a gap.
     """
-    k_dz, steps = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)
-    gap = 1.0
-    unit = servo.p * gap
-    screw = np.linspace(-0.5, 0.5, starts) * gap
-    k, r, w = np.meshgrid(k_dz, steps, screw, indexing="ij")
-    position = simulate_ensemble(servo, _DURATION, unit * r, gap, unit * k, w, controller, _RATE)
-    last = position[..., -round(_LAST * _RATE) :] / unit
-    return SettlingMap(k_dz, steps, (0.5 * np.ptp(last, axis=-1) < _STILL).all(axis=-1))
+    axes = RatioAxes(tuple((_UNITS * _K_DZ).tolist()), tuple((_UNITS * _STEPS).tolist()), _GAP)
+    still = _STILL * servo.p * _GAP
+    settings = MapSettings(servo, axes, members=_STARTS, motion=0.0, duration=_DURATION, window=_LAST, still=still)
+    with ThreadPoolExecutor() as pool:
+        found = joined(list(pool.map(partial(measured, settings), settings.chunks)))
+    return SettlingMap(_K_DZ, _STEPS, (found.settled == 1.0).reshape(axes.shape))

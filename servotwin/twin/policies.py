@@ -36,11 +36,10 @@ def certified(servo: Servo, settings: TwinSettings) -> CertifiedPolicy:
 
 
 def _margin(servo: Servo, settings: TwinSettings) -> MarginPolicy:
-    law = servo.controller
-    if law.loop_filter_hz is not None or law.voltage_limit is not None:
+    if servo.controller.voltage_limit is not None:
         raise InvalidInput(
-            "policy 'margin' reads its dead zone from a map for controllers without loop filter or voltage limit, "
-            "and this one has them: give another policy"
+            "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "
+            "with a voltage limit, and this one has one: give another policy"
         )
     step, continuous = settings.uncertainty.step, servo.replace(sample_rate=None, rate_limit=None)
     return (
