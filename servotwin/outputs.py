@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -39,6 +39,12 @@ def write_text(path: Path, text: str) -> Path:
     with written(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
+
+
+def write_and_say(path: Path, text: str, say: Callable[..., None]) -> None:
+    """Write a text file atomically and say where it is; `say` prints as a rich console does."""
+    write_text(path, text)
+    say(f"written: {path}", soft_wrap=True, highlight=False)
 
 
 def check_file(path: Path, suffixes: tuple[str, ...]) -> Path:

@@ -50,8 +50,7 @@ def accuracy(
     if size < 1.0:
         console.print(f"With {size:.0%} of the windows, shares and coverages scatter about their targets.")
     if output is not None:
-        outputs.write_text(output, dumps(figures, date, size))
-        console.print(f"written: {output}", soft_wrap=True, highlight=False)
+        outputs.write_and_say(output, dumps(figures, date, size), console.print)
     return tuple(figures)
 
 

@@ -63,8 +63,7 @@ def bench(
     found = machine()
     console.print(f"{found['cpu']}, {found['cores']} cores, {found['python']}", highlight=False)
     if json is not None:
-        outputs.write_text(json, dumps(results, found, date, options.quick))
-        console.print(f"written: {json}", soft_wrap=True, highlight=False)
+        outputs.write_and_say(json, dumps(results, found, date, options.quick), console.print)
     return results
 
 

@@ -68,8 +68,7 @@ def endurance(
     console.print(shown(outcomes))
     console.print(verdict(outcomes), highlight=False)
     if output is not None:
-        outputs.write_text(output, dumps(outcomes, date))
-        console.print(f"written: {output}", soft_wrap=True, highlight=False)
+        outputs.write_and_say(output, dumps(outcomes, date), console.print)
     return outcomes
 
 

@@ -50,8 +50,9 @@ class Twin:
 
     A window is committed to the store, then acknowledged, then estimated, once: a second copy is only acknowledged.
     Windows may come in any order; every one is estimated, but only one that is newer than all before moves the
-    parameters, the trend and the starting point of the next estimate. Only an estimate whose status is OK does either,
-    and one that the trend refuses as an outlier only once others agree with it.
+    parameters, the trend and the starting point of the next estimate. Only an estimate whose status is OK moves the
+    trend, and one that does not fit it only once others agree. Of a window with another status a policy may use the
+    rest, its input bias and noise, with the gap as the trend knows it.
 
     Parameters
     ----------

@@ -76,8 +76,7 @@ def policies(
     console.print(shown(rows))
     console.print(chosen(rows))
     if output is not None:
-        outputs.write_text(output, dumps(rows, date))
-        console.print(f"written: {output}", soft_wrap=True, highlight=False)
+        outputs.write_and_say(output, dumps(rows, date), console.print)
     return tuple(rows)
 
 
