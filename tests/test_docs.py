@@ -62,9 +62,11 @@ def test_every_page_is_reached_from_the_index():
 
 
 @pytest.mark.parametrize("code", blocks("python"))
-def test_python_samples_run(code, tmp_path, monkeypatch):
+def test_python_samples_run(code, tmp_path, monkeypatch, capsys):
+    """To the end: everything that they print is there."""
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "sample", "exec"), {"__name__": "sample"})
+    assert len(capsys.readouterr().out.splitlines()) >= code.count("print(")
 
 
 @pytest.mark.parametrize("text", blocks("toml"))
