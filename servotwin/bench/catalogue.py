@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from servotwin.bench import decisions, fits, hold, ours, solver, startup, taylor
+from servotwin.bench.alone import ALONE
 from servotwin.bench.contest import Check, Contestant, Workload
 from servotwin.bench.machine import cores
 from servotwin.bench.workloads import UNIT, Noisy, Sweep, Wear
@@ -185,8 +186,9 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
     known = {name.lower(): name for name in WORKLOADS}
     for name in names:
         if name.lower() not in known:
-            hint = did_you_mean(name, tuple(WORKLOADS))
-            raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {', '.join(WORKLOADS)}")
+            hint = did_you_mean(name, (*WORKLOADS, *ALONE))
+            known_ones = f"{', '.join(WORKLOADS)}, or {' or '.join(ALONE)} alone"
+            raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {known_ones}")
     wanted = {known[name.lower()] for name in names} or set(WORKLOADS)
     return tuple(name for name in WORKLOADS if name in wanted)
 

@@ -69,6 +69,8 @@ def tell(
     changes = {key: value for key, value in (("enter", enter), ("leave", leave)) if value is not None}
     servo = servo.replace(sample_rate=None, **changes)
     tolerance = None if tolerance_mm is None else tolerance_mm / _MM
+    if not (math.isfinite(gap_deg) and gap_deg >= 0.0):
+        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be finite and 0 or more")
     found = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
     if as_json:
         print(json.dumps(as_dict(found), indent=2))
