@@ -9,6 +9,7 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 from servotwin.messages.channels import FINE, Channel, checksum, pack_channel, pack_finely, unpack_channel
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, finite
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
+from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Outcome, Probe, Request
 from servotwin.messages.updates import Band, Cause, Fallback, Gains, Proof, Reason, Receipt, Update
 from servotwin.messages.windows import Acknowledge, Hello, Window
@@ -16,6 +17,6 @@ from servotwin.messages.windows import Acknowledge, Hello, Window
 __all__ = [
     "FINE", "MAX_BYTES", "NAME_PATTERN", "Acknowledge", "Answer", "Ask", "Band", "Cause", "Channel", "Fallback",
     "Gains", "Hello", "InvalidMessage", "LongerWindow", "Message", "Outcome", "ParameterMessage", "Probe", "Proof",
-    "Reason", "Receipt", "Request", "Update", "Window", "checksum", "decode", "decode_json", "encode", "encode_json",
-    "finite", "pack_channel", "pack_finely", "unpack_channel",
+    "Reason", "Receipt", "Refusal", "Request", "Update", "Window", "checksum", "decode", "decode_json", "encode",
+    "encode_json", "finite", "pack_channel", "pack_finely", "unpack_channel",
 ]  # fmt: skip

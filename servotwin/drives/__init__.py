@@ -1,0 +1,1 @@
+"""Drives behind one protocol: simulated (a process of its own), replay, OPC UA."""

@@ -1,0 +1,1 @@
+"""The twin's evidence on disk: messages, estimates, versions, receipts; SQLite by default, PostgreSQL by URL."""
