@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed-from-lock
 
-.PHONY: help demo reproduce test lint format lock clean
+.PHONY: help demo reproduce test lint format lock clean packages
 
 help:
 	@echo "make demo       a worn servo loses stability; its digital twin wins it back"
@@ -18,8 +18,11 @@ demo: $(STAMP)
 reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
-test: lint
+test: lint packages
 	$(BIN)/python -m pytest -q -n 2
+
+packages:
+	@sh tests/packages.sh
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

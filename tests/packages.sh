@@ -1,0 +1,39 @@
+#!/bin/sh
+# Debian's mosquitto and PostgreSQL, which some tests start for themselves; without root or apt-get those tests are skipped.
+set -eu
+
+POLICY=/usr/sbin/policy-rc.d
+
+have_mosquitto() { command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ]; }
+have_postgresql() { command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1; }
+
+missing=""
+have_mosquitto || missing="$missing mosquitto"
+have_postgresql || missing="$missing postgresql"
+[ -n "$missing" ] || exit 0
+
+go_on() {
+    echo "tests that need$missing will be skipped: $1"
+    exit 0
+}
+
+[ "$(id -u)" = 0 ] || go_on "installing it takes root (apt-get install$missing)."
+command -v apt-get >/dev/null || go_on "it is not installed and there is no apt-get."
+
+# Tests start servers of their own: what is installed must not start any, nor must what is there already be told otherwise.
+if [ ! -e "$POLICY" ]; then
+    trap 'rm -f "$POLICY"' EXIT
+    printf '#!/bin/sh\nexit 101\n' >"$POLICY"
+    chmod 755 "$POLICY"
+fi
+
+export DEBIAN_FRONTEND=noninteractive
+apt() { apt-get -qq -o DPkg::Lock::Timeout=300 -o Dpkg::Use-Pty=0 "$@" >/dev/null; }
+
+echo "installing$missing for the tests (once)"
+apt update || echo "apt-get update failed; trying with what is known"
+# shellcheck disable=SC2086  # one word each
+apt install --yes --no-install-recommends $missing || {
+    [ -n "${CI:-}" ] && echo "apt-get could not install$missing" >&2 && exit 1
+    go_on "apt-get could not install it."
+}
