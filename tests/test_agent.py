@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import MAX_CHANGES, Agent, Outgoing
+from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.limits import Limits
+from servotwin.edge.packing import MAX_CHANGES
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput

@@ -132,10 +132,9 @@ def test_what_was_proved_is_kept_and_what_was_not_is_not() -> None:
 
 
 def test_windows_of_an_earlier_boot_wait_for_an_answer_too() -> None:
-    first = Agent(agent_settings())
-    feed(first, 2.0)
     outbox = MemoryOutbox()
-    outbox.put(first.outbox.get(("b0", 0)))
+    feed(Agent(agent_settings(), outbox), 2.0)
+    assert outbox.pending() == [("b0", 0)]
     agent = Agent(agent_settings(silence_s=3.0, watch=None), outbox)
     agent.absorb_block(*[array("d", bytes(8 * 1000))] * 4)
     assert agent.parameters.sample == 600

@@ -22,6 +22,7 @@ from servotwin.cosim.loop import Loop, Transmission
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
+from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import SimulatedLink
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, decode, encode
 from servotwin.plant.servo import Servo
@@ -122,7 +123,8 @@ class Cosimulation:
         self.scenario = scenario
         self.clock = VirtualClock()
         self.machine = machine
-        self.agent = Agent(scenario.agent_settings())
+        self.outbox = MemoryOutbox()
+        self.agent = Agent(scenario.agent_settings(), self.outbox)
         self.store = MemoryStore()
         start = InForce(scenario.start_law, scenario.start_tolerance)
         self.twin = twin or Twin.of(scenario.name, scenario.model, self.store, scenario.twin, estimator, start)
@@ -266,7 +268,7 @@ class Cosimulation:
 
     def _accounts(self) -> Counter[str]:
         delivered = {(boot, sequence) for _, boot, sequence in self.store.windows}
-        waiting = [key for key in self.agent.outbox.pending() if key not in delivered]
+        waiting = [key for key in self.outbox.pending() if key not in delivered]
         counts = Counter({"delivered": len(delivered), "in flight": len(waiting)})
         return +(counts + self.agent.dropped)
 

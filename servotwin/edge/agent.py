@@ -10,14 +10,16 @@ settings allow. Such a move begins while the reference rests, ends by itself, an
 from array import array
 from collections import Counter
 from dataclasses import replace
-from itertools import chain, pairwise
 from math import ceil, inf
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
+from servotwin.edge.cut import Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
+from servotwin.edge.outlet import Outlet, PackingOutlet
+from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats, Recorder, as_floats
@@ -25,28 +27,8 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import Store
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
-from servotwin.link.outbox import MemoryOutbox, Outbox
-from servotwin.link.session import Sender
-from servotwin.messages import (
-    Acknowledge,
-    Channel,
-    Fallback,
-    Hello,
-    InvalidMessage,
-    Message,
-    Request,
-    Update,
-    Window,
-    checksum,
-    pack_channel,
-    pack_finely,
-)
-
-CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
-"""What is recorded, in this order, with units."""
-
-MAX_CHANGES = 256
-"""Reference changes listed per window; the reference channel has them all."""
+from servotwin.link.outbox import Outbox
+from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Update
 
 
 class Outgoing(NamedTuple):
@@ -78,22 +60,28 @@ class Agent:
         In memory by default.
     store : Store, optional
         Of the last parameters that were proved; without one each boot begins as configured.
+    outlet : Outlet, optional
+        Where cut windows go; by default they are packed here and kept in `outbox`.
     """
 
-    def __init__(self, settings: AgentSettings, outbox: Outbox | None = None, store: Store | None = None) -> None:
+    def __init__(
+        self,
+        settings: AgentSettings,
+        outbox: Outbox | None = None,
+        store: Store | None = None,
+        outlet: Outlet | None = None,
+    ) -> None:
         self.settings = settings
-        self.outbox = MemoryOutbox() if outbox is None else outbox
         self.windows_cut = 0
-        self._sender = Sender(self.outbox, settings.retry)
+        self.outlet = PackingOutlet(settings, outbox) if outlet is None else outlet
         capacity = max(settings.longest_samples + 1, settings.period_samples, settings.rest_samples)
         self._recorder = Recorder(tuple(CHANNELS), capacity)
         self._supervisor = Supervisor(settings, self._recorder, store)
-        if self.outbox.pending():
+        if self.outlet.waiting:
             self._supervisor.asked(0.0)
         self._granted = Granted(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
         self._opened: Opened | None = None
-        self._unusable: Counter[str] = Counter()
         self._deadline = self._next_deadline()
 
     @property
@@ -140,7 +128,7 @@ class Agent:
     @property
     def dropped(self) -> Counter[str]:
         """Windows that will never be sent again without having been acknowledged, by reason."""
-        return self._unusable + Counter(self.outbox.dropped)
+        return Counter(self.outlet.dropped)
 
     def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[Outgoing]:
         """Take one sample (m, rad, m, V); returns what is to be sent now."""
@@ -175,9 +163,15 @@ class Agent:
         if isinstance(message, Request):
             return self._requested(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
-            self._sender.acknowledged(message)
+            self.outlet.acknowledged(message)
             self._heard(message.servo)
         return []
+
+    def relieved(self) -> None:
+        """The outlet sends nothing of what it was offered last: if nothing else waits, the twin owes no answer."""
+        if not self.outlet.waiting:
+            self._supervisor.answered(self.time, more=False)
+            self._deadline = self._next_deadline()
 
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""
@@ -195,7 +189,7 @@ class Agent:
     def _heard(self, servo: str) -> None:
         """The twin said something."""
         if servo == self.settings.servo:
-            self._supervisor.answered(self.time, more=bool(self.outbox.pending()))
+            self._supervisor.answered(self.time, more=self.outlet.waiting)
         self._deadline = self._next_deadline()
 
     def _requested(self, request: Request) -> list[Outgoing]:
@@ -237,7 +231,7 @@ class Agent:
             self._cut(opened)
             self._abort()
             self._opened = None
-        sent = [Outgoing(self.samples, window) for window in self._sender.due(self.time)]
+        sent = [Outgoing(self.samples, window) for window in self.outlet.due(self.time)]
         said = self._supervisor.look()
         if any(isinstance(each, Fallback) for each in said):
             self._abort()
@@ -246,44 +240,17 @@ class Agent:
         return sent + [Outgoing(self.samples, each) for each in said]
 
     def _cut(self, opened: Opened) -> None:
+        """Let a window go; what the twin then owes an answer to is the outlet's to know."""
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
-        try:
-            window = self._window(opened, sequence)
-        except InvalidMessage:
-            self._unusable["sample not finite"] += 1
-        else:
-            self._sender.offer(window, self.time)
+        signals = self._recorder.cut(opened.first, opened.last)
+        cut = Cut(opened.first, sequence, opened.reason, self.parameters.version, self._before(opened.first), signals)
+        self.outlet.offer(cut, self.time)
+        if self.outlet.waiting:
             self._supervisor.asked(self.time)
 
-    def _window(self, opened: Opened, sequence: int) -> Window:
-        first = opened.first
-        signals = self._recorder.cut(first, opened.last)
-        channels = tuple(chain.from_iterable(self._packed(name, values) for name, values in signals.items()))
-        return Window(
-            servo=self.settings.servo,
-            boot=self.settings.boot,
-            sequence=sequence,
-            start=first / self.settings.sample_rate,
-            rate=self.settings.sample_rate,
-            channels=channels,
-            reference_changes=self._changes(first, signals["reference"]),
-            parameter_version=self.parameters.version,
-            model_version=self.settings.model_version,
-            reason=opened.reason,
-            crc=checksum(channels),
-        )
-
-    def _packed(self, name: str, values: "array[float]") -> tuple[Channel, ...]:
-        if self.settings.fine_angle and name == "theta_m":
-            return pack_finely(name, CHANNELS[name], values)
-        return (pack_channel(name, CHANNELS[name], values),)
-
-    def _changes(self, first: int, reference: "array[float]") -> tuple[tuple[float, float], ...]:
-        """(time, new value) of the first changes inside a window."""
-        before = self._recorder.cut(first - 1, first)["reference"][0] if first > 0 else self.settings.reference
-        steps = enumerate(pairwise((before, *reference)), first)
-        changes = [(index / self.settings.sample_rate, new) for index, (old, new) in steps if new != old]
-        return tuple(changes[:MAX_CHANGES])
+    def _before(self, first: int) -> float:
+        """The reference just before a sample, m."""
+        return self._recorder.cut(first - 1, first)["reference"][0] if first > 0 else self.settings.reference
 
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
@@ -292,7 +259,7 @@ class Agent:
             wanted = min(wanted, self._opened.last)
         if self.probe is not None:
             wanted = min(wanted, self.probe.next_change(self.samples))
-        due = self._sender.next_time
+        due = self.outlet.next_time
         if due is None:
             return wanted
         return min(wanted, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))

@@ -1,0 +1,52 @@
+"""Cut samples become a window: int16 channels, the list of reference changes, a checksum."""
+
+from array import array
+from itertools import chain, pairwise
+
+from servotwin.edge.cut import Cut
+from servotwin.edge.settings import AgentSettings
+from servotwin.messages import Channel, Window, checksum, pack_channel, pack_finely
+
+CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
+"""What is recorded, in this order, with units."""
+
+MAX_CHANGES = 256
+"""Reference changes listed per window; the reference channel has them all."""
+
+
+def pack(cut: Cut, settings: AgentSettings) -> Window:
+    """The window that is sent.
+
+    Raises
+    ------
+    InvalidMessage
+        A sample is not finite.
+    """
+    packed = (_packed(name, values, settings.fine_angle) for name, values in cut.signals.items())
+    channels = tuple(chain.from_iterable(packed))
+    return Window(
+        servo=settings.servo,
+        boot=settings.boot,
+        sequence=cut.sequence,
+        start=cut.first / settings.sample_rate,
+        rate=settings.sample_rate,
+        channels=channels,
+        reference_changes=_changes(cut, settings.sample_rate),
+        parameter_version=cut.parameter_version,
+        model_version=settings.model_version,
+        reason=cut.reason,
+        crc=checksum(channels),
+    )
+
+
+def _packed(name: str, values: "array[float]", fine_angle: bool) -> tuple[Channel, ...]:
+    if fine_angle and name == "theta_m":
+        return pack_finely(name, CHANNELS[name], values)
+    return (pack_channel(name, CHANNELS[name], values),)
+
+
+def _changes(cut: Cut, rate: float) -> tuple[tuple[float, float], ...]:
+    """(time, new value) of the first changes of the reference inside a window."""
+    steps = enumerate(pairwise((cut.before, *cut.signals["reference"])), cut.first)
+    changes = [(index / rate, new) for index, (old, new) in steps if new != old]
+    return tuple(changes[:MAX_CHANGES])
