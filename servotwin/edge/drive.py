@@ -31,13 +31,13 @@ class Sample(NamedTuple):
 
     Attributes
     ----------
-    index : int
+    number : int
         Its number since the machine's start.
     reference, theta_m, position : float
         m (wanted by the machine, without any probing move), rad, m.
     """
 
-    index: int
+    number: int
     reference: float
     theta_m: float
     position: float
@@ -99,7 +99,7 @@ class ControlDrive(Drive, Protocol):
         """Wait for the next sample instant; None: the run is over. Raises `DriveLost`."""
 
     def write(self, voltage: float) -> None:
-        """The voltage (V) from the last sample read on; where none is written the last one holds. Raises `DriveLost`."""
+        """The voltage (V) from the last sample on; where none is written the last one holds. Raises `DriveLost`."""
 
 
 class SupervisedDrive(Drive, Protocol):
