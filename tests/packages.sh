@@ -20,15 +20,18 @@ go_on() {
 [ "$(id -u)" = 0 ] || go_on "installing it takes root (apt-get install$missing)."
 command -v apt-get >/dev/null || go_on "it is not installed and there is no apt-get."
 
+said=$(mktemp)
+trap 'rm -f "$said"' EXIT
+
 # Tests start servers of their own: what is installed must not start any, nor must what is there already be told otherwise.
 if [ ! -e "$POLICY" ]; then
-    trap 'rm -f "$POLICY"' EXIT
+    trap 'rm -f "$POLICY" "$said"' EXIT
     printf '#!/bin/sh\nexit 101\n' >"$POLICY"
     chmod 755 "$POLICY"
 fi
 
 export DEBIAN_FRONTEND=noninteractive
-apt() { apt-get -qq -o DPkg::Lock::Timeout=300 -o Dpkg::Use-Pty=0 "$@" >/dev/null; }
+apt() { apt-get -qq -o DPkg::Lock::Timeout=300 -o Dpkg::Use-Pty=0 "$@" >"$said" 2>&1 || { cat "$said" >&2 && false; }; }
 
 echo "installing$missing for the tests (once)"
 apt update || echo "apt-get update failed; trying with what is known"
