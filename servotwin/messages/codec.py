@@ -1,11 +1,12 @@
 """Messages to bytes and back, with every way in which bytes can be wrong turned into InvalidMessage."""
 
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 import msgspec
 
 from servotwin.messages.channels import checksum
 from servotwin.messages.checks import InvalidMessage, require
+from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Request
 from servotwin.messages.updates import Fallback, Receipt, Update
 from servotwin.messages.windows import Acknowledge, Hello, Window
@@ -18,6 +19,13 @@ Message = Window | ParameterMessage
 _Decoded = TypeVar("_Decoded")
 
 
+class _Tagged(msgspec.Struct):
+    """What every message has."""
+
+    type: str
+
+
+_SCHEMAS = frozenset(kind.__struct_config__.tag for kind in get_args(Message))
 _encoder = msgspec.msgpack.Encoder()
 _decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
 _json_encoder = msgspec.json.Encoder()
@@ -39,7 +47,8 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
     """
     message = _guarded(_decoder, data, limit)
     if isinstance(message, Window):
-        require(message.crc == checksum(message.channels), "window checksum does not match its channels")
+        whole = message.crc == checksum(message.channels)
+        require(whole, "window checksum does not match its channels", Refusal.BAD_CHECKSUM)
     return message
 
 
@@ -57,10 +66,20 @@ def _guarded(
     decoder: "msgspec.msgpack.Decoder[_Decoded] | msgspec.json.Decoder[_Decoded]", data: bytes, limit: int
 ) -> _Decoded:
     """Decode, with every way in which bytes can be wrong turned into InvalidMessage."""
-    require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed")
+    require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed", Refusal.TOO_LARGE)
     try:
         return decoder.decode(data)
     except InvalidMessage:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-        raise InvalidMessage(f"message not understood: {error}") from None
+        raise InvalidMessage(f"message not understood: {error}", _refusal_of(decoder, data)) from None
+
+
+def _refusal_of(decoder: object, data: bytes) -> Refusal:
+    """Whether a message that was not understood is of a schema that this version does not know."""
+    read = msgspec.json.decode if decoder is _json_decoder else msgspec.msgpack.decode
+    try:
+        tag = read(data, type=_Tagged).type
+    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
+        return Refusal.NOT_UNDERSTOOD
+    return Refusal.NOT_UNDERSTOOD if tag in _SCHEMAS else Refusal.UNKNOWN_SCHEMA
