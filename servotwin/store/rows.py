@@ -78,12 +78,16 @@ class Claim(NamedTuple):
         How many outcomes the servo has had: what the next one has to name.
     messages : tuple of Stored
         Not yet processed, in the order in which they were committed; empty where only the time to wake has come.
+    attempts : int
+        How often the servo was lent since its last outcome, this time included: more than a few times means that a
+        worker dies of it.
     """
 
     servo: str
     state: bytes
     serial: int
     messages: tuple[Stored, ...]
+    attempts: int = 1
 
 
 class Evidence(NamedTuple):
@@ -95,17 +99,21 @@ class Evidence(NamedTuple):
         glance, estimate, disturbance, trend, redesign, excitation, update, request, receipt, fallback, answer, hello,
         proof, withdrawn.
     message : int
-        Id of the message that led to it; 0: none did.
+        Id of the message that led to it; 0: none did. What is found later of a window (an update that was proved on the
+        queue) names the window, so that the chain holds.
     body : bytes
         MessagePack.
     version : int or None
-        Of the parameters, where it is about one.
+        Of the parameters: those that an update carries, a receipt or a fallback is about, or, for a glance or an
+        estimate, those in force when its window was cut: so the effect of a version is found.
     gap, std : float or None
         rad, for queries.
     status : str
         For queries: the estimate's status, the receipt's reason, why nothing was redesigned.
     context : str
         Key of the context under which it was computed; empty: does not matter.
+    tail : float or None
+        m, for queries: of a glance or an estimate, the largest tracking error in the last tenth of its window.
     """
 
     kind: str
@@ -116,6 +124,7 @@ class Evidence(NamedTuple):
     std: float | None = None
     status: str = ""
     context: str = ""
+    tail: float | None = None
 
 
 class Outcome(NamedTuple):
@@ -156,3 +165,134 @@ class Posted(NamedTuple):
 
     serial: int
     body: bytes
+
+
+class Waiting(NamedTuple):
+    """What is not yet processed.
+
+    Attributes
+    ----------
+    messages, proofs : int
+        Windows and letters; what the twin asks itself for.
+    age : float
+        s since the oldest window or letter came; 0.0: none waits.
+    """
+
+    messages: int
+    proofs: int
+    age: float
+
+
+class Summary(NamedTuple):
+    """One servo at a glance.
+
+    Attributes
+    ----------
+    serial, windows, waiting : int
+        Outcomes so far, windows kept, windows and letters not yet processed.
+    heard : float or None
+        s since the epoch, when its last message came.
+    wake : float or None
+        s since the epoch at which its twin wants to be woken.
+    gap, std : float or None
+        rad, of the newest glance or estimate.
+    status : str
+        Of the same.
+    version : int or None
+        Of the newest update.
+    receipt : str
+        Status of the newest receipt; empty: none came.
+    posted : int
+        Serial of the newest message to the edge.
+    """
+
+    servo: str
+    serial: int
+    windows: int
+    waiting: int
+    heard: float | None
+    wake: float | None
+    gap: float | None
+    std: float | None
+    status: str
+    version: int | None
+    receipt: str
+    posted: int
+
+
+class Held(NamedTuple):
+    """A window as the store knows it.
+
+    Attributes
+    ----------
+    start : float
+        Sample time of its first sample, s.
+    received, done : float, float or None
+        s since the epoch, when it came and when it was processed.
+    """
+
+    id: int
+    servo: str
+    boot: str
+    sequence: int
+    start: float
+    received: float
+    done: float | None
+
+
+class Found(NamedTuple):
+    """Evidence as it is kept; `made`: s since the epoch, the others as of `Evidence`."""
+
+    id: int
+    kind: str
+    message: int
+    body: bytes
+    version: int | None
+    gap: float | None
+    std: float | None
+    status: str
+    context: str
+    tail: float | None
+    made: float
+
+
+class Effect(NamedTuple):
+    """What a version did, as the first window under it shows.
+
+    Attributes
+    ----------
+    window : Held
+        The first one that was cut under the version.
+    before, after : Found
+        The glance or estimate of the window that the version stands on, and of the first one under it: their `tail`,
+        `gap` and `status` are what changed.
+    """
+
+    window: Held
+    before: Found | None
+    after: Found
+
+
+class Step(NamedTuple):
+    """An update and what became of it: receipts and fallbacks that name its version, and the effect, if one shows."""
+
+    update: Found
+    answers: tuple[Found, ...]
+    effect: Effect | None
+
+
+class Link(NamedTuple):
+    """A window and everything that follows from it: the evidence chain.
+
+    Attributes
+    ----------
+    window : Held
+    found : tuple of Found
+        Glances, estimates, redesigns and so on, updates excepted.
+    steps : tuple of Step
+        Its updates: none, mostly, or one.
+    """
+
+    window: Held
+    found: tuple[Found, ...]
+    steps: tuple[Step, ...]
