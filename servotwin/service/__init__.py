@@ -1,1 +1,1 @@
-"""The twin as a service: HTTP in, commit, acknowledge, estimate in a pool, updates out."""
+"""The twin as a service: HTTP in front of the store, workers behind it."""
