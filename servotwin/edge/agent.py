@@ -14,7 +14,7 @@ from math import ceil, inf
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
-from servotwin.control.gains import with_gains
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.cut import Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
@@ -175,8 +175,9 @@ class Agent:
 
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""
-        s, p = self.settings, self.parameters
-        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, p.tolerance, s.model_version)
+        s, p, law = self.settings, self.parameters, self.controller
+        gains = None if law is None else gains_of(law)
+        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, p.tolerance, s.model_version, gains)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """Where in a block the next thing may happen: its end, the deadline, just after a change of the reference."""

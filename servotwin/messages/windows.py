@@ -7,6 +7,7 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.channels import Channel
 from servotwin.messages.checks import Count, Name, Text, all_finite, require
+from servotwin.messages.updates import Gains
 
 
 class Window(Struct, frozen=True, tag="window/1"):
@@ -48,6 +49,7 @@ class Window(Struct, frozen=True, tag="window/1"):
         require(all_finite(x for change in self.reference_changes for x in change), "a reference change is not finite")
         require(len({c.samples for c in self.channels}) == 1, "window channels differ in length")
         require(len({c.name for c in self.channels}) == len(self.channels), "window channel names repeat")
+        require(isfinite(self.start + self.samples / self.rate), "the time of the window's last sample is not finite")
 
     @property
     def identity(self) -> tuple[str, str, int]:
@@ -59,13 +61,34 @@ class Window(Struct, frozen=True, tag="window/1"):
         """Samples per channel."""
         return self.channels[0].samples
 
+    @property
+    def middle(self) -> float:
+        """Sample time half-way between the first and the last sample, s."""
+        return self.start + 0.5 * (self.samples - 1) / self.rate
+
     def channel(self, name: str) -> Channel | None:
         """The channel of that name, if it was recorded."""
         return next((channel for channel in self.channels if channel.name == name), None)
 
 
-class Hello(Struct, frozen=True, tag="hello/1"):
-    """The edge introduces itself after a start or a reconnection; time is its sample time, s."""
+class Hello(Struct, frozen=True, omit_defaults=True, tag="hello/1"):
+    """The edge introduces itself after a start or a reconnection.
+
+    Attributes
+    ----------
+    time : float
+        Its sample time, s.
+    rate : float
+        Hz.
+    parameter_version : int
+        In force.
+    tolerance : float
+        In force, m.
+    model_version : str
+        Which description of the servo it runs on.
+    controller : Gains, optional
+        In force: after a restart, those that were proved last at the machine. None: updates set none there.
+    """
 
     servo: Name
     boot: Name
@@ -74,6 +97,7 @@ class Hello(Struct, frozen=True, tag="hello/1"):
     parameter_version: Count
     tolerance: float
     model_version: Text
+    controller: Gains | None = None
 
     def __post_init__(self) -> None:
         require(all_finite((self.time, self.rate, self.tolerance)), "hello time, rate and tolerance must be finite")

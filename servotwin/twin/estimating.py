@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from servotwin.errors import InvalidInput
 from servotwin.identify import whitened
 from servotwin.identify.estimate import GapEstimate, no_estimate
 from servotwin.identify.gap import estimate_gap, settings_of
@@ -12,6 +13,7 @@ from servotwin.identify.offset import estimate_carrying
 from servotwin.identify.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
+from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.wear import Expectation
 
@@ -39,7 +41,9 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     return estimate
 
 
-def no_use(message: WindowMessage, reason: str) -> GapEstimate:
-    """The estimate from a window that no estimator accepts."""
-    middle = message.start + 0.5 * (message.samples - 1) / message.rate
-    return no_estimate(middle, (reason,), method=UNUSABLE)
+def estimate_from(message: WindowMessage, estimator: Estimator, expected: Expectation) -> GapEstimate:
+    """What a window says about the gap; where it cannot be used at all, UNIDENTIFIABLE and why."""
+    try:
+        return estimator(decode_window(message), expected)
+    except InvalidInput as error:
+        return no_estimate(message.middle, (str(error),), method=UNUSABLE)

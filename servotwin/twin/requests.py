@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -49,8 +49,8 @@ class Requests:
     def __init__(self, servo: str, policy: ExcitationPolicy, insistence: Insistence, widest: float) -> None:
         self.servo, self.policy, self.insistence, self.widest = servo, policy, insistence, widest
         self.pending: Request | None = None
-        self._memory, self._boot, self._serial = Memory(), "", 0
-        self._sent_at, self._attempts = -math.inf, 0
+        self.memory, self.boot, self.serial = Memory(), "", 0
+        self.sent_at, self.attempts = -math.inf, 0
 
     def learn(self, window: Window, estimate: GapEstimate, widest: float, runs: InForce, now: float) -> Decision:
         """Decide after a window; what is asked for is `pending` then.
@@ -67,19 +67,19 @@ class Requests:
         now : float
             s.
         """
-        if window.boot != self._boot:
-            self._boot, self._serial, self._memory, self.pending = window.boot, 0, self._memory.rebooted(), None
+        if window.boot != self.boot:
+            self.boot, self.serial, self.memory, self.pending = window.boot, 0, self.memory.rebooted(), None
         long = window.reason == "probe" or long_enough(*_extent(window), self.policy.settings)
         upper = min(self.widest, widest, estimate.interval[1])
-        decision = self.policy.look(self._memory, Seen(now, estimate.status, long, upper, _slack(runs)))
-        self._memory = decision.memory
+        decision = self.policy.look(self.memory, Seen(now, estimate.status, long, upper, _slack(runs)))
+        self.memory = decision.memory
         if estimate.ok and self.pending is not None and isinstance(self.pending.ask, Probe):
             self._close(None)
         if decision.ask is not None:
             until = window.start + self.insistence.validity
-            self._serial += 1
-            self.pending = Request(self.servo, self._boot, self._serial, decision.ask, until, decision.reason[:256])
-            self._attempts = 0
+            self.serial += 1
+            self.pending = Request(self.servo, self.boot, self.serial, decision.ask, until, decision.reason[:256])
+            self.attempts = 0
         return decision
 
     def settle(self, answer: Answer) -> Request | None:
@@ -88,9 +88,9 @@ class Requests:
         if asked is None or (answer.boot, answer.serial) != (asked.boot, asked.serial) or answer.outcome.passing:
             return None
         if answer.outcome is Outcome.DUPLICATE:
-            self._serial = max(self._serial, answer.newest) + 1
-            self.pending = msgspec.structs.replace(asked, serial=self._serial)
-            self._attempts = 0
+            self.serial = max(self.serial, answer.newest) + 1
+            self.pending = msgspec.structs.replace(asked, serial=self.serial)
+            self.attempts = 0
             return self.pending
         self._close(answer.outcome)
         return None
@@ -99,26 +99,31 @@ class Requests:
         """The pending request, which counts as sent."""
         if self.pending is None:
             return []
-        self._sent_at, self._attempts = now, self._attempts + 1
+        self.sent_at, self.attempts = now, self.attempts + 1
         return [self.pending]
+
+    def steady(self, now: float) -> None:
+        """Nothing happened later than `now` (s), whatever the clock said then."""
+        self.sent_at = min(self.sent_at, now)
+        self.memory = replace(self.memory, probed=min(self.memory.probed, now))
 
     def next_wake(self) -> float | None:
         """When `wake` is due, s; None: nothing is waited for."""
-        return None if self.pending is None else self._sent_at + self.insistence.retry
+        return None if self.pending is None else self.sent_at + self.insistence.retry
 
     def wake(self, now: float) -> list[Request]:
         """The pending request once more when its answer is overdue; given up after `attempts`."""
         due = self.next_wake()
         if due is None or now < due:
             return []
-        if self._attempts >= self.insistence.attempts:
+        if self.attempts >= self.insistence.attempts:
             self._close(None)
         return self.send(now)
 
     def _close(self, outcome: Outcome | None) -> None:
         """The pending request is over."""
         assert self.pending is not None
-        self._memory = self._memory.answered(self.pending.ask, outcome)
+        self.memory = self.memory.answered(self.pending.ask, outcome)
         self.pending = None
 
 

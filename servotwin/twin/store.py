@@ -8,9 +8,10 @@ from typing import Protocol
 from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
-from servotwin.messages import Answer, Fallback, Receipt, Request, Update, Window
+from servotwin.messages import Answer, Fallback, Hello, Receipt, Request, Update, Window
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
+from servotwin.twin.wear import Expectation
 
 Identity = tuple[str, str, int]
 """(servo, boot, sequence) of a window."""
@@ -23,8 +24,8 @@ class Store(Protocol):
         """Keep a window under its identity; False when it was there already."""
         ...
 
-    def add_estimate(self, window: Window, estimate: GapEstimate) -> None:
-        """Keep what was estimated from a window."""
+    def add_estimate(self, window: Window, estimate: GapEstimate, expected: Expectation) -> None:
+        """Keep what was estimated from a window, and what was expected of it."""
         ...
 
     def add_disturbance(self, window: Window, disturbance: Disturbance) -> None:
@@ -49,6 +50,10 @@ class Store(Protocol):
 
     def add_fallback(self, fallback: Fallback) -> None:
         """Keep what the edge did by itself."""
+        ...
+
+    def add_hello(self, hello: Hello) -> None:
+        """Keep that the edge started or came back."""
         ...
 
     def add_excitation(self, window: Window, decision: Decision) -> None:
@@ -76,6 +81,7 @@ class MemoryStore:
     updates: list[Update] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
     fallbacks: list[Fallback] = field(default_factory=list)
+    hellos: list[Hello] = field(default_factory=list)
     excitations: dict[Identity, Decision] = field(default_factory=dict)
     requests: list[Request] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
@@ -86,7 +92,7 @@ class MemoryStore:
         self.windows.setdefault(window.identity, window)
         return new
 
-    def add_estimate(self, window: Window, estimate: GapEstimate) -> None:
+    def add_estimate(self, window: Window, estimate: GapEstimate, _expected: Expectation) -> None:
         """Keep what was estimated from a window."""
         self.estimates[window.identity] = estimate
 
@@ -113,6 +119,10 @@ class MemoryStore:
     def add_fallback(self, fallback: Fallback) -> None:
         """Keep a fallback."""
         self.fallbacks.append(fallback)
+
+    def add_hello(self, hello: Hello) -> None:
+        """Keep a hello."""
+        self.hellos.append(hello)
 
     def add_excitation(self, window: Window, decision: Decision) -> None:
         """Keep a decision."""

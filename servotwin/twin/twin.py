@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.identify.disturbance import Disturbance, disturbance, nothing_known
 from servotwin.identify.estimate import GapEstimate
@@ -22,19 +21,20 @@ from servotwin.messages import (
     Receipt,
     Request,
     Update,
-    finite,
 )
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.evidence import UNASKED, Evidence
 from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.decode import decode_window
-from servotwin.twin.estimating import UNUSABLE, Estimator, estimator_of, no_use
+from servotwin.twin.delivery import Delivery
+from servotwin.twin.drafting import draft
+from servotwin.twin.estimating import UNUSABLE, Estimator, estimate_from, estimator_of
 from servotwin.twin.inforce import InForce, Settings
 from servotwin.twin.policies import policy_of
-from servotwin.twin.proof import proof_of
 from servotwin.twin.requests import Requests, requests_of
 from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import Knowledge, pack, unpack
 from servotwin.twin.store import Store
 from servotwin.twin.versions import Versions
 from servotwin.twin.wear import Wear
@@ -89,8 +89,8 @@ class Twin:
         self._estimator, self._policy, self._store, self._observer = estimator, policy, store, observer
         self._versions, self._known = Versions(), Settings({0: start or InForce()})
         self._wear = Wear(self.settings.initial_gap, self.settings.trend)
+        self._delivery = Delivery(self.settings.retry, self.settings.attempts)
         self._tuned_for: float | None = None
-        self._sent_at, self._attempts = -math.inf, 0
 
     @classmethod
     def of(
@@ -101,35 +101,62 @@ class Twin:
         settings: TwinSettings,
         estimator: Estimator | None = None,
         start: InForce | None = None,
+        state: bytes | None = None,
     ) -> Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs.
 
         The model's controller is the one that runs: policies design for it.
         Without `start` the edge is taken to begin with the servo's own controller.
+        With the `state` of an earlier twin of that servo it goes on where that one was.
+
+        Raises
+        ------
+        InvalidInput
+            The state is not understood, or another servo's.
         """
         policy = policy_of(servo, settings)
         begins = start or InForce(servo.controller)
         chosen = estimator or estimator_of(servo, settings)
         asks = requests_of(name, servo, settings)
-        return cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks)
+        twin = cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks)
+        if state:
+            twin.restore(state)
+        return twin
 
     @property
     def trend(self) -> Trend | None:
         """Gap and rate of wear as known from all windows that counted, on the sample time of the edge's boot."""
         return self._wear.trend
 
+    def state(self) -> bytes:
+        """Everything that it knows, as `restore` takes it; equal twins give equal bytes."""
+        return pack(self.servo, self._knowledge())
+
+    def restore(self, state: bytes) -> None:
+        """Know what an earlier twin of this servo knew, bit for bit; the settings stay its own.
+
+        Raises
+        ------
+        InvalidInput
+            The state is not understood, or another servo's.
+        """
+        knows = unpack(self.servo, state, self._knowledge())
+        self._versions, self._known, self._wear, self._requests, self._delivery, self._tuned_for = knows
+
     def receive(self, message: Message, now: float) -> list[Message]:
-        """What to send after a message that arrived at `now` (s, any steady clock of the twin's own).
+        """What to send after a message that arrived at `now` (s, a clock of the twin's own).
+
+        A window is committed to the store, acknowledged and learnt from, unless the store has it already.
 
         Raises
         ------
         InvalidMessage
             The message is for another servo, or of a kind that only an edge receives.
         """
-        if message.servo != self.servo:
-            raise InvalidMessage(f"message of servo {message.servo!r} came to the twin of {self.servo!r}")
+        self._check(message)
         if isinstance(message, WindowMessage):
             return self._window(message, now)
+        self._steady(now)
         if isinstance(message, Receipt):
             self._store.add_receipt(message)
             return self._send(self._versions.settle(message), now)
@@ -138,33 +165,20 @@ class Twin:
         if isinstance(message, Answer):
             return self._answered(message, now)
         if isinstance(message, Hello):
-            self._versions.hear(message.boot, message.parameter_version)
-            return []
+            return self._greeted(message)
         raise InvalidMessage(f"a twin does not receive {type(message).__name__} messages")
 
     def next_wake(self) -> float | None:
         """When `wake` is due, s; None: nothing is waited for."""
-        due = [] if self._versions.pending is None else [self._sent_at + self.settings.retry]
+        sent = self._delivery.next_wake(self._versions)
         asked = None if self._requests is None else self._requests.next_wake()
-        return min(due if asked is None else [*due, asked], default=None)
+        return min((due for due in (sent, asked) if due is not None), default=None)
 
     def wake(self, now: float) -> list[Message]:
         """The pending update and request once more when their answers are overdue; given up after `attempts`."""
-        again: list[Message] = [] if self._requests is None else [*self._requests.wake(now)]
-        if self._versions.pending is None or now < self._sent_at + self.settings.retry:
-            return again
-        if self._attempts >= self.settings.attempts:
-            self._versions.give_up()
-            return again
-        return self._again(now) + again
-
-    def estimate(self, message: WindowMessage, now: float) -> GapEstimate:
-        """What a window says about the gap; where it cannot be used at all, UNIDENTIFIABLE and why."""
-        try:
-            window = decode_window(message)
-            return self._estimator(window, self._wear.expect(message.boot, window.mid_time, now))
-        except InvalidInput as error:
-            return no_use(message, str(error))
+        self._steady(now)
+        asked = [] if self._requests is None else self._requests.wake(now)
+        return [*self._delivery.wake(self._versions, now), *asked]
 
     def observe(self, message: WindowMessage) -> Disturbance:
         """What a window says about input bias and noise; where it cannot be used at all, nothing and why."""
@@ -178,30 +192,54 @@ class Twin:
     def _window(self, message: WindowMessage, now: float) -> list[Message]:
         new = self._store.add_window(message)
         acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
-        return [acknowledge, *self._learn(message, now)] if new else [acknowledge]
+        return [acknowledge, *self.learn(message, now)] if new else [acknowledge]
 
-    def _learn(self, message: WindowMessage, now: float) -> list[Message]:
+    def learn(self, message: WindowMessage, now: float, arrived: float | None = None) -> list[Message]:
+        """What to send after a window that is safe already, and new.
+
+        Everything that a window leads to begins here, so a quicker look that spares most of them the rest of it
+        belongs here too: after `hear`, before `estimate_from`.
+
+        Parameters
+        ----------
+        message : messages.Window
+        now : float
+            s, a clock of the twin's own.
+        arrived : float, optional
+            When it arrived, on the same clock; `now` unless given. What passed between two boots of the edge is
+            taken from it.
+
+        Raises
+        ------
+        InvalidMessage
+            The window is another servo's.
+        """
+        self._check(message)
+        self._steady(now)
         self._versions.hear(message.boot, message.parameter_version)
-        estimate, disturbed = self.estimate(message, now), self.observe(message)
-        self._store.add_estimate(message, estimate)
+        heard = now if arrived is None else arrived
+        expected = self._wear.expect(message.boot, message.middle, heard)
+        estimate, disturbed = estimate_from(message, self._estimator, expected), self.observe(message)
+        self._store.add_estimate(message, estimate, expected)
         self._store.add_disturbance(message, disturbed)
         stale = not self._versions.admits(message)
-        why_not = _STALE if stale else self._refusal(message, estimate, now)
+        why_not = _STALE if stale else self._refusal(message, estimate, heard)
         self._store.add_trend(message, self.trend)
         unasked = stale or (why_not and self._policy.needs_estimate)
         redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
-        asked = [] if stale or estimate.method == UNUSABLE else self._ask(message, estimate, now)
+        asked = [] if stale or estimate.method == UNUSABLE else self._ask(message, estimate, now, heard)
         if redesign.tolerance is None:
             return asked
         self._tuned_for = redesign.gap
-        return self._send(self._versions.issue(self._draft(message, estimate, redesign)), now) + asked
+        drafted = draft(message, estimate, redesign, self.settings.validity)
+        return self._send(self._versions.issue(drafted), now) + asked
 
-    def _ask(self, message: WindowMessage, estimate: GapEstimate, now: float) -> list[Message]:
+    def _ask(self, message: WindowMessage, estimate: GapEstimate, now: float, heard: float) -> list[Message]:
         """A request, where windows tell too little."""
         if self._requests is None:
             return []
-        trend = self._wear.expect(message.boot, estimate.time, now).trend
+        trend = self._wear.expect(message.boot, estimate.time, heard).trend
         widest = math.inf if trend is None else trend.gap_interval[1]
         runs = self._known.of(self._versions.in_force)
         decision = self._requests.learn(message, estimate, widest, runs, now)
@@ -219,11 +257,11 @@ class Twin:
         self._store.add_request(request)
         return [*self._requests.send(now)]
 
-    def _refusal(self, message: WindowMessage, estimate: GapEstimate, now: float) -> str:
+    def _refusal(self, message: WindowMessage, estimate: GapEstimate, heard: float) -> str:
         """Why no parameters may stand on an estimate; empty where they may, and the trend has learnt from it."""
         if not estimate.ok:
             return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
-        if self._wear.learn(message.boot, estimate, now):
+        if self._wear.learn(message.boot, estimate, heard):
             return ""
         return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
 
@@ -235,6 +273,13 @@ class Twin:
         except InvalidInput as error:
             return Redesign(None, math.nan, str(error))
 
+    def _greeted(self, message: Hello) -> list[Message]:
+        """The edge started, or came back, with what it says."""
+        self._store.add_hello(message)
+        if self._versions.hear(message.boot, message.parameter_version):
+            self._known.hear(message)
+        return []
+
     def _fallen_back(self, message: Fallback) -> list[Message]:
         """The edge has left what this twin gave it: nothing made before is sent again."""
         self._store.add_fallback(message)
@@ -244,36 +289,23 @@ class Twin:
             self._tuned_for = None
         return []
 
-    def _draft(self, message: WindowMessage, estimate: GapEstimate, redesign: Redesign) -> Update:
-        """An update but for its version and base."""
-        assert redesign.tolerance is not None
-        low, high = estimate.interval
-        return Update(
-            servo=self.servo,
-            version=1,
-            base_version=0,
-            window=(message.boot, message.sequence),
-            data_time=message.start,
-            gap=finite(estimate.gap),
-            std=finite(estimate.std_total),
-            interval=(finite(low), finite(high)),
-            status=estimate.status.value,
-            tolerance=redesign.tolerance,
-            not_after=message.start + self.settings.validity,
-            controller=None if redesign.controller is None else gains_of(redesign.controller),
-            band=redesign.band,
-            proof=None if redesign.certificate is None else proof_of(redesign.certificate),
-        )
-
     def _send(self, update: Update | None, now: float) -> list[Message]:
         if update is None:
             return []
         self._store.add_update(update)
-        self._known.issue(update)
-        self._attempts = 0
-        return self._again(now)
+        self._known.issue(update, self._versions.in_force)
+        return [*self._delivery.first(self._versions, now)]
 
-    def _again(self, now: float) -> list[Message]:
-        pending = self._versions.pending
-        self._sent_at, self._attempts = now, self._attempts + 1
-        return [] if pending is None else [pending]
+    def _check(self, message: Message) -> None:
+        if message.servo != self.servo:
+            raise InvalidMessage(f"message of servo {message.servo!r} came to the twin of {self.servo!r}")
+
+    def _steady(self, now: float) -> None:
+        """Nothing happened later than now: a clock that was put back must not make anything wait for it."""
+        self._delivery.steady(now)
+        if self._requests is not None:
+            self._requests.steady(now)
+
+    def _knowledge(self) -> Knowledge:
+        parts = self._versions, self._known, self._wear, self._requests, self._delivery
+        return Knowledge(*parts, self._tuned_for)

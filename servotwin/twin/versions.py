@@ -9,6 +9,9 @@ import msgspec
 
 from servotwin.messages import Reason, Receipt, Update, Window
 
+EARLIER = 1000
+"""Boots that a twin remembers, so that what it remembers is bounded."""
+
 
 @dataclass
 class Versions:
@@ -30,6 +33,8 @@ class Versions:
         The newest update, while no receipt for it has come.
     newest : float
         Data time of the newest update of this boot, s.
+    earlier : list of str
+        Boots that are over, the last `EARLIER` of them.
     """
 
     boot: str | None = None
@@ -37,11 +42,11 @@ class Versions:
     issued: int = 0
     pending: Update | None = None
     newest: float = -math.inf
-    _earlier: set[str] = field(default_factory=set)
+    earlier: list[str] = field(default_factory=list)
 
     def hear(self, boot: str, in_force: int) -> bool:
         """Note what a message says about its boot; False when that boot is over."""
-        if boot in self._earlier:
+        if boot in self.earlier:
             return False
         if boot != self.boot:
             self._begin(boot, in_force)
@@ -75,7 +80,7 @@ class Versions:
 
     def _begin(self, boot: str, in_force: int) -> None:
         if self.boot is not None:
-            self._earlier.add(self.boot)
+            self.earlier = [*self.earlier, self.boot][-EARLIER:]
         self.boot, self.in_force = boot, in_force
         self.pending, self.newest = None, -math.inf
 

@@ -67,8 +67,8 @@ class Wear:
     def __init__(self, initial_gap: float, settings: TrendSettings) -> None:
         self.settings = settings
         self.trend: Trend | None = None
-        self._previous = initial_gap
-        self._boot, self._heard = "", 0.0
+        self.previous = initial_gap
+        self.boot, self.heard = "", 0.0
 
     def expect(self, boot: str, time: float, now: float) -> Expectation:
         """What is known before a window of `boot` with its middle at `time` (s) that arrived at `now`.
@@ -76,7 +76,7 @@ class Wear:
         For a window older than the trend, what is known is the trend as it stands.
         """
         trend = self._on_clock(boot, time, now)
-        return Expectation(self._previous, trend and trend.predict(max(time, trend.time)))
+        return Expectation(self.previous, trend and trend.predict(max(time, trend.time)))
 
     def learn(self, boot: str, estimate: GapEstimate, now: float) -> bool:
         """Take an estimate; whether it counts.
@@ -88,14 +88,14 @@ class Wear:
         if not estimate.ok or (trend is not None and estimate.time <= trend.time):
             return False
         self.trend = (trend or Trend.start(estimate.time, self.settings)).update(estimate)
-        self._boot, self._heard = boot, now
+        self.boot, self.heard = boot, now
         counts = self.trend.refused == 0
         if counts:
-            self._previous = estimate.gap
+            self.previous = estimate.gap
         return counts
 
     def _on_clock(self, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
-        if self.trend is None or boot == self._boot:
+        if self.trend is None or boot == self.boot:
             return self.trend
-        return self.trend.without_offset().on_clock(time - max(0.0, now - self._heard))
+        return self.trend.without_offset().on_clock(time - max(0.0, now - self.heard))
