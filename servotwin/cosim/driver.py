@@ -24,11 +24,11 @@ from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import SimulatedLink
+from servotwin.machine import simulation_of
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, decode, encode
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.scenario import Scenario
-from servotwin.simulation import Run, Simulation
+from servotwin.simulation import Run
 from servotwin.simulation.splice import shifted
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.inforce import InForce
@@ -271,22 +271,3 @@ class Cosimulation:
         waiting = [key for key in self.outbox.pending() if key not in delivered]
         counts = Counter({"delivered": len(delivered), "in flight": len(waiting)})
         return +(counts + self.agent.dropped)
-
-
-def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
-    """The plant and its controller at the start of a scenario; `plant` where the machine is another than twin and edge
-    take it for."""
-    return Simulation(
-        scenario.servo if plant is None else plant,
-        scenario.duration,
-        controller=scenario.start_law,
-        reference=scenario.reference,
-        gap=scenario.gap,
-        tolerance=scenario.start_tolerance,
-        theta_d0=scenario.theta_d0,
-        sample_rate=scenario.recording.sample_rate,
-        noise=scenario.noise,
-        seed=scenario.seed_of("noise"),
-        input_bias=scenario.input_bias,
-        friction=scenario.friction,
-    )

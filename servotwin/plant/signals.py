@@ -208,12 +208,17 @@ class SquareWave:
 
     def pieces(self, duration: float, /) -> PiecewiseCubic:
         """One constant per half period that starts on [0, duration]."""
-        count = 2.0 * max(duration, 0.0) / self.period
+        return self.between(0.0, max(duration, 0.0))
+
+    def between(self, begin: float, end: float) -> PiecewiseCubic:
+        """The same from a time on (s, at least 0), whatever it was before: for a run without an end."""
+        count = 2.0 * (end - begin) / self.period
         if not count <= _MOST_PIECES:
-            shown = f"SquareWave period = {self.period!r} s: gives {count:.3g} half periods in {duration!r} s"
+            shown = f"SquareWave period = {self.period!r} s: gives {count:.3g} half periods in {end - begin!r} s"
             raise InvalidInput(f"{shown}; at most {_MOST_PIECES:g} are allowed")
-        halves = np.arange(math.floor(count) + 1)
-        return PiecewiseCubic.held(halves * (0.5 * self.period), self.offset + self.amplitude * (-1.0) ** halves)
+        halves = np.arange(math.floor(2.0 * begin / self.period), math.floor(2.0 * end / self.period) + 1)
+        times, values = halves * (0.5 * self.period), self.offset + self.amplitude * (-1.0) ** halves
+        return PiecewiseCubic.held(np.append(0.0, times[1:]), values)
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,10 @@ from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation import kept
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.run import Inputs, quantised
-from servotwin.simulation.ticks import Drive, Output, Port, run_ticks, tick_and_record
+from servotwin.simulation.ticks import Drive, Port, run_ticks, tick_and_record
 
 _CHUNK = 1 << 15
 _RECORDED = ("theta_m", "theta_d", "voltage")
@@ -39,7 +40,8 @@ _RECORDED = ("theta_m", "theta_d", "voltage")
 
 @dataclass
 class SampledEngine:
-    """Engine of a `Simulation` whose controller has a sample rate."""
+    """Engine of a `Simulation` whose controller has a sample rate; with `keep` it remembers at least so many samples,
+    and no events."""
 
     servo: Servo
     controller: Controller
@@ -48,6 +50,7 @@ class SampledEngine:
     samples: int
     noise: Noise | None
     rng: np.random.Generator
+    keep: int | None = None
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
@@ -69,10 +72,8 @@ class SampledEngine:
         self.source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.drawn = np.zeros(0)
         self.port = self._make_port(searches)
-        total = (self.samples - 1) * self.record_every + 1
-        ticks = -(-total // self.tick_every)
-        rows = len(self.port.recorded)
-        self.output = Output(np.empty((rows, self.samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8))
+        samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
+        self.output = kept.new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
@@ -94,21 +95,38 @@ class SampledEngine:
         """Sample reached."""
         return self.base // self.record_every
 
+    @property
+    def oldest(self) -> int:
+        """The first sample remembered."""
+        return self.output.first_sample
+
     def advance(self, index: int) -> None:
         """Go on to a sample; at the last one of the horizon the tick is taken too."""
+        while self.keep is not None and index - self.index > self.keep:
+            self._advance(self.index + self.keep)
+        self._advance(index)
+
+    def _advance(self, index: int) -> None:
         end = index * self.record_every
-        for base, jumps in self._knots(end):
+        self.make_room(index)
+        for base, jumps in self.knots(end):
             self._run(base)
             self._run_through(base, jumps)
         self._run(end)
         if index == self.samples - 1:
-            drive = self._drive(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
+            drive = self.drive(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
             self.law_state = tick_and_record(
                 self.base, self.state, self.parameters, self.law_state, self.port, drive, self.output
             )
             self.finished = True
 
-    def _knots(self, end: int) -> list[tuple[int, list[Jump]]]:
+    def make_room(self, index: int) -> None:
+        """Forget what is too old, where samples up to `index` would not fit."""
+        if self.keep is not None and index - self.oldest > 2 * self.keep:
+            self.output = kept.moved_on(self.output, self.index - self.keep, self.tick_every, self.record_every)
+            self.record.size[1] = 0
+
+    def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
         """Base steps during or at the end of which the gap's cubic changes, with those changes."""
         gap, found = self.inputs.gap, dict[int, list[Jump]]()
         jumping = set(gap.jumps.tolist())
@@ -120,7 +138,7 @@ class SampledEngine:
                 found.setdefault(base, []).append(Jump(time, self.plant.input_values("gap", coefficients), opened))
         return sorted(found.items())
 
-    def _drive(self, first: int, last: int) -> Drive:
+    def drive(self, first: int, last: int) -> Drive:
         """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
         times = np.arange(first, first + count) / self.tick_rate
@@ -144,28 +162,30 @@ class SampledEngine:
     def _run(self, end: int) -> None:
         while self.base < end:
             stop = min(end, self.base + _CHUNK)
-            first, last = -(-self.base // self.tick_every), -(-stop // self.tick_every)
-            drive = self._drive(first, last)
-            while self.base < stop:
-                status, self.base, self.mode, self.law_state = run_ticks(
-                    self.tables,
-                    self.state,
-                    self.base,
-                    stop,
-                    self.mode,
-                    self.parameters,
-                    self.law_state,
-                    self.port,
-                    drive,
-                    self.output,
-                    self.record,
-                    self.scratch,
-                )
-                self._check(status)
+            self.flow(stop, self.drive(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
+
+    def flow(self, end: int, drive: Drive) -> None:
+        """Go on to a base step; `drive` covers the ticks on the way, on which the gap's cubic does not change."""
+        while self.base < end:
+            status, self.base, self.mode, self.law_state = run_ticks(
+                self.tables,
+                self.state,
+                self.base,
+                end,
+                self.mode,
+                self.parameters,
+                self.law_state,
+                self.port,
+                drive,
+                self.output,
+                self.record,
+                self.scratch,
+            )
+            self._check(status)
 
     def _run_through(self, base: int, jumps: list[Jump]) -> None:
         """One base step in which the gap's cubic changes."""
-        drive = self._drive(-(-base // self.tick_every), base // self.tick_every + 1)
+        drive = self.drive(-(-base // self.tick_every), base // self.tick_every + 1)
         self.law_state = tick_and_record(
             base, self.state, self.parameters, self.law_state, self.port, drive, self.output
         )
@@ -218,13 +238,14 @@ class SampledEngine:
         out = np.zeros(last - first)
         for j, state in enumerate(self.port.recorded):
             if row[state] != 0.0:
-                out += row[state] * self.output.states[j, first:last]
+                out += row[state] * self.output.states[j, first - self.oldest : last - self.oldest]
         if last > self.index and not self.finished:
             out[-1] = row @ self.state
         return out
 
     def _measured(self, first: int, last: int) -> Array:
-        out = self.output.measured[np.arange(first, last) * self.record_every // self.tick_every]
+        ticks = np.arange(first, last) * self.record_every // self.tick_every
+        out = self.output.measured[ticks - self.output.first_tick]
         if last > self.index and not self.finished:
             present = self.channel("position", self.index, self.index + 1)
             out[-1] = quantised(present, self.servo.position_resolution)[0]

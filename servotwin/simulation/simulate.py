@@ -62,6 +62,8 @@ class Simulation:
         V, added to the voltage behind the controller and its limits.
     friction : float
         N m, Coulomb's on the motor's shaft, which sticks and slips; needs a rigid screw.
+    keep : int, optional
+        Samples that are remembered, at least one; needs a sampled controller. None: all of them, and the events.
 
     Raises
     ------
@@ -83,6 +85,7 @@ class Simulation:
         seed: int | np.random.Generator = 0,
         input_bias: float = 0.0,
         friction: float = 0.0,
+        keep: int | None = None,
     ) -> None:
         _check_times(duration, sample_rate)
         _check_disturbances(input_bias, friction)
@@ -98,12 +101,14 @@ class Simulation:
             float(friction),
         )
         rng = np.random.default_rng(seed)
+        self.keep = keep
+        self._check_keep()
         self.engine: Engine
         if self.controller.sample_rate is None:
             source = None if noise is None else noise.source(sample_rate, rng)
             self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0, noise=source)
         else:
-            self.engine = SampledEngine(servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng)
+            self.engine = SampledEngine(servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng, keep)
 
     @property
     def index(self) -> int:
@@ -167,6 +172,10 @@ class Simulation:
         if tolerance is not None:
             self.inputs.retune(self.time, tolerance)
 
+    def _check_keep(self) -> None:
+        if self.keep is not None and (self.keep < 1 or self.controller.sample_rate is None):
+            raise InvalidInput(f"keep = {self.keep} samples: must be at least 1, and needs a sampled controller")
+
     def _check_tolerance(self, tolerance: float) -> None:
         if self.inputs.tolerance is None:
             raise InvalidInput("this simulation has no dead zone: start it with tolerance=0.0 to set one later")
@@ -187,9 +196,11 @@ class Simulation:
         -------
         (last - first,) array
         """
-        if not 0 <= first <= last <= self.index + 1:
+        oldest = 0 if self.keep is None else max(0, self.index - self.keep)
+        if not oldest <= first <= last <= self.index + 1:
             raise InvalidInput(
-                f"samples {first} .. {last} are outside 0 .. {self.index + 1}, what was simulated so far"
+                f"samples {first} .. {last} are outside {oldest} .. {self.index + 1}, what was simulated so far"
+                + ("" if self.keep is None else " and is remembered")
             )
         if name == "reference":
             return self.inputs.reference.on(self.inputs.times(first, last))
@@ -197,7 +208,15 @@ class Simulation:
         return quantised(values, self.servo.encoder_resolution) if name == "theta_m" else values
 
     def run(self) -> Run:
-        """Everything up to the present sample."""
+        """Everything up to the present sample.
+
+        Raises
+        ------
+        InvalidInput
+            Not everything is remembered.
+        """
+        if self.keep is not None:
+            raise InvalidInput(f"keep = {self.keep} samples: a simulation that forgets has no run to give")
         return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
 
 

@@ -29,6 +29,15 @@ def spliced(before: PiecewiseCubic, after: PiecewiseCubic, time: float) -> Piece
     return PiecewiseCubic(times, np.vstack([before.coeffs[past], about(after, time), after.coeffs[future]]))
 
 
+def recent(pieces: PiecewiseCubic, time: float) -> PiecewiseCubic:
+    """The same from a time (s) on; of what was before, only a constant is left."""
+    first = int(np.searchsorted(pieces.times, time, side="right")) - 1
+    if first <= 0:
+        return pieces
+    past = [[pieces.coeffs[first, 0], 0.0, 0.0, 0.0]]
+    return PiecewiseCubic(np.append(0.0, pieces.times[first:]), np.vstack([past, pieces.coeffs[first:]]))
+
+
 def shifted(pieces: PiecewiseCubic, offset: PiecewiseCubic) -> PiecewiseCubic:
     """A signal plus another."""
     times = np.union1d(pieces.times, offset.times)

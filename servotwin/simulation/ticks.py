@@ -42,11 +42,13 @@ class Drive(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What is recorded, by absolute index."""
+    """What is recorded, from a sample and a tick on."""
 
     states: Array  # (recorded, samples)
     measured: Array  # (ticks,)
     active: NDArray[np.int8]  # (ticks,)
+    first_sample: int
+    first_tick: int
 
 
 @inlined
@@ -74,8 +76,8 @@ def take_tick(
     )
     state = tick(now, state, drive.reference[k], y)
     x[port.voltage] = state.voltage
-    output.measured[i] = y
-    output.active[i] = 1 if state.active > 0.5 else 0
+    output.measured[i - output.first_tick] = y
+    output.active[i - output.first_tick] = 1 if state.active > 0.5 else 0
     return state
 
 
@@ -83,7 +85,7 @@ def take_tick(
 def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
     """Record the states of one sample."""
     for j in range(len(port.recorded)):
-        output.states[j, row] = x[port.recorded[j]]
+        output.states[j, row - output.first_sample] = x[port.recorded[j]]
 
 
 @bare
