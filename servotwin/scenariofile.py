@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from servotwin.control import controllerfile
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
 from servotwin.edge.probe import ProbeLimits
@@ -17,7 +17,6 @@ from servotwin.edge.settings import Supervision
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
-from servotwin.plant import servofile
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
@@ -25,7 +24,6 @@ from servotwin.tomltable import Table, given, part
 from servotwin.twin import settingsfile as twinfile
 
 MM = 1e-3
-_GAINS = [key for key in servofile.CONTROLLER if key.symbol in Gains.__struct_fields__]
 DEG = math.pi / 180.0
 
 
@@ -159,7 +157,7 @@ def _gap(table: Table) -> SignalLike:
 
 def _controller(table: Table, controller: Controller) -> Controller | None:
     """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
-    changes = given(table, {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER})
+    changes = given(table, controllerfile.KEYS)
     return controller.replace(**changes) if changes else None
 
 
@@ -232,8 +230,7 @@ def _supervision(table: Table, controller: Controller) -> Supervision | None:
         return None
 
     def gains(inner: Table) -> Gains:
-        changed = given(inner, {key.name: (key.symbol, key.read) for key in _GAINS})
-        return gains_of(controller.replace(**changed))
+        return controllerfile.gains(inner, controller)
 
     def whole(inner: Table) -> Supervision:
         inner.table("probe")

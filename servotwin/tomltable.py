@@ -162,6 +162,10 @@ class Table:
             raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
         return [Table(self.source, item, f"{self.path(key)}[{i}]") for i, item in enumerate(value)]
 
+    def known(self, *keys: str) -> None:
+        """These keys are allowed here, whether they are read or not."""
+        self._asked.update(keys)
+
     def done(self) -> None:
         """Refuse whatever was never asked for."""
         for key in self.values:
@@ -206,7 +210,7 @@ Reader = tuple[str, Callable[[Table, str], Any]]
 
 def given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
     """What a table gives of these keys, by the names they set."""
-    table._asked.update(readers)
+    table.known(*readers)
     return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
 
 

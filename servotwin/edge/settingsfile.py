@@ -14,19 +14,38 @@ from servotwin.messages import Band, Gains
 from servotwin.tomltable import Reader, Table, given
 
 MM = 1e-3
-GainsReader = Callable[[Table], Gains]
-"""Reads the gains that a table gives, with those of the running controller for the others."""
+GainsReader = Callable[[Table], Gains | None]
+"""Reads the gains that a table gives, with those of the running controller for the others; None: gains stay."""
 
 
 def _millimetres(table: Table, key: str) -> float:
     return table.number(key, minimum=0.0, infinite=True) * MM
 
 
+def length(table: Table, name: str, default: float | None = None) -> float:
+    """A length in m, at least 0: `name_mm`, or `name_m` where a program wrote it to the last bit."""
+    exact, key = f"{name}_m", f"{name}_mm"
+    table.known(exact, key)
+    if exact in table.values:
+        return table.number(exact, minimum=0.0, infinite=True)
+    if key not in table.values and default is not None:
+        return default
+    return _millimetres(table, key)
+
+
 def _number(table: Table, key: str) -> float:
     return table.number(key, infinite=True)
 
 
+def _metres(table: Table, key: str) -> float:
+    return table.number(key, minimum=0.0, infinite=True)
+
+
 LIMITS: Mapping[str, Reader] = {
+    "minimum_m": ("minimum", _metres),
+    "maximum_m": ("maximum", _metres),
+    "max_step_m": ("max_step", _metres),
+    "max_rate_m_per_s": ("max_rate", _metres),
     "minimum_mm": ("minimum", _millimetres),
     "maximum_mm": ("maximum", _millimetres),
     "max_step_mm": ("max_step", _millimetres),
@@ -51,6 +70,7 @@ WATCH: Mapping[str, Reader] = {
     "margin": ("margin", Table.number),
     "overshoot": ("overshoot", Table.number),
     "persist_s": ("persist_s", Table.number),
+    "error_floor_m": ("error_floor", _metres),
     "error_floor_mm": ("error_floor", _millimetres),
     "effort_floor_v": ("effort_floor", Table.number),
     "swings": ("swings", Table.integer),
@@ -60,7 +80,7 @@ WATCH: Mapping[str, Reader] = {
 
 def probe(table: Table) -> ProbeLimits:
     """Which probing moves the twin may request."""
-    return ProbeLimits(**{"size": table.number("size_mm") * MM, **given(table, PROBE)})
+    return ProbeLimits(**{"size": length(table, "size"), **given(table, PROBE)})
 
 
 def limits(table: Table) -> Limits:
@@ -76,12 +96,12 @@ def supervision(table: Table, gains: GainsReader) -> Supervision:
 
 
 def _fallback(table: Table, gains: GainsReader) -> FallbackSet:
-    tolerance = table.number("tolerance_mm", 0.0, minimum=0.0) * MM
-    band = _band(table.table("band")) if "band" in table.values else None
+    tolerance = length(table, "tolerance", 0.0)
+    found_band = band(table.table("band")) if "band" in table.values else None
     found = FallbackSet(
         tolerance,
         gains(table),
-        band,
+        found_band,
         table.number("silence_s", inf, positive=True, infinite=True),
         table.number("refuse_s", FallbackSet(0.0).refuse_s, minimum=0.0),
     )
@@ -89,8 +109,9 @@ def _fallback(table: Table, gains: GainsReader) -> FallbackSet:
     return found
 
 
-def _band(table: Table) -> Band:
-    error, error_rms = (table.number(key, minimum=0.0) * MM for key in ("error_mm", "error_rms_mm"))
+def band(table: Table) -> Band:
+    """What a loop is predicted to stay within."""
+    error, error_rms = (length(table, name) for name in ("error", "error_rms"))
     found = Band(error, error_rms, table.number("effort_v", minimum=0.0), table.number("settling_s", minimum=0.0))
     table.done()
     return found

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from servotwin.control import controllerfile
 from servotwin.tomltable import Table
 
 
@@ -23,10 +24,6 @@ def _positive(table: Table, key: str) -> Any:
     return table.number(key, positive=True)
 
 
-def _positive_or_none(table: Table, key: str) -> Any:
-    return table.number(key, None, positive=True)
-
-
 def _stiffness(table: Table, key: str) -> Any:
     return table.number(key, float("inf"), positive=True, infinite=True)
 
@@ -41,18 +38,6 @@ def _each_nonnegative(table: Table, key: str) -> Any:
 
 def _resolution(table: Table, key: str) -> Any:
     return table.number(key, 0.0, minimum=0.0)
-
-
-def _multiple(table: Table, key: str) -> Any:
-    return table.number(key, 1.0, minimum=0.0)
-
-
-def _voltage(table: Table, key: str) -> Any:
-    return table.number(key, 0.0)
-
-
-def _release(table: Table, key: str) -> Any:
-    return table.number(key, 0.5, positive=True)
 
 
 def _count(table: Table, key: str) -> Any:
@@ -74,21 +59,7 @@ PLANT = (
     Key("sensors", "encoder_resolution_rad", "encoder_resolution", _resolution),
     Key("sensors", "position_resolution_m", "position_resolution", _resolution),
 )
-CONTROLLER = (
-    Key("controller", "kp_v_per_m", "Kp", Table.number),
-    Key("controller", "ki_v_per_m_s", "Ki", Table.number),
-    Key("controller", "kd_v_s_per_m", "Kd", Table.number),
-    Key("controller", "filter_time_s", "Tf", _positive),
-    Key("controller", "enter_tolerances", "enter", _multiple),
-    Key("controller", "leave_tolerances", "leave", _multiple),
-    Key("controller", "loop_filter_hz", "loop_filter_hz", _positive_or_none),
-    Key("controller", "voltage_limit_v", "voltage_limit", _positive_or_none),
-    Key("controller", "rate_limit_v_per_s", "rate_limit", _positive_or_none),
-    Key("controller", "sample_rate_hz", "sample_rate", _positive_or_none),
-    Key("controller", "tracking_time_s", "tracking_time", _positive_or_none),
-    Key("controller", "feedforward_v", "feedforward", _voltage),
-    Key("controller", "release_time_s", "release_time", _release),
-)
+CONTROLLER = tuple(Key("controller", name, symbol, read) for name, (symbol, read) in controllerfile.KEYS.items())
 
 
 def read(table: Table) -> tuple[dict[str, Any], dict[str, Any]]:
