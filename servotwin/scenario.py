@@ -122,7 +122,7 @@ class Scenario:
             The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
             is unstable on the servo even without a gap, nothing is proved for the stated range.
         """
-        return cls._from_table(read_toml(path), Path(path).parent)
+        return cls.from_table(read_toml(path), Path(path).parent)
 
     @classmethod
     def preset(cls, name: str) -> Scenario:
@@ -131,10 +131,11 @@ class Scenario:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
         text = resources.files("servotwin").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
-        return cls._from_table(parse_toml(text, f"{name}.toml"), Path())
+        return cls.from_table(parse_toml(text, f"{name}.toml"), Path())
 
     @classmethod
-    def _from_table(cls, table: Table, folder: Path) -> Scenario:
+    def from_table(cls, table: Table, folder: Path) -> Scenario:
+        """A scenario from a table that was read already; a servo's path in it is relative to `folder`."""
         values = scenariofile.read(table, folder)
         with named(table):
             scenario = cls(**values)

@@ -124,8 +124,8 @@ class SupervisedDrive(Drive, Protocol):
         """
 
     def write(self, parameters: Parameters) -> None:
-        """Run on these: version, tolerance and gains (None: the drive's own), all at once and without a jump of the
-        voltage; the blocks to come say from which sample on.
+        """Run on these: version, tolerance and gains, all at once; the blocks to come say from which sample on. Gains
+        come without a jump of the voltage; None leaves them as they are, and sets the dead zone as it is.
 
         Raises
         ------

@@ -73,12 +73,15 @@ class Endless:
         self._offset = offset
         self.lay_out()
 
+    def set_tolerance(self, tolerance: float) -> None:
+        """A new dead zone (m) from the present sample on."""
+        self.simulation.set_tolerance(tolerance)
+        self._forget()
+
     def set_controller(self, controller: Controller, tolerance: float) -> None:
         """Another controller and dead zone (m) from the present sample on, without a jump of the voltage."""
         self.simulation.set_controller(controller, tolerance)
-        inputs = self.simulation.inputs
-        assert inputs.tolerance is not None
-        inputs.tolerance = recent(inputs.tolerance, self._oldest)
+        self._forget()
 
     def measured(self, name: str, first: int, last: int) -> Array:
         """As `Simulation.measured` says, of the samples remembered."""
@@ -88,6 +91,12 @@ class Endless:
     def _oldest(self) -> float:
         """Time of the oldest sample remembered, s."""
         return self.engine.oldest / self.rate
+
+    def _forget(self) -> None:
+        """What the dead zone was before the oldest sample remembered."""
+        inputs = self.simulation.inputs
+        assert inputs.tolerance is not None
+        inputs.tolerance = recent(inputs.tolerance, self._oldest)
 
     def _set_reference(self, reference: PiecewiseCubic) -> None:
         inputs = self.simulation.inputs

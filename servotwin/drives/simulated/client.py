@@ -1,0 +1,222 @@
+"""The client of a simulated machine, in both roles; standard library only."""
+
+import socket
+import sys
+from array import array
+from dataclasses import dataclass
+from math import nan
+
+import msgspec
+
+from servotwin.drives.simulated import wire
+from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
+from servotwin.edge.parameters import Parameters
+from servotwin.errors import InvalidInput
+from servotwin.messages import Gains
+
+_NO_GAINS = (0.0,) * len(Gains.__struct_fields__)
+
+
+@dataclass(frozen=True)
+class Welcome:
+    """What a machine says of itself."""
+
+    rate: float
+    machine: str
+
+
+class Line:
+    """The connection to a machine in one role.
+
+    Parameters
+    ----------
+    address : str
+        "unix:PATH" or "127.0.0.1:PORT".
+    role : str
+        "control" or "supervise".
+    silence : float
+        s without an answer after which the machine counts as lost; 0: never.
+    """
+
+    def __init__(self, address: str, role: str, silence: float) -> None:
+        self._address, self._role, self._silence = wire.address_of(address), role, silence
+        self._socket: socket.socket | None = None
+        self.welcome = Welcome(0.0, "")
+
+    def connect(self) -> None:
+        """Reach the machine, at first or again."""
+        self.close()
+        self._socket = wire.new_socket(self._address)
+        wire.patient(self._socket, self._silence)
+        wire.at_once(self._socket)
+        try:
+            self._socket.connect(wire.place(self._address))
+            self._socket.sendall(wire.HELLO.pack(wire.MAGIC, wire.VERSION, wire.ROLES[self._role]))
+            answer = wire.receive(self._socket, wire.WELCOME.size)
+        except OSError as error:
+            raise self.lost(error) from None
+        self.welcome = self._welcomed(answer)
+
+    def _welcomed(self, answer: bytes) -> Welcome:
+        magic, version, role, run, rate = wire.WELCOME.unpack(answer)
+        if magic != wire.MAGIC or version != wire.VERSION or role != wire.ROLES[self._role]:
+            self.close()
+            spoken = "" if magic != wire.MAGIC else f" (its role is {role}, its protocol {version})"
+            wanted = f"the role {self._role} in protocol {wire.VERSION}"
+            raise InvalidInput(f"machine address {self._address}: does not offer {wanted}{spoken}")
+        return Welcome(rate, run.hex())
+
+    def send(self, data: bytes) -> None:
+        """Send all of it, or lose the machine."""
+        try:
+            self._connected.sendall(data)
+        except OSError as error:
+            raise self.lost(error) from None
+
+    def receive(self, size: int) -> bytes:
+        """So many bytes, or lose the machine."""
+        try:
+            return wire.receive(self._connected, size)
+        except OSError as error:
+            raise self.lost(error) from None
+
+    @property
+    def _connected(self) -> socket.socket:
+        if self._socket is None:
+            raise DriveLost(f"machine {self._address}: not connected")
+        return self._socket
+
+    def lost(self, error: OSError) -> DriveLost:
+        """What to raise when it is gone."""
+        self.close()
+        told = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
+        return DriveLost(f"machine {self._address}: {told}")
+
+    def close(self) -> None:
+        """Let go of it."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class SimulatedControl:
+    """`edge.drive.ControlDrive` of a simulated machine; the parameters are those of `Line`."""
+
+    def __init__(self, address: str, silence: float = 5.0) -> None:
+        self._line = Line(address, "control", silence)
+        self._owed = False
+        self._lag = 0.0
+
+    @property
+    def rate(self) -> float:
+        """Hz."""
+        return self._line.welcome.rate
+
+    @property
+    def machine(self) -> str:
+        """The machine's present run."""
+        return self._line.welcome.machine
+
+    @property
+    def lag(self) -> float:
+        """s behind its pace."""
+        return self._lag
+
+    def connect(self) -> None:
+        """Reach the machine; its voltage is what it was left with until the first `write`."""
+        self._line.connect()
+        self._owed = False
+
+    def read(self) -> Sample | None:
+        """The next sample; one that was not answered lets the voltage hold."""
+        if self._owed:
+            self.write(nan)
+        number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._line.receive(wire.SAMPLE.size))
+        if number == wire.LAST:
+            return None
+        self._owed = True
+        return Sample(number, reference, theta_m, position)
+
+    def write(self, voltage: float) -> None:
+        """Answer the last sample, once."""
+        if self._owed:
+            self._owed = False
+            self._line.send(wire.VOLTAGE.pack(voltage))
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._line.close()
+
+
+class SimulatedSupervised:
+    """`edge.drive.SupervisedDrive` of a simulated machine; the parameters are those of `Line`.
+
+    Reconnected to the same run of the machine it goes on with the sample that is due, as long as the machine has it.
+    """
+
+    can_move = True
+
+    def __init__(self, address: str, silence: float = 5.0) -> None:
+        self._line = Line(address, "supervise", silence)
+        self._next = wire.NOW
+        self._lag = 0.0
+
+    @property
+    def rate(self) -> float:
+        """Hz."""
+        return self._line.welcome.rate
+
+    @property
+    def machine(self) -> str:
+        """The machine's present run."""
+        return self._line.welcome.machine
+
+    @property
+    def lag(self) -> float:
+        """s behind its pace."""
+        return self._lag
+
+    def connect(self) -> None:
+        """Reach the machine; in a new run samples count from the present one."""
+        before = self.machine
+        self._line.connect()
+        if self.machine != before:
+            self._next = wire.NOW
+
+    def read(self, most: int = 0) -> Block | None:
+        """The next samples."""
+        over, count, first, version = self._ask(wire.READ, self._next, most=most)
+        if over == wire.OVER:
+            return None
+        signals = [array("d") for _ in range(4)]
+        data = self._line.receive(32 * count) if count else b""
+        for k, signal in enumerate(signals):
+            signal.frombytes(data[8 * count * k : 8 * count * (k + 1)])
+            if sys.byteorder == "big":
+                signal.byteswap()
+        self._next = first + count
+        return Block(first, version, *signals)
+
+    def write(self, parameters: Parameters) -> None:
+        """Run on these from the next sample on."""
+        gains = _NO_GAINS if parameters.gains is None else msgspec.structs.astuple(parameters.gains)
+        numbers = parameters.tolerance, *gains
+        status, count, _, _ = self._ask(wire.WRITE, parameters.version, numbers, parameters.gains is not None)
+        if status == wire.REFUSED:
+            raise DriveRefused(self._line.receive(count).decode("utf-8", "replace"))
+
+    def move(self, offset: float) -> None:
+        """Add this (m) to the reference from the next sample on."""
+        self._ask(wire.MOVE, 0, (offset, *_NO_GAINS))
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._line.close()
+
+    def _ask(
+        self, kind: int, number: int, numbers: tuple[float, ...] = (0.0, *_NO_GAINS), gains: bool = False, most: int = 0
+    ) -> tuple[int, int, int, int]:
+        """Send one request; returns the head of its reply."""
+        self._line.send(wire.REQUEST.pack(kind, gains, most, number, *numbers))
+        status, count, first, version, self._lag = wire.REPLY.unpack(self._line.receive(wire.REPLY.size))
+        return status, count, first, version

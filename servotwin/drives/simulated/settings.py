@@ -1,0 +1,120 @@
+"""A simulated machine's TOML: a scenario, and how its drive behaves."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from servotwin.drives.simulated import wire
+from servotwin.errors import InvalidInput
+from servotwin.scenario import PRESETS, Scenario
+from servotwin.tomltable import Table, named, read_toml
+
+
+@dataclass(frozen=True)
+class MachineSettings:
+    """A machine and its drive.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its servo, reference, gap, disturbances and noise; in the role supervise also its controller and dead zone at
+        the start.
+    role : str
+        "control": the voltage comes from the edge. "supervise": the machine's own controller runs.
+    address : wire.Address
+    speed : float
+        Seconds of machine time per second; 0: in lock-step, no further than the edge asks for.
+    endless : bool
+        Whether it runs on after the scenario's `duration_s`, its gap as it then is.
+    watchdog : float
+        s of machine time without a voltage after which it is 0 V; control only.
+    slack : float
+        s by the clock by which the machine may be late, or wait for the edge, and catch up; what is beyond is given up:
+        the edge's tick counts as missed, the machine's time as lost.
+    block : float
+        s of machine time in one block; supervise only.
+    kept : float
+        s of machine time for which samples wait to be read; supervise only.
+    """
+
+    scenario: Scenario
+    role: str
+    address: wire.Address
+    speed: float = 1.0
+    endless: bool = True
+    watchdog: float = 0.1
+    slack: float = 0.25
+    block: float = 0.02
+    kept: float = 10.0
+
+    def __post_init__(self) -> None:
+        rate, law = self.rate, self.scenario.law.sample_rate
+        if law is None:
+            raise InvalidInput("scenario controller sample rate: a machine needs one, in Hz; it has none")
+        if self.role == "control" and law != rate:
+            raise InvalidInput(f"scenario controller sample rate = {law!r} Hz: must be the recording's, {rate!r} Hz")
+        if not 1 <= self.block_samples <= wire.MOST:
+            raise InvalidInput(f"block_s = {self.block!r} s: must hold 1 to {wire.MOST} samples at {rate!r} Hz")
+        if self.kept < self.block:
+            raise InvalidInput(f"keep_s = {self.kept!r} s: must be at least block_s = {self.block!r} s")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> MachineSettings:
+        """From a TOML file; paths in it are relative to it.
+
+        Raises
+        ------
+        InvalidInput
+            The file or its scenario is missing or not allowed.
+        """
+        table, folder = read_toml(path), Path(path).parent
+        settings = {
+            "scenario": _scenario(table, folder),
+            "role": table.text("role", choices=tuple(wire.ROLES)),
+            "address": _address(table, folder),
+            "speed": table.number("speed", cls.speed, minimum=0.0),
+            "endless": table.boolean("endless", cls.endless),
+            "watchdog": table.number("watchdog_s", cls.watchdog, minimum=0.0),
+            "slack": table.number("slack_s", cls.slack, positive=True),
+            "block": table.number("block_s", cls.block, positive=True),
+            "kept": table.number("keep_s", cls.kept, positive=True),
+        }
+        table.done()
+        with named(table):
+            return cls(**settings)
+
+    @property
+    def rate(self) -> float:
+        """Samples per second of machine time, Hz."""
+        return self.scenario.recording.sample_rate
+
+    @property
+    def block_samples(self) -> int:
+        """Samples in one block."""
+        return round(self.block * self.rate)
+
+    @property
+    def end(self) -> int | None:
+        """Samples in all, the scenario's last instant not included; None: no end."""
+        return None if self.endless else self.scenario.samples - 1
+
+
+def _scenario(table: Table, folder: Path) -> Scenario:
+    """A preset's name, a file, or a table."""
+    if isinstance(table.values.get("scenario"), dict):
+        return Scenario.from_table(table.table("scenario"), folder)
+    name = table.text("scenario")
+    if name in PRESETS:
+        return Scenario.preset(name)
+    if not (folder / name).is_file():
+        allowed = f"one of {', '.join(PRESETS)}, the path of a scenario's TOML, relative to this file, or a table"
+        raise table.invalid("scenario", allowed)
+    return Scenario.load(folder / name)
+
+
+def _address(table: Table, folder: Path) -> wire.Address:
+    with named(table):
+        address = wire.address_of(table.text("listen"))
+    return address if address.path is None else address._replace(path=str(folder / address.path))
