@@ -1,0 +1,230 @@
+"""Which model and which settings the twin of each servo has; many servos share one model.
+
+In a file::
+
+    [models.axis]
+    servo = "paper"                 # a preset, or a servo's TOML relative to this file
+    [models.axis.controller]        # what runs there instead of the servo's own controller
+    ki_v_per_m_s = 0.0
+    [models.axis.twin]              # keys as in a scenario's [twin]
+    policy = "certified"
+
+    [servos]
+    "ax-1" = "axis"                 # one servo
+    "line-*" = "axis"               # all whose names begin so; the first pattern that fits counts
+
+A `Fleet` is a value: frozen, quickly made and small. It can be pickled to a pool's workers when these start (it is the
+service's own and never crossed a link), or read anew there from the same text. What takes long to make of a model, a
+proved fallback set above all, each process makes when it is first needed, and keeps.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of, with_gains
+from servotwin.errors import InvalidInput
+from servotwin.identify.disturbance import disturbance
+from servotwin.messages import NAME_PATTERN
+from servotwin.plant import servofile
+from servotwin.plant.servo import PRESETS, Servo
+from servotwin.redesign.policy import Policy
+from servotwin.tomltable import Reader, Table, did_you_mean, given, named, parse_toml, part
+from servotwin.twin import settingsfile
+from servotwin.twin.estimating import Estimator, estimator_of
+from servotwin.twin.inforce import InForce
+from servotwin.twin.policies import certified, policy_of
+from servotwin.twin.requests import requests_of
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import Store
+from servotwin.twin.twin import Twin
+
+MOST_MODELS = 256
+_CONTROLLER: dict[str, Reader] = {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER}
+
+
+@dataclass(frozen=True)
+class Model:
+    """What the twins of equal servos have in common.
+
+    Attributes
+    ----------
+    name : str
+    servo : Servo
+        The model, with the controller that runs.
+    settings : TwinSettings
+    start : InForce or None
+        What the edge runs before the first update, as far as it does not say so itself (`messages.Hello`). None: the
+        fallback set that is proved for the whole stated range, as the edge of a policy "certified" begins with; it is
+        made when a twin first needs it, which takes seconds.
+    """
+
+    name: str
+    servo: Servo
+    settings: TwinSettings
+    start: InForce | None = None
+
+    @property
+    def begins(self) -> InForce:
+        """`start`, made where it has to be; nothing is known of it where no fallback set can be proved."""
+        return _proved_start(self) if self.start is None else self.start
+
+    def twin(self, servo: str, store: Store, state: bytes | None = None) -> Twin:
+        """The twin of one servo of this model; estimator and policy are made once per process.
+
+        Raises
+        ------
+        InvalidInput
+            The state is not understood or another servo's, or the policy cannot design for the controller.
+        """
+        twin = Twin(
+            servo,
+            _estimator(self),
+            _policy(self),
+            store,
+            self.settings,
+            partial(disturbance, servo=self.servo),
+            None if state else self.begins,
+            requests_of(servo, self.servo, self.settings),
+        )
+        if state:
+            twin.restore(state)
+        return twin
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """The models, and which of them each servo has.
+
+    Parameters
+    ----------
+    models : tuple of Model
+        With names of their own.
+    servos : tuple of (str, str)
+        (name of a servo, or a pattern with *, name of its model).
+
+    Raises
+    ------
+    InvalidInput
+        A name is none, comes twice, or a model does not exist.
+    """
+
+    models: tuple[Model, ...]
+    servos: tuple[tuple[str, str], ...]
+
+    def __post_init__(self) -> None:
+        if len(self._by_name) < len(self.models) or not 1 <= len(self.models) <= MOST_MODELS:
+            raise InvalidInput(f"fleet: has {len(self.models)} models: 1 to {MOST_MODELS} with names of their own")
+        if not self.servos:
+            raise InvalidInput('servos: is empty; give at least one, such as "ax-1" = "NAME OF A MODEL"')
+        for servo, model in self.servos:
+            _check_pattern(servo)
+            if model not in self._by_name:
+                hint = did_you_mean(model, self._by_name)
+                raise InvalidInput(f"servos.{servo} = {model!r}: there is no such model{hint}")
+
+    @classmethod
+    def read(cls, table: Table, folder: Path) -> Fleet:
+        """What [models] and [servos] of a twin's file say; paths are relative to `folder`.
+
+        Other keys of the table are left to others, who have to ask for them before `table.done()`.
+
+        Raises
+        ------
+        InvalidInput
+            A key is unknown or missing, a value is not allowed, a file that it names cannot be read, a controller is
+            unstable on its servo even without a gap.
+        """
+        inner = table.table("models", required=True)
+        models = tuple(part(inner, name, partial(_model, name=name, folder=folder)) for name in inner.values)
+        servos = table.table("servos", required=True)
+        with named(table):
+            return cls(models, tuple((servo, servos.text(servo)) for servo in servos.values))
+
+    @classmethod
+    def loads(cls, text: str, source: str, folder: Path) -> Fleet:
+        """From a file's text; `source` is its name in messages. What else the file holds is not looked at."""
+        return cls.read(parse_toml(text, source), folder)
+
+    def model_of(self, servo: str) -> Model:
+        """The model of a servo.
+
+        Raises
+        ------
+        InvalidInput
+            There is none.
+        """
+        exact = self._exact.get(servo)
+        model = exact or next((model for pattern, model in self._patterns if fnmatchcase(servo, pattern)), None)
+        if model is None or not re.match(NAME_PATTERN, servo):
+            raise InvalidInput(f"servo {servo!r} has no model: [servos] names it neither by itself nor by a pattern")
+        return self._by_name[model]
+
+    @cached_property
+    def _by_name(self) -> dict[str, Model]:
+        return {model.name: model for model in self.models}
+
+    @cached_property
+    def _exact(self) -> dict[str, str]:
+        return {servo: model for servo, model in self.servos if "*" not in servo}
+
+    @cached_property
+    def _patterns(self) -> tuple[tuple[str, str], ...]:
+        return tuple((servo, model) for servo, model in self.servos if "*" in servo)
+
+
+def _check_pattern(servo: str) -> None:
+    if not re.match(NAME_PATTERN, servo.replace("*", "a")):
+        raise InvalidInput(f"servos: {servo!r} names no servo: 1 to 64 of A-Z a-z 0-9 . _ - are allowed, and * for any")
+
+
+def _model(table: Table, name: str, folder: Path) -> Model:
+    """One table of [models]."""
+    if not re.match(NAME_PATTERN, name):
+        raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+    servo = _servo(table, folder)
+    law = part(table, "controller", lambda inner: servo.controller.replace(**given(inner, _CONTROLLER)))
+    settings = part(table, "twin", settingsfile.twin)
+    servo.check_loop(law)
+    own = gains_of(law) == gains_of(servo.controller)
+    return Model(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
+
+
+def _servo(table: Table, folder: Path) -> Servo:
+    name = table.text("servo")
+    if name not in PRESETS and not (folder / name).is_file():
+        presets = ", ".join(PRESETS)
+        raise table.invalid("servo", f"one of {presets}, or the path of a servo's TOML, relative to this file")
+    return Servo.resolve(name, folder)
+
+
+def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> InForce | None:
+    """What an edge begins with, as `Scenario.start` has it; `own`: the gains are the servo's own."""
+    if settings.policy == "certified":
+        return None if own else InForce(law, 0.0)
+    k_dz = 1.0 if settings.k_dz is None else settings.k_dz
+    return InForce(law, servo.tolerance_for(settings.initial_gap, k_dz))
+
+
+@lru_cache(maxsize=MOST_MODELS)
+def _estimator(model: Model) -> Estimator:
+    return estimator_of(model.servo, model.settings)
+
+
+@lru_cache(maxsize=MOST_MODELS)
+def _policy(model: Model) -> Policy:
+    return policy_of(model.servo, model.settings)
+
+
+@lru_cache(maxsize=MOST_MODELS)
+def _proved_start(model: Model) -> InForce:
+    try:
+        proved = certified(model.servo, model.settings).fallback().setting
+    except InvalidInput:
+        return InForce()
+    return InForce(with_gains(model.servo.controller, gains_of(proved.controller)), proved.tolerance)
