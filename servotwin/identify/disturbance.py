@@ -91,6 +91,20 @@ def disturbance(window: Window, servo: Servo) -> Disturbance:
     return Disturbance(bias, std, noise, (last - first) / window.sample_rate, effort)
 
 
+def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
+    """Input bias and its spread (V) from the last `SHORTEST` s before the reference changes, or the window ends.
+
+    The first of these moments that is one of rest counts; without one, or without the channels, (NaN, inf).
+    """
+    if any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
+        return math.nan, math.inf
+    size = max(1, round(_BATCH_S * window.sample_rate))
+    ends = {last: first for first, last in reversed(_constant(window, size))}
+    rests = (_rest(window, servo, size, first, last) for last, first in reversed(ends.items()))
+    bias, std, _, _ = next((rest for rest in rests if rest is not None), (math.nan, math.inf, 0, 0))
+    return bias, std
+
+
 def _longest_good(rests: list[tuple[float, float, int, int]]) -> tuple[float, float, int, int]:
     """The longest of (bias, std, first, last) with little more than the least spread, which is partly luck."""
     allowed = max(_NEAR * min(rest[1] for rest in rests), _FINE)

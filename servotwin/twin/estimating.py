@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.identify import whitened
+from servotwin.identify.disturbance import Disturbance, nothing_known
 from servotwin.identify.estimate import GapEstimate, no_estimate
 from servotwin.identify.gap import estimate_gap, settings_of
 from servotwin.identify.offset import estimate_carrying
 from servotwin.identify.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
+from servotwin.redesign.evidence import UNASKED
 from servotwin.twin.decode import decode_window
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.wear import Expectation
 
 Estimator = Callable[[Window, Expectation], GapEstimate]
 """(window, what is known before it) -> estimate."""
+
+Observer = Callable[[Window], Disturbance]
+"""window -> input bias and noise."""
 
 UNUSABLE = "none"
 """Method of what is stated where no estimator took the window: no motion would make it better."""
@@ -47,3 +53,13 @@ def estimate_from(message: WindowMessage, estimator: Estimator, expected: Expect
         return estimator(decode_window(message), expected)
     except InvalidInput as error:
         return no_estimate(message.middle, (str(error),), method=UNUSABLE)
+
+
+def observed(message: WindowMessage, observer: Observer | None) -> Disturbance:
+    """What a window says about input bias and noise; where it cannot be used at all, nothing and why."""
+    if observer is None:
+        return UNASKED
+    try:
+        return observer(decode_window(message))
+    except InvalidInput as error:
+        return nothing_known(math.nan, str(error))

@@ -14,6 +14,7 @@ from servotwin.redesign.certificate import Demands
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.uncertainty import Uncertainty
 from servotwin.tomltable import did_you_mean
+from servotwin.twin.triagesettings import TriageSettings
 
 POLICIES = ("certified", "margin", "hysteresis", "paper")
 _OWNERS = {"k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
@@ -47,6 +48,8 @@ class TwinSettings:
         Of "margin": tolerances per standard deviation of the measurement's noise.
     excitation : ExcitationSettings, optional
         What is asked of the edge when windows tell too little of the gap; None: nothing.
+    triage : TriageSettings, optional
+        When a glance at a window is enough; None: every window is estimated.
     initial_gap : float
         rad; what is believed before the first estimate (section 4.2: zero).
     trend : TrendSettings
@@ -79,6 +82,7 @@ class TwinSettings:
     smoothing: float | None = None
     k_noise: float | None = None
     excitation: ExcitationSettings | None = None
+    triage: TriageSettings | None = None
     initial_gap: float = 0.0
     trend: TrendSettings = field(default_factory=TrendSettings)
     gap_limit: float | None = None

@@ -13,6 +13,7 @@ from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.uncertainty import Range
 from servotwin.tomltable import Reader, Table, given, part
 from servotwin.twin.settings import POLICIES, TwinSettings
+from servotwin.twin.triagesettings import TriageSettings
 
 DEG, MM = math.pi / 180.0, 1e-3
 
@@ -58,12 +59,28 @@ EXCITATION: Mapping[str, Reader] = {
 }
 
 
+TRIAGE: Mapping[str, Reader] = {
+    "gap_deg": ("gap", lambda table, key: table.number(key) * DEG),
+    "deviations": ("deviations", Table.number),
+    "widest_deg": ("widest", lambda table, key: table.number(key) * DEG),
+    "misfit": ("misfit", Table.number),
+    "least_misfit_um": ("least_misfit", lambda table, key: table.number(key) * 1e-6),
+    "bias_mv": ("bias", lambda table, key: table.number(key) * 1e-3),
+    "every": ("every", Table.integer),
+    "longest_s": ("longest", Table.number),
+}
+
+
+def _triage(table: Table) -> TriageSettings:
+    return TriageSettings(**given(table, TRIAGE))
+
+
 def _excitation(table: Table) -> ExcitationSettings:
     return ExcitationSettings(**given(table, EXCITATION))
 
 
 def twin(table: Table) -> TwinSettings:
-    """[twin] with its tables `estimator`, `trend`, `excitation`, `uncertainty` and `demands`."""
+    """[twin] with its tables `estimator`, `trend`, `excitation`, `triage`, `uncertainty` and `demands`."""
     default = TwinSettings()
     method = table.text("method", default.method, choices=tuple(METHODS))
     limit = table.number("gap_limit_deg", None, minimum=0.0)
@@ -78,6 +95,7 @@ def twin(table: Table) -> TwinSettings:
         smoothing=table.number("smoothing", None, minimum=0.0, maximum=1.0),
         k_noise=table.number("k_noise", None, minimum=0.0),
         excitation=part(table, "excitation", _excitation) if "excitation" in table.values else None,
+        triage=part(table, "triage", _triage) if "triage" in table.values else None,
         initial_gap=table.number("initial_gap_deg", 0.0, minimum=0.0) * DEG,
         trend=part(table, "trend", _trend),
         gap_limit=None if limit is None else limit * DEG,

@@ -18,8 +18,10 @@ from servotwin.identify.trend import Trend, TrendSettings
 from servotwin.messages import Request, Update
 from servotwin.redesign.excitation import Memory
 from servotwin.twin.delivery import Delivery
+from servotwin.twin.glance import Watch
 from servotwin.twin.inforce import InForce, Settings
 from servotwin.twin.requests import Requests
+from servotwin.twin.triage import Triage
 from servotwin.twin.versions import Versions
 from servotwin.twin.wear import Wear
 
@@ -81,6 +83,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/1"):
     tuned_for: float | None
     sent_at: float
     attempts: int
+    watch: Watch | None = None
 
 
 class Knowledge(NamedTuple):
@@ -92,6 +95,7 @@ class Knowledge(NamedTuple):
     requests: Requests | None
     delivery: Delivery
     tuned_for: float | None
+    triage: Triage | None = None
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -109,6 +113,7 @@ def pack(servo: str, knows: Knowledge) -> bytes:
         None if knows.tuned_for is None else float(knows.tuned_for),
         knows.delivery.sent_at,
         knows.delivery.attempts,
+        None if knows.triage is None else knows.triage.watch,
     )
     return _encoder.encode(state)
 
@@ -134,6 +139,7 @@ def unpack(servo: str, data: bytes, fresh: Knowledge) -> Knowledge:
         _restored_requests(fresh.requests, state.requests),
         replace(fresh.delivery, sent_at=state.sent_at, attempts=state.attempts),
         state.tuned_for,
+        _restored_triage(fresh.triage, state.watch),
     )
 
 
@@ -196,4 +202,11 @@ def _restored_requests(fresh: Requests | None, state: RequestsState | None) -> R
     if fresh is not None and state is not None:
         for name in RequestsState.__struct_fields__:
             setattr(fresh, name, getattr(state, name))
+    return fresh
+
+
+def _restored_triage(fresh: Triage | None, watch: Watch | None) -> Triage | None:
+    """As the settings want it: without what it remembers, it begins anew."""
+    if fresh is not None and watch is not None:
+        fresh.watch = watch
     return fresh

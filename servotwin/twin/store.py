@@ -11,6 +11,7 @@ from servotwin.identify.trend import Trend
 from servotwin.messages import Answer, Fallback, Hello, Receipt, Request, Update, Window
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
+from servotwin.twin.glance import Glance
 from servotwin.twin.wear import Expectation
 
 Identity = tuple[str, str, int]
@@ -22,6 +23,10 @@ class Store(Protocol):
 
     def add_window(self, window: Window) -> bool:
         """Keep a window under its identity; False when it was there already."""
+        ...
+
+    def add_glance(self, window: Window, glance: Glance) -> None:
+        """Keep what a glance at a window saw, and whether it was enough."""
         ...
 
     def add_estimate(self, window: Window, estimate: GapEstimate, expected: Expectation) -> None:
@@ -74,6 +79,7 @@ class MemoryStore:
     """A store that forgets with its process; for simulation and tests."""
 
     windows: dict[Identity, Window] = field(default_factory=dict)
+    glances: dict[Identity, Glance] = field(default_factory=dict)
     estimates: dict[Identity, GapEstimate] = field(default_factory=dict)
     disturbances: dict[Identity, Disturbance] = field(default_factory=dict)
     trends: dict[Identity, Trend | None] = field(default_factory=dict)
@@ -91,6 +97,10 @@ class MemoryStore:
         new = window.identity not in self.windows
         self.windows.setdefault(window.identity, window)
         return new
+
+    def add_glance(self, window: Window, glance: Glance) -> None:
+        """Keep a glance."""
+        self.glances[window.identity] = glance
 
     def add_estimate(self, window: Window, estimate: GapEstimate, _expected: Expectation) -> None:
         """Keep what was estimated from a window."""

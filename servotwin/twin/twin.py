@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.disturbance import Disturbance, disturbance, nothing_known
+from servotwin.identify.disturbance import Disturbance, disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
-from servotwin.identify.window import Window
 from servotwin.messages import (
     Acknowledge,
     Answer,
@@ -24,23 +22,20 @@ from servotwin.messages import (
 )
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.redesign.evidence import UNASKED, Evidence
+from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Policy, Redesign
-from servotwin.twin.decode import decode_window
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.drafting import draft
-from servotwin.twin.estimating import UNUSABLE, Estimator, estimate_from, estimator_of
+from servotwin.twin.estimating import UNUSABLE, Estimator, Observer, estimate_from, estimator_of, observed
 from servotwin.twin.inforce import InForce, Settings
 from servotwin.twin.policies import policy_of
 from servotwin.twin.requests import Requests, requests_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import Knowledge, pack, unpack
 from servotwin.twin.store import Store
+from servotwin.twin.triage import Triage
 from servotwin.twin.versions import Versions
 from servotwin.twin.wear import Wear
-
-Observer = Callable[[Window], Disturbance]
-"""window -> input bias and noise."""
 
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
@@ -71,6 +66,8 @@ class Twin:
         What the edge runs before the first update.
     requests : Requests, optional
         Asks for windows that tell more; None: takes them as they come.
+    triage : Triage, optional
+        Says of which windows a glance is enough; None: every one is estimated.
     """
 
     def __init__(
@@ -83,6 +80,7 @@ class Twin:
         observer: Observer | None = None,
         start: InForce | None = None,
         requests: Requests | None = None,
+        triage: Triage | None = None,
     ) -> None:
         self.servo, self._requests = servo, requests
         self.settings = settings or TwinSettings()
@@ -91,6 +89,7 @@ class Twin:
         self._wear = Wear(self.settings.initial_gap, self.settings.trend)
         self._delivery = Delivery(self.settings.retry, self.settings.attempts)
         self._tuned_for: float | None = None
+        self._triage = triage
 
     @classmethod
     def of(
@@ -118,7 +117,8 @@ class Twin:
         begins = start or InForce(servo.controller)
         chosen = estimator or estimator_of(servo, settings)
         asks = requests_of(name, servo, settings)
-        twin = cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks)
+        triage = None if settings.triage is None else Triage(servo, settings.triage)
+        twin = cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks, triage)
         if state:
             twin.restore(state)
         return twin
@@ -141,7 +141,7 @@ class Twin:
             The state is not understood, or another servo's.
         """
         knows = unpack(self.servo, state, self._knowledge())
-        self._versions, self._known, self._wear, self._requests, self._delivery, self._tuned_for = knows
+        self._versions, self._known, self._wear, self._requests, self._delivery, self._tuned_for, self._triage = knows
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """What to send after a message that arrived at `now` (s, a clock of the twin's own).
@@ -180,15 +180,6 @@ class Twin:
         asked = [] if self._requests is None else self._requests.wake(now)
         return [*self._delivery.wake(self._versions, now), *asked]
 
-    def observe(self, message: WindowMessage) -> Disturbance:
-        """What a window says about input bias and noise; where it cannot be used at all, nothing and why."""
-        if self._observer is None:
-            return UNASKED
-        try:
-            return self._observer(decode_window(message))
-        except InvalidInput as error:
-            return nothing_known(math.nan, str(error))
-
     def _window(self, message: WindowMessage, now: float) -> list[Message]:
         new = self._store.add_window(message)
         acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
@@ -197,8 +188,7 @@ class Twin:
     def learn(self, message: WindowMessage, now: float, arrived: float | None = None) -> list[Message]:
         """What to send after a window that is safe already, and new.
 
-        Everything that a window leads to begins here, so a quicker look that spares most of them the rest of it
-        belongs here too: after `hear`, before `estimate_from`.
+        Of a window that says nothing new at a glance, that is all that is made: it moves nothing.
 
         Parameters
         ----------
@@ -218,13 +208,17 @@ class Twin:
         self._steady(now)
         self._versions.hear(message.boot, message.parameter_version)
         heard = now if arrived is None else arrived
+        if self._nothing_new(message):
+            return []
         expected = self._wear.expect(message.boot, message.middle, heard)
-        estimate, disturbed = estimate_from(message, self._estimator, expected), self.observe(message)
+        estimate, disturbed = estimate_from(message, self._estimator, expected), observed(message, self._observer)
         self._store.add_estimate(message, estimate, expected)
         self._store.add_disturbance(message, disturbed)
         stale = not self._versions.admits(message)
-        why_not = _STALE if stale else self._refusal(message, estimate, heard)
+        why_not = _STALE if stale else self._wear.refusal(message.boot, estimate, heard)
         self._store.add_trend(message, self.trend)
+        if self._triage is not None and not stale:
+            self._triage.learn(message, estimate, self.trend, why_not)
         unasked = stale or (why_not and self._policy.needs_estimate)
         redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
@@ -234,6 +228,14 @@ class Twin:
         self._tuned_for = redesign.gap
         drafted = draft(message, estimate, redesign, self.settings.validity)
         return self._send(self._versions.issue(drafted), now) + asked
+
+    def _nothing_new(self, message: WindowMessage) -> bool:
+        """Whether a glance at the window is enough."""
+        asked = self._requests is not None and self._requests.pending is not None
+        seen = None if self._triage is None else self._triage.look(message, self.trend, asked)
+        if seen is not None:
+            self._store.add_glance(message, seen)
+        return seen is not None and not seen.moved
 
     def _ask(self, message: WindowMessage, estimate: GapEstimate, now: float, heard: float) -> list[Message]:
         """A request, where windows tell too little."""
@@ -256,14 +258,6 @@ class Twin:
             return []
         self._store.add_request(request)
         return [*self._requests.send(now)]
-
-    def _refusal(self, message: WindowMessage, estimate: GapEstimate, heard: float) -> str:
-        """Why no parameters may stand on an estimate; empty where they may, and the trend has learnt from it."""
-        if not estimate.ok:
-            return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
-        if self._wear.learn(message.boot, estimate, heard):
-            return ""
-        return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
 
     def _redesign(self, estimate: GapEstimate, disturbed: Disturbance, why_not: str) -> Redesign:
         now = self._known.of(self._versions.in_force)
@@ -308,4 +302,4 @@ class Twin:
 
     def _knowledge(self) -> Knowledge:
         parts = self._versions, self._known, self._wear, self._requests, self._delivery
-        return Knowledge(*parts, self._tuned_for)
+        return Knowledge(*parts, self._tuned_for, self._triage)

@@ -94,6 +94,14 @@ class Wear:
             self.previous = estimate.gap
         return counts
 
+    def refusal(self, boot: str, estimate: GapEstimate, now: float) -> str:
+        """Why no parameters may stand on an estimate; empty where they may, and this has learnt from it."""
+        if not estimate.ok:
+            return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
+        if self.learn(boot, estimate, now):
+            return ""
+        return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
+
     def _on_clock(self, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
         if self.trend is None or boot == self.boot:

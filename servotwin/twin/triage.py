@@ -1,0 +1,96 @@
+"""The triage of one servo's windows: a glance at each, and what it is compared with.
+
+After every estimate the glance at the same window is compared with it: where glances mislead, all are estimated.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from servotwin.errors import InvalidInput
+from servotwin.identify.disturbance import quick_bias
+from servotwin.identify.estimate import GapEstimate
+from servotwin.identify.trend import Trend
+from servotwin.identify.whitened.quick import Quick, quick_fit
+from servotwin.messages import Window as WindowMessage
+from servotwin.plant.servo import Servo
+from servotwin.twin.decode import decode_window
+from servotwin.twin.glance import Glance, Watch, allowed, glance
+from servotwin.twin.triagesettings import TriageSettings
+from servotwin.twin.wear import Expectation
+
+_FADES = 0.95  # of the usual misfit, per window: steps to one side may leave more than those to the other
+
+
+class Triage:
+    """The triage of one servo: it remembers what it compares with.
+
+    Parameters
+    ----------
+    servo : Servo
+    settings : TriageSettings
+
+    Attributes
+    ----------
+    watch : Watch
+    """
+
+    def __init__(self, servo: Servo, settings: TriageSettings) -> None:
+        self.servo, self.settings, self.watch = servo, settings, Watch()
+
+    def look(self, message: WindowMessage, trend: Trend | None, asked: bool) -> Glance | None:
+        """A glance at a window; None where it is no window, which the estimator says better.
+
+        Parameters
+        ----------
+        message : messages.Window
+        trend : Trend or None
+            As it was left by the windows that counted.
+        asked : bool
+            Whether the edge was asked for a window that tells more, and none has come.
+        """
+        watch = msgspec.structs.replace(self.watch, doubt="a request is open") if asked else self.watch
+        try:
+            seen = glance(message, decode_window(message), self.servo, watch, _offset(trend), self.settings)
+        except InvalidInput:
+            return None
+        if not seen.moved:
+            usual = max(_FADES * watch.misfit, seen.misfit)
+            self.watch = msgspec.structs.replace(watch, misfit=usual, glances=watch.glances + 1)
+        return seen
+
+    def learn(self, message: WindowMessage, estimate: GapEstimate, trend: Trend | None, why_not: str) -> None:
+        """Note an estimate, and why it does not count, where it does not: then the next window is estimated too.
+
+        What a glance at its own window says is what later ones are compared with.
+        """
+        if why_not:
+            self.watch = msgspec.structs.replace(self.watch, doubt=why_not, glances=0)
+            return
+        window, before = decode_window(message), self.watch.misfit
+        seen = quick_fit(window, self.servo, estimate.gap, _offset(trend))
+        bias, bias_std = quick_bias(window, self.servo)
+        self.watch = Watch(
+            self._misled(seen, estimate),
+            message.boot,
+            message.parameter_version,
+            estimate.time,
+            estimate.gap,
+            estimate.std,
+            bias,
+            bias_std,
+            seen.misfit if math.isnan(before) else max(_FADES * before, seen.misfit),
+        )
+
+    def _misled(self, seen: Quick, estimate: GapEstimate) -> str:
+        """By how much a glance was wrong, in words; empty where it was not."""
+        off = abs(seen.gap - estimate.gap)
+        if off <= allowed(math.hypot(seen.std, estimate.std), self.settings):
+            return ""
+        return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
+
+
+def _offset(trend: Trend | None) -> tuple[float, float] | None:
+    return Expectation(0.0, trend).offset
