@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
 from servotwin.scenario import Scenario
-from servotwin.simulation import Simulation
+from servotwin.simulation import Simulation, simulate
 from servotwin.simulation.endless import FOREVER, Endless, first_stretch
 
 
@@ -26,6 +27,13 @@ def endless(scenario: Scenario, keep: int) -> Endless:
     if scenario.law.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a machine that runs on needs a rate in Hz")
     return Endless(_simulation(scenario, scenario.servo, keep), scenario.reference)
+
+
+def compile_ahead(scenario: Scenario) -> None:
+    """Have everything compiled that a machine of this kind runs: no sample waits for it then."""
+    rate = scenario.law.sample_rate or scenario.recording.sample_rate
+    gap = PiecewiseCubic.held([0.0, 1.5 / rate], [0.01, 0.02])
+    simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
 
 
 def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None) -> Simulation:

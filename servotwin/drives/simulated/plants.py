@@ -118,10 +118,12 @@ class SupervisedPlant:
 
     def read(self, first: int, most: int) -> Stretch | None:
         """Samples from one on, or from the oldest kept; None: there are none yet."""
-        for stretch in self._stretches:
-            if stretch.last > first:
-                return stretch.part(max(first, stretch.first), most)
-        return None
+        found = None
+        for stretch in reversed(self._stretches):
+            if stretch.last <= first:
+                break
+            found = stretch
+        return None if found is None else found.part(max(first, found.first), most)
 
     def write(self, version: int, tolerance: float, gains: Gains | None) -> None:
         """Run on these from the present sample on.

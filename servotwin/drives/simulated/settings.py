@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from servotwin.drives.simulated import wire
 from servotwin.errors import InvalidInput
@@ -70,7 +71,7 @@ class MachineSettings:
             The file or its scenario is missing or not allowed.
         """
         table, folder = read_toml(path), Path(path).parent
-        settings = {
+        settings: dict[str, Any] = {
             "scenario": _scenario(table, folder),
             "role": table.text("role", choices=tuple(wire.ROLES)),
             "address": _address(table, folder),

@@ -1,0 +1,56 @@
+"""Run a simulated machine: `python -m servotwin.drives.simulated PLANT.toml`.
+
+When it listens it says so in one line, "ready ADDRESS"; an interrupt or SIGTERM ends it.
+"""
+
+import os
+import signal
+import sys
+
+from servotwin.drives.simulated.control import ControlServer
+from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
+from servotwin.drives.simulated.server import Server, address_in_use, listening, run, start_pace
+from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.drives.simulated.supervise import SuperviseServer
+from servotwin.errors import InvalidInput
+from servotwin.machine import compile_ahead
+
+
+def main(path: str) -> None:
+    """Simulate the machine of a TOML file until its run is over.
+
+    Raises
+    ------
+    InvalidInput
+        The file is not one.
+    """
+    settings = MachineSettings.load(path)
+    compile_ahead(settings.scenario)
+    plant = ControlledPlant(settings) if settings.role == "control" else SupervisedPlant(settings)
+    with listening(settings.address) as listener:
+        server = _server(plant, settings)
+        print("ready", address_in_use(listener, settings.address), flush=True)
+        run(server, listener, settings, os.urandom(8))
+
+
+def _server(plant: ControlledPlant | SupervisedPlant, settings: MachineSettings) -> Server:
+    pace = start_pace(settings)
+    if isinstance(plant, ControlledPlant):
+        return ControlServer(plant, pace, settings.slack)
+    return SuperviseServer(plant, pace)
+
+
+def _ended(*_: object) -> None:
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _ended)
+    try:
+        if len(sys.argv) != 2:
+            raise InvalidInput("give one file: python -m servotwin.drives.simulated PLANT.toml")
+        main(sys.argv[1])
+    except InvalidInput as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
