@@ -1,0 +1,130 @@
+"""What an estimate was computed under: versions, model and settings, as text under its digest.
+
+Under an equal context an equal window with an equal prior gives an equal estimate, bit for bit. Under another one it
+need not: then the parts that differ are named. Model and settings can be made again from the text.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import os
+import platform
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import servotwin
+from servotwin.errors import InvalidInput
+from servotwin.identify.gap import METHODS
+from servotwin.plant.servo import Servo
+from servotwin.twin.settings import TwinSettings
+
+SOURCES = ("control", "hybrid", "identify", "messages", "plant", "redesign", "simulation", "twin")
+"""Packages that an estimate, or what is made of it, may depend on; each has a digest of its own."""
+LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_MODEL, _SETTINGS = "model", "settings"
+_INFINITE = re.compile(r"\binf\b(?!')")
+
+
+@lru_cache(maxsize=256)
+def context_of(servo: Servo, settings: TwinSettings) -> tuple[str, str]:
+    """(digest, JSON) of the context of a model and its settings in this process.
+
+    The JSON is one object of texts: what each thing is called, and the value in full.
+    """
+    parts = {**surroundings(), **dict(_lines(_MODEL, servo)), **dict(_lines(_SETTINGS, settings))}
+    text = json.dumps(parts, sort_keys=True, indent=0)
+    return hashlib.sha256(text.encode()).hexdigest()[:32], text
+
+
+def parts_of(context: str) -> dict[str, str]:
+    """The parts of a context's JSON.
+
+    Raises
+    ------
+    InvalidInput
+        It is none.
+    """
+    try:
+        return msgspec.json.decode(context, type=dict[str, str])
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise InvalidInput(f"the context is not understood: {error}") from None
+
+
+def differing(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...]:
+    """What two contexts do not agree on, each part with both values."""
+    keys = (key for key in sorted({*then, *now}) if then.get(key) != now.get(key))
+    return tuple(f"{key} {then.get(key, 'unknown')} then, {now.get(key, 'unknown')} now" for key in keys)
+
+
+def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
+    """Model and settings that a context's parts describe.
+
+    Raises
+    ------
+    InvalidInput
+        They describe none that this version knows.
+    """
+    try:
+        servo = msgspec.convert(_nested(parts, _MODEL), Servo)
+        values = _nested(parts, _SETTINGS)
+        estimator = values.pop("estimator", None)
+        if estimator is not None:
+            estimator = msgspec.convert(estimator, METHODS[values["method"]].settings)
+        return servo, msgspec.convert(values, TwinSettings).replace(estimator=estimator)
+    except (msgspec.MsgspecError, ValueError, SyntaxError, KeyError, TypeError, RecursionError) as error:
+        raise InvalidInput(f"the context's model or settings are not understood: {error}") from None
+
+
+@lru_cache(maxsize=1)
+def surroundings() -> Mapping[str, str]:
+    """Versions, sources and machine of this process; the last decides in which order sums of floats are taken."""
+    processor = import_module("llvmlite.binding").get_host_cpu_name()
+    return {
+        "servotwin": servotwin.__version__,
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in LIBRARIES},
+        **{f"source {package}": _source(package) for package in SOURCES},
+        "processor": f"{platform.machine()} {processor}",
+        "threads": ", ".join(f"{name}={os.environ[name]}" for name in _THREADS if name in os.environ),
+    }
+
+
+def _source(package: str) -> str:
+    """Digest of a package's source, so that an edit shows that no version tells."""
+    root = Path(servotwin.__file__).parent
+    total = hashlib.sha256()
+    for path in sorted((root / package).rglob("*.py")):
+        total.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    return total.hexdigest()[:16]
+
+
+def _lines(name: str, value: object) -> Iterator[tuple[str, str]]:
+    """(dotted name, value in full) of everything in nested dataclasses."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _lines(f"{name}.{field.name}", getattr(value, field.name))
+    else:
+        yield name, repr(value)
+
+
+def _nested(parts: Mapping[str, str], name: str) -> dict[str, Any]:
+    """The values under a name, as nested as they were."""
+    top: dict[str, Any] = {}
+    for key, text in parts.items():
+        first, *between, last = key.split(".")
+        if first == name:
+            place = top
+            for step in between:
+                place = place.setdefault(step, {})
+            place[last] = ast.literal_eval(_INFINITE.sub("1e999", text))
+    return top
