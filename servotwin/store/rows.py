@@ -99,8 +99,7 @@ class Evidence(NamedTuple):
         glance, estimate, disturbance, trend, redesign, excitation, update, request, receipt, fallback, answer, hello,
         proof, withdrawn.
     message : int
-        Id of the message that led to it; 0: none did. What is found later of a window (an update that was proved on the
-        queue) names the window, so that the chain holds.
+        Id of the message that led to it; 0: none did.
     body : bytes
         MessagePack.
     version : int or None
@@ -114,6 +113,9 @@ class Evidence(NamedTuple):
         Key of the context under which it was computed; empty: does not matter.
     tail : float or None
         m, for queries: of a glance or an estimate, the largest tracking error in the last tenth of its window.
+    window : str
+        "boot/sequence" of the window that it stands on, where `message` may be another one: of an update that had to
+        wait for a receipt, or for a proof on the queue. It is kept as that window's.
     """
 
     kind: str
@@ -125,6 +127,7 @@ class Evidence(NamedTuple):
     status: str = ""
     context: str = ""
     tail: float | None = None
+    window: str = ""
 
 
 class Outcome(NamedTuple):
@@ -218,81 +221,3 @@ class Summary(NamedTuple):
     version: int | None
     receipt: str
     posted: int
-
-
-class Held(NamedTuple):
-    """A window as the store knows it.
-
-    Attributes
-    ----------
-    start : float
-        Sample time of its first sample, s.
-    received, done : float, float or None
-        s since the epoch, when it came and when it was processed.
-    """
-
-    id: int
-    servo: str
-    boot: str
-    sequence: int
-    start: float
-    received: float
-    done: float | None
-
-
-class Found(NamedTuple):
-    """Evidence as it is kept; `made`: s since the epoch, the others as of `Evidence`."""
-
-    id: int
-    kind: str
-    message: int
-    body: bytes
-    version: int | None
-    gap: float | None
-    std: float | None
-    status: str
-    context: str
-    tail: float | None
-    made: float
-
-
-class Effect(NamedTuple):
-    """What a version did, as the first window under it shows.
-
-    Attributes
-    ----------
-    window : Held
-        The first one that was cut under the version.
-    before, after : Found
-        The glance or estimate of the window that the version stands on, and of the first one under it: their `tail`,
-        `gap` and `status` are what changed.
-    """
-
-    window: Held
-    before: Found | None
-    after: Found
-
-
-class Step(NamedTuple):
-    """An update and what became of it: receipts and fallbacks that name its version, and the effect, if one shows."""
-
-    update: Found
-    answers: tuple[Found, ...]
-    effect: Effect | None
-
-
-class Link(NamedTuple):
-    """A window and everything that follows from it: the evidence chain.
-
-    Attributes
-    ----------
-    window : Held
-    found : tuple of Found
-        Glances, estimates, redesigns and so on, updates excepted.
-    steps : tuple of Step
-        Its updates: none, mostly, or one.
-    """
-
-    window: Held
-    found: tuple[Found, ...]
-    steps: tuple[Step, ...]

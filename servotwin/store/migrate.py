@@ -1,0 +1,69 @@
+"""The schema of a database brought up to date, or the database refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from servotwin.errors import InvalidInput
+from servotwin.store.address import POSTGRESQL, shown
+from servotwin.store.engine import transaction
+from servotwin.store.schema import REVISION, metadata
+
+VERSIONS = "servotwin_version"
+"""Table with the revision."""
+# Any number, the same in every process that migrates.
+_LOCK = 7461127
+
+
+def migrate(engine: sa.Engine, to: str = REVISION) -> None:
+    """Make what is missing; nothing is done to a database that is up to date.
+
+    Raises
+    ------
+    InvalidInput
+        The database is of a newer servotwin, or holds tables that are not servotwin's.
+    StoreUnavailable
+        It cannot be read or written.
+    """
+    with transaction(engine) as connection:
+        if _found(connection) == to:
+            return
+        if connection.dialect.name == POSTGRESQL:
+            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
+        found = _found(connection)
+        if found != to:
+            _check(connection, found, to)
+            _upgrade(connection, to)
+
+
+def _found(connection: sa.Connection) -> str | None:
+    """Revision of the database; None: it has none."""
+    if not sa.inspect(connection).has_table(VERSIONS):
+        return None
+    return connection.execute(sa.text(f"SELECT version_num FROM {VERSIONS}")).scalar()
+
+
+def _check(connection: sa.Connection, found: str | None, to: str) -> None:
+    where = shown(connection.engine.url)
+    if found is None:
+        theirs = sorted(set(sa.inspect(connection).get_table_names()) & set(metadata.tables))
+        if theirs:
+            raise InvalidInput(f"store {where}: holds a table {theirs[0]!r} that is not servotwin's; give another one")
+    elif found > to:
+        raise InvalidInput(
+            f"store {where}: its schema {found} is newer than {to}, the newest that this servotwin knows; "
+            "install the newer servotwin"
+        )
+
+
+def _upgrade(connection: sa.Connection, to: str) -> None:
+    # Alembic takes longer to import than all the rest of the store, and is mostly not needed.
+    from alembic import command
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).with_name("migrations")).replace("%", "%%"))
+    config.attributes["connection"] = connection
+    command.upgrade(config, to)

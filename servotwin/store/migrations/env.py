@@ -1,0 +1,9 @@
+"""What alembic runs: the migrations, on the connection that it was handed, in that connection's transaction."""
+
+from alembic import context
+
+from servotwin.store.migrate import VERSIONS
+from servotwin.store.schema import metadata
+
+context.configure(connection=context.config.attributes["connection"], target_metadata=metadata, version_table=VERSIONS)
+context.run_migrations()

@@ -1,0 +1,153 @@
+"""Outcomes into the tables, each as a whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from servotwin.store.address import SQLITE
+from servotwin.store.putting import insert_once, put
+from servotwin.store.rows import Evidence, Outcome
+from servotwin.store.schema import PROOFS, WINDOWS, WORK, contexts, evidence, messages, outgoing, states, twins
+
+_ESTIMATES = ("glance", "estimate")
+
+
+def commit(connection: sa.Connection, outcomes: Sequence[Outcome], now: float) -> list[bool]:
+    """Write those whose serial is still the servo's; whether each was.
+
+    The comparison with the serial makes an effect exactly once, whoever holds the lease: of two workers that had the
+    same servo the first to commit wins, and what the other made is void.
+    """
+    order = sorted(range(len(outcomes)), key=lambda i: outcomes[i].servo)
+    posted = {i: _raise(connection, outcomes[i]) for i in order}
+    valid = [(outcomes[i], last) for i in order if (last := posted[i]) is not None]
+    if valid:
+        _write(connection, valid, now)
+    return [posted[i] is not None for i in range(len(outcomes))]
+
+
+def _raise(connection: sa.Connection, outcome: Outcome) -> int | None:
+    """The servo's serial raised by one; serial of its last message to the edge, None where the outcome is void."""
+    known = _summary(outcome.evidence)
+    values = known | {"wake": outcome.wake, "count": len(outcome.outgoing)}
+    statement = _RAISE.values({twins.c[name]: sa.bindparam(f"_{name}", type_=twins.c[name].type) for name in known})
+    bound = {f"_{name}": value for name, value in values.items()}
+    found = connection.execute(statement, bound | {"_servo": outcome.servo, "_serial": outcome.serial})
+    return found.scalar()
+
+
+def _write(connection: sa.Connection, valid: Sequence[tuple[Outcome, int]], now: float) -> None:
+    outcomes = [outcome for outcome, _ in valid]
+    _states(connection, outcomes)
+    _done(connection, outcomes, now)
+    known = {key: text for outcome in outcomes for key, text in outcome.contexts}
+    _many(
+        connection,
+        insert_once(connection, contexts),
+        ({"key": key, "text": text} for key, text in sorted(known.items())),
+    )
+    found = [(outcome.servo, one) for outcome in outcomes for one in outcome.evidence]
+    windows = _windows(connection, found)
+    _many(connection, sa.insert(evidence), (_found(servo, one, windows, now) for servo, one in found))
+    _many(connection, sa.insert(outgoing), (row for outcome, last in valid for row in _posts(outcome, last, now)))
+    put(connection, [item for outcome in outcomes for item in outcome.enqueue])
+    connection.execute(_RECKON.where(twins.c.servo.in_([outcome.servo for outcome in outcomes])))
+
+
+def _states(connection: sa.Connection, outcomes: Sequence[Outcome]) -> None:
+    insert = sqlite.insert if connection.dialect.name == SQLITE else postgresql.insert
+    new = insert(states)
+    replacing = new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
+    connection.execute(replacing, [{"servo": outcome.servo, "state": outcome.state} for outcome in outcomes])
+
+
+def _done(connection: sa.Connection, outcomes: Sequence[Outcome], now: float) -> None:
+    for outcome in outcomes:
+        if outcome.done:
+            found = connection.execute(_DONE, {"_servo": outcome.servo, "_now": now, "_ids": list(outcome.done)})
+            if found.rowcount != len(set(outcome.done)):
+                raise ValueError(
+                    f"outcome of {outcome.servo}: covers a message that is not an unprocessed one of its own"
+                )
+
+
+def _many(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, Any]]) -> None:
+    found = list(rows)
+    if found:
+        connection.execute(statement, found)
+
+
+def _windows(connection: sa.Connection, found: Sequence[tuple[str, Evidence]]) -> dict[tuple[str, str], int]:
+    """Ids of the windows that evidence names."""
+    names = sorted({(servo, one.window) for servo, one in found if one.window})
+    if not names:
+        return {}
+    query = sa.select(messages.c.servo, messages.c.key, messages.c.id)
+    rows = connection.execute(query.where(sa.tuple_(messages.c.servo, messages.c.key).in_(names), WINDOWS))
+    return {(row.servo, row.key): row.id for row in rows}
+
+
+def _found(servo: str, found: Evidence, windows: Mapping[tuple[str, str], int], now: float) -> dict[str, Any]:
+    row = found._asdict()
+    message = windows.get((servo, row.pop("window")), found.message)
+    return row | {"message": message or None, "context": found.context or None, "servo": servo, "made": now}
+
+
+def _posts(outcome: Outcome, last: int, now: float) -> list[dict[str, Any]]:
+    first = last - len(outcome.outgoing) + 1
+    return [
+        {"servo": outcome.servo, "serial": first + i, "body": body, "made": now}
+        for i, body in enumerate(outcome.outgoing)
+    ]
+
+
+def _summary(found: Sequence[Evidence]) -> dict[str, Any]:
+    """What the servo's row says of the newest estimate, update and receipt, where there is a new one."""
+    known: dict[str, Any] = {}
+    for one in found:
+        if one.kind in _ESTIMATES:
+            known |= {"gap": one.gap, "std": one.std, "status": one.status}
+        elif one.kind == "update":
+            known["version"] = one.version
+        elif one.kind == "receipt":
+            known["receipt"] = one.status
+    return known
+
+
+_RAISE = (
+    sa.update(twins)
+    .where(twins.c.servo == sa.bindparam("_servo"), twins.c.serial == sa.bindparam("_serial"))
+    .values(
+        serial=twins.c.serial + 1,
+        posted=twins.c.posted + sa.bindparam("_count", type_=sa.BigInteger),
+        wake=sa.bindparam("_wake", type_=sa.Double),
+        attempts=0,
+        lease_owner=None,
+        lease_until=None,
+    )
+    .returning(twins.c.posted)
+)
+
+_DONE = (
+    sa.update(messages)
+    .where(
+        messages.c.id.in_(sa.bindparam("_ids", expanding=True)),
+        messages.c.servo == sa.bindparam("_servo"),
+        messages.c.done.is_(None),
+    )
+    .values(done=sa.bindparam("_now", type_=sa.Double))
+)
+
+
+def _first(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
+    oldest = sa.select(messages.c.received).where(queue, messages.c.servo == twins.c.servo)
+    return oldest.order_by(messages.c.id).limit(1).correlate(twins).scalar_subquery()
+
+
+# A statement of its own after the serials were raised: on PostgreSQL those rows are locked then, and what was put
+# before that is seen here, what is put after it waits and says so itself.
+_RECKON = sa.update(twins).values(ready=_first(WORK), asked=_first(PROOFS))
