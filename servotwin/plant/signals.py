@@ -91,6 +91,11 @@ class PiecewiseCubic:
 
     def on(self, times: Array) -> Array:
         """`value` at increasing times ``(n,)``, piece by piece: quicker where there are many times in few pieces."""
+        if times.size == 0:
+            return np.empty(0)
+        first, last = np.searchsorted(self.times, _rounded_up(times[[0, -1]]), side="right").tolist()
+        if first == last and not self.coeffs[max(first - 1, 0), 1:].any():
+            return np.full(times.size, self.coeffs[max(first - 1, 0), 0])
         result = np.empty(times.size)
         bounds = np.concatenate([[0], np.searchsorted(_rounded_up(times), self.times[1:], side="left"), [times.size]])
         for piece in np.flatnonzero(np.diff(bounds)):

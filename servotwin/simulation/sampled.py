@@ -128,14 +128,13 @@ class SampledEngine:
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
         """Base steps during or at the end of which the gap's cubic changes, with those changes."""
-        gap, found = self.inputs.gap, dict[int, list[Jump]]()
-        jumping = set(gap.jumps.tolist())
-        for time, coefficients in zip(gap.times.tolist(), gap.coeffs, strict=True):
-            place = time * self.rate
-            base = int(np.ceil(place - 1e-9)) - 1
-            if self.base <= base < end:
-                opened = self.plant.opened if time in jumping else None
-                found.setdefault(base, []).append(Jump(time, self.plant.input_values("gap", coefficients), opened))
+        found = dict[int, list[Jump]]()
+        bases = np.ceil(self.inputs.gap.times * self.rate - 1e-9).astype(np.int64) - 1
+        for piece in np.flatnonzero((self.base <= bases) & (bases < end)).tolist():
+            time, coefficients = float(self.inputs.gap.times[piece]), self.inputs.gap.coeffs[piece]
+            opened = self.plant.opened if time in self.inputs.gap.jumps else None
+            jump = Jump(time, self.plant.input_values("gap", coefficients), opened)
+            found.setdefault(int(bases[piece]), []).append(jump)
         return sorted(found.items())
 
     def drive(self, first: int, last: int) -> Drive:
@@ -155,9 +154,11 @@ class SampledEngine:
         """Noise of the next ticks; those that a change of controller looked at are `drawn` already."""
         if self.source is None:
             return np.zeros(count)
-        values = np.concatenate([self.drawn, self.source.block(max(count - self.drawn.size, 0))])
-        self.drawn = values[count:]
-        return values[:count]
+        if (missing := count - self.drawn.size) > 0:
+            ahead = missing if self.keep is None else max(missing, _CHUNK)
+            self.drawn = np.concatenate([self.drawn, self.source.block(ahead)])
+        values, self.drawn = self.drawn[:count], self.drawn[count:]
+        return values
 
     def _run(self, end: int) -> None:
         while self.base < end:

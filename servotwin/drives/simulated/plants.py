@@ -11,6 +11,7 @@ import numpy as np
 
 from servotwin import machine
 from servotwin.control.gains import with_gains
+from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
@@ -89,7 +90,7 @@ class SupervisedPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._machine = machine.endless(settings.scenario, 2 * settings.block_samples)
+        self._machine = machine.endless(settings.scenario, wire.MOST)
         self._law, self._end = settings.scenario.law, settings.end
         self._kept = round(settings.kept * settings.rate)
         self._stretches: deque[Stretch] = deque()
@@ -106,13 +107,12 @@ class SupervisedPlant:
         return self._end is not None and self.index >= self._end
 
     def advance(self, samples: int) -> None:
-        """So many samples on, as far as there are any, at most a block at a time."""
-        last = self.index + samples if self._end is None else min(self.index + samples, self._end)
-        while (first := self.index) < last:
-            stop = min(first + self.block, last)
-            self._machine.advance(stop)
-            values = np.array([self._machine.measured(name, first, stop) for name in CHANNELS])
-            self._stretches.append(Stretch(first, self.version, values))
+        """So many samples on, at most `wire.MOST`, as far as there are any."""
+        first = self.index
+        stop = first + samples if self._end is None else min(first + samples, self._end)
+        self._machine.advance(stop)
+        values = np.array([self._machine.measured(name, first, stop) for name in CHANNELS])
+        self._stretches.append(Stretch(first, self.version, values))
         while self._stretches and self._stretches[0].last <= self.index - self._kept:
             self._stretches.popleft()
 

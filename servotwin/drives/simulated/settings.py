@@ -35,7 +35,7 @@ class MachineSettings:
         s by the clock by which the machine may be late, or wait for the edge, and catch up; what is beyond is given up:
         the edge's tick counts as missed, the machine's time as lost.
     block : float
-        s of machine time in one block; supervise only.
+        s of machine time in one block where the reader does not say; supervise only.
     kept : float
         s of machine time for which samples wait to be read; supervise only.
     """
@@ -47,7 +47,7 @@ class MachineSettings:
     endless: bool = True
     watchdog: float = 0.1
     slack: float = 0.25
-    block: float = 0.02
+    block: float = 0.05
     kept: float = 10.0
 
     def __post_init__(self) -> None:
