@@ -30,7 +30,7 @@ from servotwin.twin.settings import TwinSettings
 SOURCES = ("control", "hybrid", "identify", "messages", "plant", "redesign", "simulation", "twin")
 """Packages that an estimate, or what is made of it, may depend on; each has a digest of its own."""
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_BLAS = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _MODEL, _SETTINGS = "model", "settings"
 _INFINITE = re.compile(r"\binf\b(?!')")
 
@@ -95,7 +95,7 @@ def surroundings() -> Mapping[str, str]:
         **{name: metadata.version(name) for name in LIBRARIES},
         **{f"source {package}": _source(package) for package in SOURCES},
         "processor": f"{platform.machine()} {processor}",
-        "threads": ", ".join(f"{name}={os.environ[name]}" for name in _THREADS if name in os.environ),
+        "blas": ", ".join(f"{name}={os.environ[name]}" for name in _BLAS if name in os.environ) or "as it comes",
     }
 
 
@@ -121,8 +121,8 @@ def _nested(parts: Mapping[str, str], name: str) -> dict[str, Any]:
     """The values under a name, as nested as they were."""
     top: dict[str, Any] = {}
     for key, text in parts.items():
-        first, *between, last = key.split(".")
-        if first == name:
+        if key.startswith(f"{name}."):
+            *between, last = key.split(".")[1:]
             place = top
             for step in between:
                 place = place.setdefault(step, {})

@@ -1,0 +1,94 @@
+"""Making a stored estimate again: from the stored window, what was known before it, model and settings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+
+from servotwin import messages
+from servotwin.errors import InvalidInput
+from servotwin.identify.estimate import GapEstimate
+from servotwin.messages import InvalidMessage, Window
+from servotwin.twin.context import context_of, described, differing, parts_of
+from servotwin.twin.estimating import estimate_from, estimator_of
+from servotwin.twin.evidence import Estimated, plain
+from servotwin.twin.fleet import Model
+
+
+class Replayed(NamedTuple):
+    """What came of it.
+
+    Attributes
+    ----------
+    estimate : GapEstimate
+        As it comes out now.
+    same : bool
+        Whether it is the stored one, bit for bit.
+    differs : tuple of str
+        What is not as it was then: versions, sources, processor and, under another model, its numbers and settings;
+        each with both values.
+    changed : tuple of str
+        What of the estimate comes out otherwise.
+    """
+
+    estimate: GapEstimate
+    same: bool
+    differs: tuple[str, ...]
+    changed: tuple[str, ...]
+
+
+_estimated = msgspec.msgpack.Decoder(Estimated)
+
+
+def replay(window: bytes, body: bytes, context: str, model: Model | None = None) -> Replayed:
+    """Make an estimate again and compare.
+
+    Parameters
+    ----------
+    window : bytes
+        The message, decompressed.
+    body : bytes
+        Of the estimate's evidence.
+    context : str
+        The JSON that the evidence names.
+    model : Model, optional
+        What to estimate with; None: model and settings as they were then.
+
+    Raises
+    ------
+    InvalidInput
+        One of them is not understood.
+    """
+    message, stored, then = _window(window), _stored(body), parts_of(context)
+    servo, settings = described(then) if model is None else (model.servo, model.settings)
+    now = parts_of(context_of(servo, settings)[1])
+    estimate = estimate_from(message, estimator_of(servo, settings), stored.prior.expectation(settings.trend))
+    again = plain(estimate)
+    return Replayed(estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again))
+
+
+def _window(data: bytes) -> Window:
+    try:
+        message = messages.decode(data)
+    except InvalidMessage as error:
+        raise InvalidInput(f"the stored window is not understood: {error}") from None
+    if not isinstance(message, Window):
+        raise InvalidInput(
+            f"the stored message is a {type(message).__name__}, and only a window can be estimated again"
+        )
+    return message
+
+
+def _stored(body: bytes) -> Estimated:
+    try:
+        return _estimated.decode(body)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise InvalidInput(f"the stored estimate is not understood: {error}") from None
+
+
+def _changed(then: bytes, now: bytes) -> tuple[str, ...]:
+    """Names of the values that are not the same, bit for bit."""
+    one, other = (msgspec.msgpack.decode(each, type=dict[str, msgspec.Raw]) for each in (then, now))
+    keys = sorted({*one, *other})
+    return tuple(key for key in keys if bytes(one.get(key, b"")) != bytes(other.get(key, b"")))
