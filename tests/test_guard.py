@@ -31,7 +31,7 @@ def decide(update: Update, current: Parameters, limits: Limits, here: Instant) -
 
 def test_a_good_update_is_applied_at_the_next_sample() -> None:
     parameters, receipt = decide(UPDATE, CURRENT, LIMITS, HERE)
-    assert parameters == Parameters(3, 1e-4, 20.0, ("b0", 1), 110_000)
+    assert parameters == Parameters(3, 1e-4, 20.0, ("b0", 1), 110_000, gap=0.1)
     assert (receipt.applied, receipt.sample, receipt.reason) == (True, 110_000, Reason.APPLIED)
     assert (receipt.version, receipt.parameter_version, receipt.boot) == (3, 3, "b0")
 

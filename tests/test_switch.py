@@ -38,7 +38,7 @@ def reasons(said: tuple[Any, ...]) -> list[tuple[int, Reason]]:
 def test_a_safe_instant_is_used_at_once(error: float | None) -> None:
     state, said = offer(START, UPDATE, RULES, at(22.0), error)
     assert reasons(said) == [(1, Reason.APPLIED)]
-    assert state == Switch(Parameters(1, 2e-4, 20.0, ("b0", 0), 110_000, gains=CALM, band=BAND))
+    assert state == Switch(Parameters(1, 2e-4, 20.0, ("b0", 0), 110_000, gains=CALM, band=BAND, gap=0.1))
     assert isinstance(said[0], Receipt)
     assert said[0].sample == 110_000
 

@@ -18,6 +18,7 @@ from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.cut import Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
+from servotwin.edge.novelty import TIMED
 from servotwin.edge.outlet import Outlet, PackingOutlet
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
@@ -82,6 +83,7 @@ class Agent:
         self._granted = Granted(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
         self._opened: Opened | None = None
+        self._cut_at = 0
         self._deadline = self._next_deadline()
 
     @property
@@ -232,6 +234,8 @@ class Agent:
             self._cut(opened)
             self._abort()
             self._opened = None
+        elif opened is None and self.samples >= self._timed:
+            self._cut(Opened(self.samples - self._granted.window, self.samples, TIMED))
         sent = [Outgoing(self.samples, window) for window in self.outlet.due(self.time)]
         said = self._supervisor.look()
         if any(isinstance(each, Fallback) for each in said):
@@ -243,11 +247,21 @@ class Agent:
     def _cut(self, opened: Opened) -> None:
         """Let a window go; what the twin then owes an answer to is the outlet's to know."""
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
-        signals = self._recorder.cut(opened.first, opened.last)
-        cut = Cut(opened.first, sequence, opened.reason, self.parameters.version, self._before(opened.first), signals)
-        self.outlet.offer(cut, self.time)
+        self._cut_at = self.samples
+        self.outlet.offer(self._raw(opened, sequence), self.time)
         if self.outlet.waiting:
             self._supervisor.asked(self.time)
+
+    def _raw(self, opened: Opened, sequence: int) -> Cut:
+        """Samples, and what is in force."""
+        p, signals = self.parameters, self._recorder.cut(opened.first, opened.last)
+        basis = p.window[1] if p.window is not None and p.window[0] == self.settings.boot else None
+        return Cut(opened.first, sequence, opened.reason, p.version, self._before(opened.first), signals, p.gap, basis)
+
+    @property
+    def _timed(self) -> float:
+        """`samples` at which a window is cut if nothing else has led to one."""
+        return self._cut_at + max(self.settings.look_samples, self._granted.window)
 
     def _before(self, first: int) -> float:
         """The reference just before a sample, m."""
@@ -256,8 +270,7 @@ class Agent:
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
         wanted = self._supervisor.next_look
-        if self._opened is not None:
-            wanted = min(wanted, self._opened.last)
+        wanted = min(wanted, self._timed if self._opened is None else self._opened.last)
         if self.probe is not None:
             wanted = min(wanted, self.probe.next_change(self.samples))
         due = self.outlet.next_time

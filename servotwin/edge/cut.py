@@ -21,6 +21,10 @@ class Cut(NamedTuple):
         Reference just before the first sample, m.
     signals : dict of str to array of double
         Channel by channel, equally long: m, rad, m, V.
+    gap : float or None
+        rad: what the update in force gives as the gap; None: none is in force, or it gives none.
+    basis : int or None
+        Sequence of the window of this boot that it stands on.
     """
 
     first: int
@@ -29,6 +33,8 @@ class Cut(NamedTuple):
     parameter_version: int
     before: float
     signals: dict[str, "array[float]"]
+    gap: float | None = None
+    basis: int | None = None
 
     @property
     def samples(self) -> int:

@@ -40,7 +40,14 @@ def applied(update: Update, current: Parameters, sample: int) -> Parameters:
     """What is in force from `sample` on; an update without gains leaves them."""
     gains = current.gains if update.controller is None else update.controller
     return Parameters(
-        update.version, update.tolerance, update.data_time, update.window, sample, gains=gains, band=update.band
+        update.version,
+        update.tolerance,
+        update.data_time,
+        update.window,
+        sample,
+        gains=gains,
+        band=update.band,
+        gap=update.gap,
     )
 
 

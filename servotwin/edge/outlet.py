@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from servotwin.edge.cut import Cut
+from servotwin.edge.novelty import Novelty
 from servotwin.edge.packing import pack
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox, Outbox
@@ -55,11 +56,12 @@ class PackingOutlet:
     outbox : Outbox, optional
         In memory by default; what it already holds is due at once.
     judge : callable, optional
-        Looks at each cut window first; None: all are sent.
+        Looks at each cut window first; None: the one that the settings ask for, if any.
     """
 
     def __init__(self, settings: AgentSettings, outbox: Outbox | None = None, judge: Judge | None = None) -> None:
-        self._settings, self._judge = settings, judge
+        self._settings = settings
+        self.judge = judge if judge is not None or settings.novelty is None else Novelty(settings.novelty)
         self.outbox = MemoryOutbox() if outbox is None else outbox
         self._sender = Sender(self.outbox, settings.retry)
         self._lost: Counter[str] = Counter()
@@ -81,7 +83,7 @@ class PackingOutlet:
 
     def offer(self, cut: Cut, now: float) -> None:
         """Judge, pack and keep; one that holds a sample which is not finite is counted only."""
-        wanted = cut if self._judge is None else self._judge(cut)
+        wanted = cut if self.judge is None else self.judge(cut)
         if wanted is None:
             self._lost[WITHHELD] += 1
             return

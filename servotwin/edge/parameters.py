@@ -31,6 +31,8 @@ class Parameters:
         Whether they are the fallback set.
     not_before : int
         First sample at which an update may replace them.
+    gap : float, optional
+        rad, that the update was made for; None: not known.
     """
 
     version: int = 0
@@ -42,6 +44,7 @@ class Parameters:
     band: Band | None = None
     fallback: bool = False
     not_before: int = 0
+    gap: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.tolerance < inf:

@@ -6,6 +6,7 @@ from math import inf, isfinite
 
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
+from servotwin.edge.noveltyrules import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.verdict import FallbackSet
@@ -77,6 +78,8 @@ class AgentSettings:
     own : Gains, optional
         The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
     supervision : Supervision
+    novelty : NoveltySettings, optional
+        Which windows are worth sending; None: all.
     """
 
     servo: str
@@ -96,6 +99,7 @@ class AgentSettings:
     longest_window_s: float | None = None
     longest_pre_trigger_s: float | None = None
     probe: ProbeLimits | None = None
+    novelty: NoveltySettings | None = None
 
     def __post_init__(self) -> None:
         for key in ("servo", "boot"):
@@ -111,6 +115,7 @@ class AgentSettings:
             allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
+        self._check_novelty()
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
@@ -129,6 +134,12 @@ class AgentSettings:
             allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
             raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")
 
+    def _check_novelty(self) -> None:
+        """The model is for these samples."""
+        if self.novelty is not None and self.novelty.model.rate != self.sample_rate:
+            rates = f"{self.novelty.model.rate!r} Hz for samples at {self.sample_rate!r} Hz"
+            raise InvalidInput(f"agent novelty model = {rates}: must be equal")
+
     @property
     def longest_samples(self) -> int:
         """Samples of the longest window."""
@@ -145,6 +156,11 @@ class AgentSettings:
     def rest_samples(self) -> int:
         """Samples for which the reference rests before a probing move."""
         return 0 if self.probe is None else max(1, round(self.probe.rest_s * self.sample_rate))
+
+    @property
+    def look_samples(self) -> float:
+        """Samples after a window at which one is cut where nothing else leads to one; inf: never."""
+        return inf if self.novelty is None else max(self.window_samples, self.novelty.rules.look_s * self.sample_rate)
 
     @property
     def window_samples(self) -> int:
