@@ -1,0 +1,61 @@
+"""The file under an edge's outbox: opened, checked, put aside when it is broken."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+_SCHEMA = """
+PRAGMA journal_mode = WAL;
+PRAGMA synchronous = FULL;
+PRAGMA busy_timeout = 2000;
+PRAGMA journal_size_limit = 4194304;
+CREATE TABLE IF NOT EXISTS windows (
+    place INTEGER PRIMARY KEY AUTOINCREMENT, boot TEXT NOT NULL, sequence INTEGER NOT NULL, reason TEXT NOT NULL,
+    encoding TEXT NOT NULL, body BLOB NOT NULL, UNIQUE (boot, sequence));
+CREATE TABLE IF NOT EXISTS letters (
+    place INTEGER PRIMARY KEY AUTOINCREMENT, digest BLOB NOT NULL UNIQUE, body BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS counts (what TEXT PRIMARY KEY, number INTEGER NOT NULL) WITHOUT ROWID;
+"""
+_BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_BESIDE = ("-wal", "-shm")
+
+
+def is_broken(error: sqlite3.Error) -> bool:
+    """Whether the file holds nonsense; otherwise it cannot be written or read just now."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in _BROKEN
+
+
+def connect(path: Path) -> sqlite3.Connection:
+    """An outbox's file, made where there is none.
+
+    Raises
+    ------
+    sqlite3.Error
+        It cannot be opened, or `is_broken`.
+    """
+    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+    try:
+        connection.executescript(_SCHEMA)
+        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if found != "ok":
+            error = sqlite3.DatabaseError(found)
+            error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+            raise error
+    except sqlite3.Error:
+        connection.close()
+        raise
+    return connection
+
+
+def put_aside(path: Path) -> Path:
+    """Rename a broken file, so that somebody may look into it; where it is now."""
+    number = 1
+    while (aside := path.with_name(f"{path.name}.broken-{number}")).exists():
+        number += 1
+    path.rename(aside)
+    for end in _BESIDE:
+        beside = path.with_name(path.name + end)
+        if beside.exists():
+            beside.rename(aside.with_name(aside.name + end))
+    return aside

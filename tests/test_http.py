@@ -1,0 +1,238 @@
+"""The link over HTTP: delivery, refusals, and everything that may answer instead of the twin."""
+
+import socket
+import ssl
+import threading
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from faketwin import FakeTwin, Handler
+
+from servotwin.errors import InvalidInput
+from servotwin.link.http import HttpTransport
+from servotwin.link.transport import Backoff, Parcel, Refused, Unreachable, squeezed
+from servotwin.messages import Acknowledge, Hello, Refusal, Window, checksum, encode, pack_channel
+
+CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
+HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, 0.0, "")
+
+
+def window(sequence: int) -> Window:
+    return Window("axis-1", "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+
+
+def parcel(sequence: int) -> Parcel:
+    return Parcel("axis-1", *squeezed(encode(window(sequence))), "b0", sequence)
+
+
+LETTER = Parcel("axis-1", encode(HELLO))
+
+
+@pytest.fixture
+def twin() -> Iterator[FakeTwin]:
+    with FakeTwin() as twin:
+        yield twin
+
+
+@pytest.fixture
+def link(twin: FakeTwin) -> Iterator[HttpTransport]:
+    transport = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
+    yield transport
+    release(transport)
+
+
+def release(transport: HttpTransport) -> None:
+    transport.close()
+    transport._up.drop()
+    transport._down.drop()
+
+
+def test_windows_and_letters_arrive(twin: FakeTwin, link: HttpTransport) -> None:
+    link.deliver(parcel(0))
+    link.deliver(parcel(0))
+    link.deliver(LETTER)
+    assert twin.windows == {("b0", 0): window(0)}
+    assert twin.letters == [HELLO]
+
+
+def test_one_connection_serves_many_requests(twin: FakeTwin, link: HttpTransport) -> None:
+    seen = set()
+    twin.fault = lambda handler, _: bool(seen.add(handler.client_address))
+    for k in range(5):
+        link.deliver(parcel(k))
+    assert len(seen) == 1
+
+
+def test_a_connection_that_the_other_side_closed_is_opened_again(twin: FakeTwin, link: HttpTransport) -> None:
+    def close_after(handler: Handler, _: bytes) -> bool:
+        handler.close_connection = True
+        return False
+
+    twin.fault = close_after
+    for k in range(3):
+        link.deliver(parcel(k))
+    assert len(twin.windows) == 3
+
+
+def test_what_the_twin_says_is_read_again_until_it_is_acknowledged(twin: FakeTwin, link: HttpTransport) -> None:
+    assert link.listen(0) == []
+    for k in range(3):
+        twin.say(Acknowledge("axis-1", "b0", k))
+    assert [len(link.listen(after)) for after in (0, 0, 2, 3)] == [3, 3, 1, 0]
+
+
+@pytest.mark.parametrize(("code", "status"), [(code, 400) for code in Refusal])
+def test_a_refusal_is_understood(twin: FakeTwin, link: HttpTransport, code: Refusal, status: int) -> None:
+    def refuse(handler: Handler, _: bytes) -> bool:
+        handler.refuse(status, code, Retry_After="7")
+        return True
+
+    twin.fault = refuse
+    for ask in (lambda: link.deliver(parcel(0)), lambda: link.deliver(LETTER), lambda: link.listen(0)):
+        with pytest.raises(Refused) as refused:
+            ask()
+        assert (refused.value.reason, refused.value.after_s) == (code, 7.0)
+
+
+def test_a_wrong_token_is_a_refusal(twin: FakeTwin) -> None:
+    link = HttpTransport(twin.url, "axis-1", "other", timeout_s=5.0)
+    with pytest.raises(Refused, match="bad_token") as refused:
+        link.deliver(parcel(0))
+    assert refused.value.reason.passing
+    release(link)
+
+
+@pytest.mark.parametrize(
+    ("status", "body"),
+    [(200, b"<html>log in here</html>"), (200, b""), (200, b"\x90"), (404, b"<html>"), (302, b""), (502, b"{}"),
+     (413, b'{"code": "no such code"}'), (200, b"x" * 100_000), (500, b"x" * 100_000)],
+)  # fmt: skip
+def test_whoever_answers_otherwise_is_not_the_twin(
+    twin: FakeTwin, link: HttpTransport, status: int, body: bytes
+) -> None:
+    def answer(handler: Handler, _: bytes) -> bool:
+        handler.answer(status, body)
+        return True
+
+    twin.fault = answer
+    with pytest.raises(Unreachable):
+        link.deliver(parcel(0))
+    twin.fault = None
+    link.deliver(parcel(0))
+    assert len(twin.windows) == 1
+
+
+def test_an_answer_that_breaks_off_is_no_delivery(twin: FakeTwin, link: HttpTransport) -> None:
+    def break_off(handler: Handler, _: bytes) -> bool:
+        handler.wfile.write(b"HTTP/1.1 201 Created\r\nContent-Length: 50\r\n\r\nabc")
+        handler.close_connection = True
+        return True
+
+    twin.fault = break_off
+    with pytest.raises(Unreachable):
+        link.deliver(parcel(0))
+
+
+def test_an_answer_that_never_comes_is_no_delivery() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        link = HttpTransport(f"http://127.0.0.1:{deaf.getsockname()[1]}", "axis-1", "secret", timeout_s=0.2)
+        with pytest.raises(Unreachable, match="timed out"):
+            link.deliver(parcel(0))
+        release(link)
+
+
+def test_nobody_there_is_unreachable() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        url = f"http://127.0.0.1:{closed.getsockname()[1]}"
+    link = HttpTransport(url, "axis-1", "secret", timeout_s=1.0)
+    with pytest.raises(Unreachable, match="refused"):
+        link.deliver(parcel(0))
+
+
+def test_closing_wakes_whoever_listens(twin: FakeTwin) -> None:
+    link = HttpTransport(twin.url, "axis-1", "secret", wait_s=30.0)
+    woken = []
+
+    def listen() -> None:
+        try:
+            link.listen(0)
+        except Unreachable:
+            woken.append(True)
+
+    arrived = threading.Event()
+    twin.fault = lambda *_: bool(arrived.set())
+    thread = threading.Thread(target=listen)
+    thread.start()
+    assert arrived.wait(10.0)
+    link.close()
+    thread.join(10.0)
+    assert woken == [True]
+    release(link)
+
+
+def test_deflate_is_used_where_it_helps() -> None:
+    body = encode(window(0))
+    small, encoding = squeezed(body)
+    assert (encoding, zlib.decompress(small)) == ("deflate", body)
+    assert squeezed(b"abc") == (b"abc", "")
+
+
+def test_over_tls_the_certificate_is_checked(twin: FakeTwin, certificate: Path) -> None:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate)
+    twin.server.socket = context.wrap_socket(twin.server.socket, server_side=True)
+    url = twin.url.replace("http:", "https:")
+    trusting = HttpTransport(url, "axis-1", "secret", str(certificate), 5.0)
+    trusting.deliver(parcel(0))
+    release(trusting)
+    doubting = HttpTransport(url, "axis-1", "secret", None, 5.0)
+    with pytest.raises(Unreachable, match="certificate verify failed"):
+        doubting.deliver(parcel(1))
+    assert list(twin.windows) == [("b0", 0)]
+    with pytest.raises(InvalidInput, match="holds no certificates"):
+        HttpTransport(url, "axis-1", "secret", str(certificate.with_name("absent.pem")))
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import datetime
+    import ipaddress
+
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "twin")])
+    now = datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=2))
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), True)
+        .sign(key, hashes.SHA256())
+    )
+    file = tmp_path_factory.mktemp("tls") / "twin.pem"
+    private = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    file.write_bytes(private + made.public_bytes(serialization.Encoding.PEM))
+    return file
+
+
+def test_pauses_grow_and_begin_again() -> None:
+    backoff = Backoff(1.0, 2.0, 5.0)
+    assert [backoff.failed(1.0) for _ in range(5)] == [1.0, 2.0, 4.0, 5.0, 5.0]
+    assert backoff.failed(0.0) == 2.5
+    backoff.succeeded()
+    assert backoff.failed(1.0) == 1.0
+    with pytest.raises(InvalidInput):
+        Backoff(2.0, 1.0, 1.0)
