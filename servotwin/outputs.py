@@ -12,8 +12,10 @@ from servotwin.errors import InvalidInput
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Path]:
+def written(path: Path, mode: int | None = None) -> Iterator[Path]:
     """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
+
+    It gets the permissions `mode`; None: those of any new file.
 
     Raises
     ------
@@ -26,7 +28,7 @@ def written(path: Path) -> Iterator[Path]:
         temporary = Path(name)
         try:
             yield temporary
-            temporary.chmod(0o666 & ~_umask())
+            temporary.chmod(0o666 & ~_umask() if mode is None else mode)
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -26,7 +27,8 @@ def waiting(connection: sa.Connection, now: float) -> Waiting:
     counts = [sa.select(sa.func.count()).select_from(messages).where(queue) for queue in (WORK, PROOFS)]
     first = sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None))
     query = sa.select(*(count.scalar_subquery() for count in counts), first.scalar_subquery())
-    work, proofs, oldest = connection.execute(query).one()
+    found: Any = connection.execute(query).one()
+    work, proofs, oldest = found
     return Waiting(work, proofs, 0.0 if oldest is None else max(0.0, now - oldest))
 
 

@@ -124,7 +124,9 @@ class Rows:
 
     def add_update(self, update: Update) -> None:
         """An update on its way."""
-        self._computed("update", encode(update), update.status, version=update.version, gap=update.gap, std=update.std)
+        window = "{}/{}".format(*update.window)
+        values = {"version": update.version, "gap": update.gap, "std": update.std, "window": window}
+        self._computed("update", encode(update), update.status, **values)
 
     def add_request(self, request: Request) -> None:
         """A request on its way."""
