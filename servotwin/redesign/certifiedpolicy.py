@@ -20,6 +20,7 @@ from servotwin.redesign.certified import certify
 from servotwin.redesign.deadzones import gap_range
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
+from servotwin.redesign.region import Prover, Region
 from servotwin.redesign.setting import Setting
 from servotwin.redesign.uncertainty import Range, Uncertainty
 
@@ -71,6 +72,10 @@ class CertifiedPolicy:
         Where nothing may stand on the window's own estimate, what it says of the input bias still counts, with the gap
         as the trend knows it.
         """
+        return self.decide(evidence, self)
+
+    def decide(self, evidence: Evidence, prover: Prover) -> Redesign:
+        """The same with what another has proved."""
         estimate = self._estimate(evidence)
         if estimate is None:
             return Redesign(None, math.nan, evidence.unusable)
@@ -81,22 +86,18 @@ class CertifiedPolicy:
                 f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
             )
             return Redesign(None, math.nan, reason)
-        feedforward, bias = self._input_bias(evidence)
-        noise = _noise(evidence)
-        found = certify(
-            self.servo,
-            self.uncertainty.replace(gap=gap, input_bias=bias, friction=self._friction(evidence)),
-            self.held(),
-            self.trial,
-            feedforward,
-            noise,
-            self.clock,
-        )
+        region = Region(gap, *self._input_bias(evidence), self._friction(evidence), _noise(evidence))
+        found = prover.prove(region)
         if isinstance(found, Refusal):
-            return self._fallen_back(evidence, found.reason)
+            return _fallen_back(prover.fallback(), region, found.reason)
         if _in_force(found.setting, evidence):
             return Redesign(None, estimate.gap, "what was proved is in force already", certificate=found)
-        return _sent(found, noise, estimate.gap, "")
+        return _sent(found, region.noise, estimate.gap, "")
+
+    def prove(self, region: Region) -> Certificate | Refusal:
+        """The cheapest setting that holds in a region, by simulation."""
+        known = region.within(self.uncertainty)
+        return certify(self.servo, known, self.held(), self.trial, region.feedforward, region.noise, self.clock)
 
     def held(self) -> Demands:
         """The demands, and the fallback set's band; a dead zone opens the loop inside of it only."""
@@ -125,13 +126,6 @@ class CertifiedPolicy:
         low, high = gap_range(estimate)
         grows = trend is not None and trend.updates > 1
         return low, high + (self.horizon * max(0.0, trend.rate_interval[1]) if trend is not None and grows else 0.0)
-
-    def _fallen_back(self, evidence: Evidence, reason: str) -> Redesign:
-        proved = self.fallback()
-        feedforward, _ = self._input_bias(evidence)
-        law = proved.setting.controller.replace(feedforward=feedforward)
-        sent = replace(proved, setting=replace(proved.setting, controller=law))
-        return _sent(sent, _noise(evidence), math.nan, f"{reason}; the fallback set is sent")
 
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """What to feed forward (V), and the range of biases to reckon with; what cannot be told from the feedforward
@@ -187,6 +181,12 @@ def _fallback(servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: T
     if isinstance(found, Refusal):
         raise InvalidInput(f"no fallback set for the servo's stated range: {found.reason}")
     return found
+
+
+def _fallen_back(proved: Certificate, region: Region, reason: str) -> Redesign:
+    law = proved.setting.controller.replace(feedforward=region.feedforward)
+    sent = replace(proved, setting=replace(proved.setting, controller=law))
+    return _sent(sent, region.noise, math.nan, f"{reason}; the fallback set is sent")
 
 
 def _sent(proved: Certificate, noise: float, gap: float, reason: str) -> Redesign:
