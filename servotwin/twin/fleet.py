@@ -192,6 +192,7 @@ def _model(table: Table, name: str, folder: Path) -> Model:
     settings = part(table, "twin", settingsfile.twin)
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)
+    policy_of(servo.replace(controller=law), settings)
     return Model(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
