@@ -1,0 +1,91 @@
+"""A PostgreSQL server for tests: a cluster of its own in a temporary folder, reached by a socket in that folder."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import psycopg
+from servers import needed
+
+PATIENCE_S = 60.0
+OPTIONS = {"listen_addresses": "", "fsync": "off", "full_page_writes": "off", "max_connections": "100"}
+
+
+class Server(NamedTuple):
+    """A running server: where its socket lies, and whose databases they are."""
+
+    folder: Path
+    user: str
+
+    def database(self, name: str) -> str:
+        """A new, empty database; its URL."""
+        with psycopg.connect(self._parameters("postgres"), autocommit=True) as connection:
+            connection.execute(f'CREATE DATABASE "{name}"')
+        return f"postgresql://{self.user}@/{name}?host={self.folder}"
+
+    def run(self, name: str, statement: str) -> None:
+        """Run a statement in a database."""
+        with psycopg.connect(self._parameters(name), autocommit=True) as connection:
+            connection.execute(statement)
+
+    def answers(self) -> bool:
+        """Whether it takes connections."""
+        try:
+            psycopg.connect(self._parameters("postgres")).close()
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    def _parameters(self, name: str) -> str:
+        return f"host={self.folder} user={self.user} dbname={name}"
+
+
+@contextlib.contextmanager
+def running() -> Iterator[Server]:
+    """A server, until the block ends. It refuses to run as root, who therefore starts it as user postgres."""
+    initdb = needed("initdb")
+    user = "postgres" if os.geteuid() == 0 else None
+    folder = Path(tempfile.mkdtemp(prefix="pg-"))
+    process = None
+    try:
+        if user:
+            shutil.chown(folder, user, user)
+        # Without its own name in the environment, libpq would read a home that is not the server's.
+        started = {"user": user, "group": user, "extra_groups": []} if user else {}
+        server = Server(folder, "postgres")
+        said = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
+        make = [initdb, "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8", "--locale=C"]
+        subprocess.run([*make, folder / "data"], check=True, timeout=PATIENCE_S, **said, **started)
+        settings = [word for name, value in OPTIONS.items() for word in ("-c", f"{name}={value}")]
+        command = [initdb.with_name("postgres"), "-D", folder / "data", "-k", folder, *settings]
+        process = subprocess.Popen(command, start_new_session=True, **said, **started)
+        _wait(server, process)
+        yield server
+    finally:
+        if process is not None:
+            _end(process)
+        shutil.rmtree(folder)
+
+
+def _wait(server: Server, process: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not server.answers():
+        assert process.poll() is None, "the PostgreSQL server ended"
+        assert time.monotonic() < end, "the PostgreSQL server does not answer"
+        time.sleep(0.05)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGINT)  # "fast": connections are cut
+    try:
+        process.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()

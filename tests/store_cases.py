@@ -1,0 +1,49 @@
+"""Messages and outcomes for tests of the store; nothing in them has a meaning."""
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import postgres
+
+from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome
+
+SYSTEMS = ("sqlite", "postgresql")
+
+_numbers = itertools.count()
+
+
+@contextmanager
+def addresses(system: str, folder: Path) -> Iterator[Callable[[], str]]:
+    """URLs of new, empty databases."""
+    if system == "sqlite":
+        yield lambda: f"sqlite:///{folder}/store-{next(_numbers)}.db"
+    else:
+        with postgres.running() as server:
+            yield lambda: server.database(f"store{next(_numbers)}")
+
+
+def incoming(servo: str, key: str, body: bytes, kind: Kind, received: float = 100.0, encoding: str = "") -> Incoming:
+    return Incoming(servo, kind, key, body, encoding, hashlib.sha256(body).digest(), received)
+
+
+def window(servo: str = "a", sequence: int = 1, body: bytes = b"samples", received: float = 100.0) -> Incoming:
+    plain = incoming(servo, f"boot/{sequence}", body, Kind.WINDOW, received)
+    return plain._replace(boot="boot", sequence=sequence, start=2.0 * sequence)
+
+
+def letter(servo: str = "a", body: bytes = b"hello", received: float = 100.0) -> Incoming:
+    return incoming(servo, hashlib.sha256(body).hexdigest(), body, Kind.LETTER, received)
+
+
+def proof(servo: str = "a", body: bytes = b"prove it", received: float = 100.0) -> Incoming:
+    return incoming(servo, f"proof {body!r}", body, Kind.PROOF, received)
+
+
+def outcome(claim: Claim, *evidence: Evidence, outgoing: tuple[bytes, ...] = (), **other: object) -> Outcome:
+    """One that covers everything of a claim."""
+    done = tuple(message.id for message in claim.messages)
+    values = {"state": b"state", "wake": None} | other
+    return Outcome(claim.servo, claim.serial, done=done, evidence=evidence, outgoing=outgoing, **values)
