@@ -226,6 +226,17 @@ def map_(
     stability_map(Request(servo, *axes, enter, leave, *runs), out, workers, scheduler)
 
 
+@app.command()
+def twin(
+    config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Instead of the file's; 0: any free one.")] = None,
+) -> None:
+    """The twin as a service: windows come in over HTTP, estimates are made and stored, updates go out."""
+    from servotwin.service.command import run
+
+    run(config, port)
+
+
 def main() -> None:
     """Entry point of the `servotwin` command."""
     app()

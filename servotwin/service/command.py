@@ -1,0 +1,138 @@
+"""`servotwin twin`: the service as a process."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import sqlalchemy as sa
+import uvicorn
+
+from servotwin.errors import InvalidInput
+from servotwin.service import logs
+from servotwin.service.config import ServiceConfig
+from servotwin.service.protocol import Protocol
+from servotwin.service.system import System
+from servotwin.service.twinfile import TwinFile, read_twin
+from servotwin.store.store import Store, open_store
+
+log = logging.getLogger(__name__)
+GRACE_S = 20
+"""s that requests may take to their end when the service is told to stop."""
+IDLE_S = 75
+"""s after which a connection that says nothing is closed."""
+
+
+def run(path: Path, port: int | None = None) -> None:
+    """Serve until a signal says stop; the address is printed as one line once requests are taken.
+
+    Raises
+    ------
+    InvalidInput
+        The file, the tokens, the store or the address are not usable.
+    """
+    twin = read_twin(path)
+    logs.configure(twin.service.log_level)
+    store = store_of(twin.service)
+    try:
+        with listening(twin.service, port) as listener:
+            serve(twin, store, listener)
+    finally:
+        store.close()
+
+
+def serve(twin: TwinFile, store: Store, listener: socket.socket) -> None:
+    """Serve on a socket that listens."""
+    if twin.service.tokens is None:
+        log.warning("no tokens: whoever reaches this machine itself may do everything")
+    _raise_file_limit()
+    system = System(twin, store)
+    asyncio.run(_Server(config_of(twin.service, system), system).serve([listener]))
+
+
+def store_of(config: ServiceConfig) -> Store:
+    """The store, open."""
+    address = config.store
+    if config.store_password is not None:
+        address = sa.make_url(address).set(password=config.store_password).render_as_string(hide_password=False)
+    return open_store(address)
+
+
+def listening(config: ServiceConfig, port: int | None = None) -> socket.socket:
+    """A socket at the service's address.
+
+    Raises
+    ------
+    InvalidInput
+        The address is taken, or is not this machine's.
+    """
+    where = config.bind, config.port if port is None else port
+    family = socket.AF_INET6 if ":" in config.bind else socket.AF_INET
+    try:
+        return socket.create_server(where, family=family, backlog=2048)
+    except OSError as error:
+        raise InvalidInput(f"bind = {where[0]!r}, port = {where[1]}: cannot listen there ({error.strerror})") from None
+
+
+def config_of(config: ServiceConfig, system: System) -> uvicorn.Config:
+    """How uvicorn serves it."""
+    return uvicorn.Config(
+        system.app,
+        http=Protocol,
+        ws="none",
+        lifespan="on",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        proxy_headers=False,
+        backlog=2048,
+        timeout_keep_alive=IDLE_S,
+        timeout_graceful_shutdown=GRACE_S,
+        ssl_certfile=config.tls_certificate,
+        ssl_keyfile=config.tls_key,
+    )
+
+
+class _Server(uvicorn.Server):
+    """Says where it is once it takes requests, and lets those that wait for messages go when it has to end."""
+
+    def __init__(self, config: uvicorn.Config, system: System) -> None:
+        super().__init__(config)
+        self._system = system
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Both signals mean: come to an end; it is a good one, so that they are not raised again afterwards."""
+        former = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for each in sockets or ():
+            print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._system.outgoing.close()
+        await super().shutdown(sockets)
+
+
+def _url(listener: socket.socket, tls: bool) -> str:
+    host, port = listener.getsockname()[:2]
+    return f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def _raise_file_limit() -> None:
+    """As many connections as the system lets one process have."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -1,0 +1,64 @@
+"""What goes to a worker and what comes back, in frames: a length in four bytes, then MessagePack; no pickles."""
+
+from __future__ import annotations
+
+from struct import Struct as Layout
+from typing import NamedTuple
+
+import msgspec
+
+from servotwin.store.rows import Claim, Outcome
+
+LENGTH = Layout("<I")
+
+
+class Start(NamedTuple):
+    """What a worker needs to know once.
+
+    Attributes
+    ----------
+    text : str
+        The twin's file.
+    source, folder : str
+        Its name in messages; paths in it are relative to the folder.
+    """
+
+    text: str
+    source: str
+    folder: str
+
+
+class Job(NamedTuple):
+    """Servos to be worked on one after the other; `now` in s: since the epoch, or sample time in lock-step."""
+
+    claims: tuple[Claim, ...]
+    now: float
+
+
+class Done(NamedTuple):
+    """What became of one claim.
+
+    Attributes
+    ----------
+    outcome : Outcome or None
+    error : str
+        Why there is none.
+    seconds : float
+        What it took.
+    """
+
+    outcome: Outcome | None
+    error: str
+    seconds: float
+
+
+_encoder = msgspec.msgpack.Encoder()
+start_of = msgspec.msgpack.Decoder(Start).decode
+job_of = msgspec.msgpack.Decoder(Job).decode
+done_of = msgspec.msgpack.Decoder(Done).decode
+
+
+def framed(message: Start | Job | Done) -> bytes:
+    """The message's frame."""
+    body = _encoder.encode(message)
+    return LENGTH.pack(len(body)) + body

@@ -1,0 +1,184 @@
+"""The service put together: what each part is given, how they begin and how they end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from contextlib import asynccontextmanager, suppress
+from functools import lru_cache, partial
+from typing import Any
+from uuid import uuid4
+
+from fastapi import FastAPI
+
+from servotwin.errors import InvalidInput
+from servotwin.service.app import make_app
+from servotwin.service.auth import Authority, TokenFile
+from servotwin.service.config import SQLITE
+from servotwin.service.dispatcher import Dispatcher, Parts
+from servotwin.service.edgeapi import EdgeApi, Gate
+from servotwin.service.future import REMEMBERED, Boots
+from servotwin.service.ingest import Clocks, Ingest
+from servotwin.service.landing import Landing
+from servotwin.service.limits import Bodies, Buckets
+from servotwin.service.metrics import Metrics
+from servotwin.service.outgoing import Outgoing
+from servotwin.service.pool import Pool
+from servotwin.service.proofs import Allowance
+from servotwin.service.readapi import ReadApi
+from servotwin.service.shelf import Shelf
+from servotwin.service.stepapi import StepApi
+from servotwin.service.twinfile import TwinFile
+from servotwin.store.errors import StoreUnavailable
+from servotwin.store.groupcommit import Bounds, GroupCommit
+from servotwin.store.retention import forget
+from servotwin.store.rows import Incoming, Outcome, Posted, Put
+from servotwin.store.store import Store
+from servotwin.twin.fleet import Fleet
+
+log = logging.getLogger(__name__)
+
+REFRESH_S, RETENTION_S, DAY = 1.0, 600.0, 86400.0
+ALONE = "twin"
+"""Borrows everything where one process has the store to itself: after a crash its loans are its own."""
+
+
+class System:
+    """One process of the service.
+
+    Parameters
+    ----------
+    twin : TwinFile
+    store : Store
+        Open; whoever opened it closes it, after `end`.
+    clocks : Clocks, optional
+    pool : Pool, optional
+        Replaces the one that the file describes.
+    """
+
+    def __init__(self, twin: TwinFile, store: Store, clocks: Clocks | None = None, pool: Pool | None = None) -> None:
+        self.config, self.store, self.clocks = twin.service, store, clocks or Clocks()
+        self.metrics, self.shelf, self._landing = Metrics(), Shelf(), Landing()
+        self.pool = pool or Pool(self.config.workers, twin.start, self.config.job_timeout_s)
+        self.tokens = None if self.config.tokens is None else TokenFile(self.config.tokens)
+        self.authority = Authority(None) if self.tokens is None else self.tokens.authority
+        alone, self._knows = self.config.store.startswith(SQLITE), knowing(twin.fleet)
+        self._owner = ALONE if alone else uuid4().hex
+        self.outgoing = Outgoing(self._posted, self.config.long_polls, None if alone else REFRESH_S)
+        self.commits = GroupCommit(store, Bounds(waiting=self.config.queue), self.clocks.wall)
+        self.ingest = self._ingest()
+        self._parts = Parts(store, self.shelf, self.pool, self._commit, self.outgoing.post, self.metrics, self.clocks)
+        self.dispatcher = Dispatcher(self._parts, self._owner, Allowance(self.config.proofs_per_minute))
+        self._tasks: list[asyncio.Task[None]] = []
+        self._watch()
+
+    @property
+    def app(self) -> FastAPI:
+        """The HTTP API; its lifespan begins and ends everything else."""
+        buckets = Buckets(self.config.rate_limit_per_s, self.config.rate_burst, self.clocks.monotonic)
+        gate, bodies = (
+            Gate(self.authority, self._knows, buckets),
+            Bodies(self.config.max_body_bytes, self.config.body_timeout_s),
+        )
+        edge = EdgeApi(gate, bodies, self.ingest, self.outgoing, self.dispatcher.poke)
+        read = ReadApi(self.authority, self.store, self.shelf, self.health, self.metrics, self.clocks.wall)
+        whole = gate, bodies, self.ingest, self._parts, self.dispatcher, self._owner
+        return make_app(edge, read, StepApi(*whole) if self.config.lockstep else None, self.metrics, self._lifespan)
+
+    async def begin(self) -> None:
+        """Take back what a crash left borrowed, start the workers, begin to work."""
+        if self._owner == ALONE:
+            await self.shelf.ask(partial(self.store.release, self._owner))
+        await self.pool.begin()
+        self._spawn(self._refresh())
+        if not self.config.lockstep:
+            self._spawn(self.dispatcher.run())
+        if not math.isinf(self.config.retention_days):
+            self._spawn(self._forget())
+
+    async def end(self) -> None:
+        """Commit what came, finish what is begun, end the workers."""
+        self.outgoing.close()
+        await self.dispatcher.stop()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.pool.end()
+        await asyncio.to_thread(self.commits.close)
+        self.shelf.close()
+
+    def health(self) -> dict[str, Any]:
+        """What is well."""
+        store, workers = not self.shelf.fault, self.pool.alive
+        working = all(not task.done() for task in self._tasks)
+        return {"ok": store and workers > 0 and working, "store": store, "workers": workers, "dispatching": working}
+
+    def _ingest(self) -> Ingest:
+        slack = math.inf if self.config.lockstep else self.config.future_slack_s
+        boots = Boots(self.config.speed, slack)
+        return Ingest(self._put, self._knows, boots, self.metrics, self.config.max_body_bytes, self.clocks)
+
+    async def _put(self, incoming: Incoming) -> Put:
+        return await self._landing(self.commits.put(incoming))
+
+    async def _commit(self, outcome: Outcome) -> bool:
+        return await self._landing(self.commits.commit(outcome))
+
+    async def _posted(self, servo: str, serial: int) -> Sequence[Posted]:
+        return await self.shelf.ask(lambda: self.store.outgoing(servo, serial))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        self._tasks.append(asyncio.create_task(work))
+
+    async def _refresh(self) -> None:
+        """Read the tokens again when their file is another one."""
+        while self.tokens is not None:
+            await asyncio.sleep(REFRESH_S)
+            self.tokens.refresh()
+        await asyncio.Event().wait()
+
+    async def _forget(self) -> None:
+        """Empty windows that are too old."""
+        while True:
+            before = self.clocks.wall() - self.config.retention_days * DAY
+            with suppress(StoreUnavailable):
+                done = await self.shelf.ask(partial(forget, self.store, before))
+                if done.emptied:
+                    log.info("windows forgotten", extra=done._asdict())
+            await asyncio.sleep(RETENTION_S)
+
+    def _watch(self) -> None:
+        """Gauges."""
+        watch = self.metrics.watch
+        watch(
+            "servotwin_commit_waiting",
+            "Messages and outcomes that wait for their commit.",
+            lambda: self.commits.waiting,
+        )
+        watch("servotwin_polls", "Polls that wait for a message.", lambda: self.outgoing.polls)
+        watch("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
+        watch("servotwin_store_ok", "Whether the store could do what it was asked last.", lambda: not self.shelf.fault)
+
+    @asynccontextmanager
+    async def _lifespan(self, _app: FastAPI) -> AsyncIterator[None]:
+        await self.begin()
+        try:
+            yield
+        finally:
+            await self.end()
+
+
+def knowing(fleet: Fleet) -> Callable[[str], bool]:
+    """Whether a fleet has a servo of that name."""
+
+    @lru_cache(maxsize=REMEMBERED)
+    def knows(servo: str) -> bool:
+        try:
+            fleet.model_of(servo)
+        except InvalidInput:
+            return False
+        return True
+
+    return knows
