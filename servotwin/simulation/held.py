@@ -65,7 +65,7 @@ class Held:
         engine.parameters = _HELD._replace(feedforward=voltage)
         engine.make_room(base + 1)
         if base in self._changes:
-            self._put_back()
+            engine.draws.put_back(self._drive.noise[base - self._first :])
             engine.advance(base + 1)
             self._lay_out()
             return
@@ -84,11 +84,6 @@ class Held:
         self._drive = self._engine.drive(first, last)
         self._changes = {base for base, _ in self._engine.knots(last)}
         self._reference, self._noise = self._drive.reference.tolist(), self._drive.noise.tolist()
-
-    def _put_back(self) -> None:
-        """The noise that was drawn for the present sample and later."""
-        here = self._engine.base - self._first
-        self._engine.drawn = np.concatenate([self._drive.noise[here:], self._engine.drawn])
 
 
 def _rounded(value: float, resolution: float) -> float:

@@ -69,8 +69,8 @@ class SampledEngine:
         self.scratch = new_scratch(self.tables)
         self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
         self.parameters = self.controller.law(None)
-        self.source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
-        self.drawn = np.zeros(0)
+        source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
+        self.draws = kept.Draws(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = kept.new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
@@ -148,17 +148,7 @@ class SampledEngine:
             zero = tolerance == 0.0
             enter = np.where(zero, -1.0, self.controller.enter * tolerance)
             leave = np.where(zero, -1.0, self.controller.leave * tolerance)
-        return Drive(first, self.inputs.reference.on(times), self._noise(count), enter, leave)
-
-    def _noise(self, count: int) -> Array:
-        """Noise of the next ticks; those that a change of controller looked at are `drawn` already."""
-        if self.source is None:
-            return np.zeros(count)
-        if (missing := count - self.drawn.size) > 0:
-            ahead = missing if self.keep is None else max(missing, _CHUNK)
-            self.drawn = np.concatenate([self.drawn, self.source.block(ahead)])
-        values, self.drawn = self.drawn[:count], self.drawn[count:]
-        return values
+        return Drive(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
 
     def _run(self, end: int) -> None:
         while self.base < end:
@@ -219,7 +209,8 @@ class SampledEngine:
         tick = -(-self.base // self.tick_every)
         time = tick / self.tick_rate
         planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
-        self.drawn = noise = self._noise(1)
+        noise = self.draws.take(1)
+        self.draws.put_back(noise)
         measured = float(self.plant.rows["position"][0] @ self.state + noise[0])
         self.law_state = law.transfer(
             self.controller.law(planned),
