@@ -81,7 +81,15 @@ def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
         if estimator is not None:
             estimator = msgspec.convert(estimator, METHODS[values["method"]].settings)
         return servo, msgspec.convert(values, TwinSettings).replace(estimator=estimator)
-    except (msgspec.MsgspecError, ValueError, SyntaxError, KeyError, TypeError, RecursionError) as error:
+    except (
+        msgspec.MsgspecError,
+        ValueError,
+        SyntaxError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise InvalidInput(f"the context's model or settings are not understood: {error}") from None
 
 
