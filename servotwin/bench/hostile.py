@@ -18,9 +18,10 @@ from functools import cache
 import numpy as np
 
 from servotwin.bench.hostiletwin import HostileTwin, Kind
-from servotwin.cosim.driver import Cosimulation, simulation_of
+from servotwin.cosim.driver import Cosimulation
 from servotwin.edge.watch import WatchSettings
 from servotwin.hybrid.automaton import Array
+from servotwin.machine import simulation_of
 from servotwin.messages import Band, Cause, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave

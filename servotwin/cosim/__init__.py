@@ -1,8 +1,9 @@
 """Plant, edge, link and twin under one virtual clock."""
 
-from servotwin.cosim.driver import Cosimulation, Machine, cosimulate, simulation_of
+from servotwin.cosim.driver import Cosimulation, Machine, cosimulate
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.quantisation import Quantisation, quantisation
+from servotwin.machine import simulation_of
 
 __all__ = [
     "Cosimulation",
