@@ -100,6 +100,17 @@ def simulate(
 
 
 @app.command()
+def convert(
+    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    output: Annotated[Path, typer.Argument(help="run.csv, which an edge can replay, run.npz or run.parquet.")],
+) -> None:
+    """A recorded log in another format."""
+    from servotwin.record import convert as run
+
+    run(log, output)
+
+
+@app.command()
 def identify(
     log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
     servo: Annotated[

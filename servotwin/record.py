@@ -1,4 +1,4 @@
-"""`servotwin simulate`: one scenario, run and written as a table of signals."""
+"""`servotwin simulate` and `convert`: a table of signals, of one scenario that is run or of a log in another format."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import servotwin as st
 from servotwin import outputs
 from servotwin.cosim import Loop
 from servotwin.errors import InvalidInput
+from servotwin.logfile import read_log
 
 _ROWS = 20_000  # of a CSV file written at a time
 
@@ -59,6 +60,25 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     with outputs.written(output) as temporary:
         write(found, temporary)
     (console or Console()).print(f"{_rows(found)} samples: {output}", soft_wrap=True, highlight=False)
+    return output
+
+
+def convert(log: Path, output: Path) -> Path:
+    """A log in another format, with what its windows are made of: a gateway replays .csv only.
+
+    Raises
+    ------
+    InvalidInput
+        The log is not one, or the output cannot be written.
+    """
+    write = writer(output)
+    found = read_log(log)
+    whole = found.whole
+    columns = {"time_s": whole.time, "measured_position_m": whole.position}
+    others = {"theta_m_rad": whole.theta_m, "voltage_v": whole.voltage, "reference_m": whole.reference}
+    columns |= {name: values for name, values in others.items() if values is not None}
+    with outputs.written(output) as temporary:
+        write(Recording(columns, found.metadata), temporary)
     return output
 
 

@@ -1,0 +1,213 @@
+"""A recorded log in place of a machine, in the role supervise: what twin and edge would have made of it.
+
+The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, reference_m, theta_m_rad, voltage_v, and
+measured_position_m or position_m. Logs of other kinds become one by `servotwin convert LOG LOG.csv`, where numpy is.
+Parameters are taken and noted, and change nothing: the samples are what they were.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import islice
+from math import isfinite
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+from servotwin.edge.drive import Block, DriveLost
+from servotwin.edge.parameters import Parameters
+from servotwin.errors import InvalidInput
+
+COLUMNS = ("time_s", "reference_m", "theta_m_rad", ("measured_position_m", "position_m"), "voltage_v")
+"""What is read; of two names the first one that is there."""
+
+JITTER = 0.05
+"""Of a sample interval: how far rounded time stamps may be from a uniform grid."""
+
+NOTED = 1000
+"""Parameters that are remembered as written."""
+
+
+class Written(NamedTuple):
+    """Parameters that a log was given, and the sample from which they would have held."""
+
+    number: int
+    parameters: Parameters
+
+
+class Extent(NamedTuple):
+    """A log as a whole: samples, and Hz."""
+
+    samples: int
+    rate: float
+
+
+class Replay:
+    """`edge.drive.SupervisedDrive` of a log.
+
+    Parameters
+    ----------
+    path : path
+        NAME.csv.
+    speed : float
+        Seconds of the log per second; 0: as fast as it is read.
+    loop : bool
+        Begin again at the end. Between two rounds one number is left out, so that the reader knows that samples do not
+        follow one another there.
+    block_s : float
+        s of the log in one block where the reader does not say.
+    clock, sleep : callable
+        Monotonic seconds, and how to wait for some.
+    """
+
+    can_move = False
+    lag = 0.0
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        speed: float = 1.0,
+        loop: bool = False,
+        block_s: float = 0.05,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._path, self._speed, self._loop, self._block_s = Path(path), speed, loop, block_s
+        self._clock, self._sleep = clock, sleep
+        self._extent = Extent(0, 0.0)
+        self._file: TextIO | None = None
+        self._rows: Iterator[tuple[float, ...]] = iter(())
+        self._number = self._version = 0
+        self.written: deque[Written] = deque(maxlen=NOTED)
+
+    @property
+    def rate(self) -> float:
+        """Hz."""
+        return self._extent.rate
+
+    @property
+    def machine(self) -> str:
+        """The log's name."""
+        return self._path.name
+
+    def connect(self) -> None:
+        """Read the whole log once to see that it is one, then begin with its first sample.
+
+        Raises
+        ------
+        InvalidInput
+            It is missing, damaged somewhere, lacks a column, or its times are not uniform.
+        """
+        self.close()
+        self._extent = extent(self._path)
+        self._begin()
+        self._zero = self._clock() - (self._number / (self.rate * self._speed) if self._speed else 0.0)
+
+    def read(self, most: int = 0) -> Block | None:
+        """The next samples, when the last of them is due."""
+        if self._file is None:
+            raise DriveLost(f"log {self._path}: not connected")
+        rows = list(islice(self._rows, most or max(1, round(self._block_s * self.rate))))
+        if not rows and self._loop:
+            self._number += 1
+            self._begin()
+            return self.read(most)
+        if not rows:
+            return None
+        first, self._number = self._number, self._number + len(rows)
+        if self._speed:
+            self._sleep(max(0.0, self._zero + self._number / (self.rate * self._speed) - self._clock()))
+        return Block(first, self._version, *(array("d", signal) for signal in list(zip(*rows, strict=True))[1:]))
+
+    def write(self, parameters: Parameters) -> None:
+        """Note them; the log's samples carry their version from here on and are what they were."""
+        self._version = parameters.version
+        self.written.append(Written(self._number, parameters))
+
+    def move(self, _offset: float) -> None:
+        """Nothing: the past cannot be moved."""
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _begin(self) -> None:
+        self.close()
+        self._file = opened(self._path)
+        self._rows = rows(self._path, self._file)
+
+
+def opened(path: Path) -> TextIO:
+    """A log's file.
+
+    Raises
+    ------
+    InvalidInput
+        It cannot be read, or is of another kind.
+    """
+    if path.suffix != ".csv":
+        made = f"servotwin convert {path} {path.with_suffix('.csv')}"
+        raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not allowed; give a .csv, for example by {made}")
+    try:
+        return path.open(encoding="utf-8-sig")
+    except OSError as error:
+        raise InvalidInput(f"log {path}: cannot be read ({error.strerror})") from None
+
+
+def extent(path: Path) -> Extent:
+    """How many samples a log has and at which rate, after a look at every one of them."""
+    with opened(path) as file:
+        times = array("d", (row[0] for row in rows(path, file)))
+    if len(times) < 2:
+        raise InvalidInput(f"log {path}: has {len(times)} samples; at least 2 are needed")
+    interval = (times[-1] - times[0]) / (len(times) - 1)
+    for index, at in enumerate(times):
+        if not abs(at - (times[0] + index * interval)) < JITTER * interval:
+            raise InvalidInput(f"log {path}: time_s = {at!r} s at sample {index}: must be increasing, uniformly spaced")
+    return Extent(len(times), float(f"{1.0 / interval:.9g}"))
+
+
+def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
+    """(time, reference, theta_m, position, voltage) of each line.
+
+    Raises
+    ------
+    InvalidInput
+        A column is missing, or a line is no row of finite numbers.
+    """
+    try:
+        line, number = file.readline(), 1
+        if line.startswith("#"):
+            line, number = file.readline(), 2
+        places = _places(path, [name.strip() for name in line.split(",")])
+        for number, line in enumerate(file, number + 1):  # noqa: B020
+            yield _numbers(path, number, line.split(","), places)
+    except UnicodeDecodeError as error:
+        raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
+
+
+def _places(path: Path, names: list[str]) -> list[int]:
+    """Where each column is."""
+    places = []
+    for wanted in COLUMNS:
+        allowed = (wanted,) if isinstance(wanted, str) else wanted
+        found = next((name for name in allowed if name in names), None)
+        if found is None:
+            raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
+        places.append(names.index(found))
+    return places
+
+
+def _numbers(path: Path, number: int, cells: list[str], places: list[int]) -> tuple[float, ...]:
+    try:
+        values = tuple(float(cells[place]) for place in places)
+    except (ValueError, IndexError):
+        values = ()
+    if not values or not all(map(isfinite, values)):
+        raise InvalidInput(f"log {path}: line {number} must hold finite numbers, {len(cells)} cells were found")
+    return values
