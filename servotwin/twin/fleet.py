@@ -29,7 +29,6 @@ from pathlib import Path
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.errors import InvalidInput
-from servotwin.identify.disturbance import disturbance
 from servotwin.messages import NAME_PATTERN
 from servotwin.plant import servofile
 from servotwin.plant.servo import PRESETS, Servo
@@ -39,7 +38,6 @@ from servotwin.twin import settingsfile
 from servotwin.twin.estimating import Estimator, estimator_of
 from servotwin.twin.inforce import InForce
 from servotwin.twin.policies import certified, policy_of
-from servotwin.twin.requests import requests_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.twin import Twin
@@ -82,19 +80,8 @@ class Model:
         InvalidInput
             The state is not understood or another servo's, or the policy cannot design for the controller.
         """
-        twin = Twin(
-            servo,
-            _estimator(self),
-            _policy(self),
-            store,
-            self.settings,
-            partial(disturbance, servo=self.servo),
-            None if state else self.begins,
-            requests_of(servo, self.servo, self.settings),
-        )
-        if state:
-            twin.restore(state)
-        return twin
+        begins = None if state else self.begins
+        return Twin.of(servo, self.servo, store, self.settings, _estimator(self), begins, state, _policy(self))
 
 
 @dataclass(frozen=True)

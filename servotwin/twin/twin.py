@@ -101,8 +101,9 @@ class Twin:
         estimator: Estimator | None = None,
         start: InForce | None = None,
         state: bytes | None = None,
+        policy: Policy | None = None,
     ) -> Twin:
-        """The twin that `settings` describe, for a servo of that name and model; `estimator` replaces theirs.
+        """The twin that `settings` describe, for a servo of that name and model; `estimator`, `policy` replace theirs.
 
         The model's controller is the one that runs: policies design for it.
         Without `start` the edge is taken to begin with the servo's own controller.
@@ -113,12 +114,11 @@ class Twin:
         InvalidInput
             The state is not understood, or another servo's.
         """
-        policy = policy_of(servo, settings)
-        begins = start or InForce(servo.controller)
+        begins, redesigns = start or InForce(servo.controller), policy or policy_of(servo, settings)
         chosen = estimator or estimator_of(servo, settings)
         asks = requests_of(name, servo, settings)
         triage = None if settings.triage is None else Triage(servo, settings.triage)
-        twin = cls(name, chosen, policy, store, settings, partial(disturbance, servo=servo), begins, asks, triage)
+        twin = cls(name, chosen, redesigns, store, settings, partial(disturbance, servo=servo), begins, asks, triage)
         if state:
             twin.restore(state)
         return twin
@@ -155,7 +155,8 @@ class Twin:
         """
         self._check(message)
         if isinstance(message, WindowMessage):
-            return self._window(message, now)
+            said: list[Message] = [Acknowledge(message.servo, message.boot, message.sequence)]
+            return said + self.learn(message, now) if self._store.add_window(message) else said
         self._steady(now)
         if isinstance(message, Receipt):
             self._store.add_receipt(message)
@@ -179,11 +180,6 @@ class Twin:
         self._steady(now)
         asked = [] if self._requests is None else self._requests.wake(now)
         return [*self._delivery.wake(self._versions, now), *asked]
-
-    def _window(self, message: WindowMessage, now: float) -> list[Message]:
-        new = self._store.add_window(message)
-        acknowledge = Acknowledge(message.servo, message.boot, message.sequence)
-        return [acknowledge, *self.learn(message, now)] if new else [acknowledge]
 
     def learn(self, message: WindowMessage, now: float, arrived: float | None = None) -> list[Message]:
         """What to send after a window that is safe already, and new.
