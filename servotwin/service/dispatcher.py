@@ -217,7 +217,7 @@ class Dispatcher:
         """A worker found no outcome: the next one is told how many did, and gives a message up at last."""
         self._faults[claim.servo] += 1
         self._parts.metrics.outcomes.add("failed")
-        about = {"servo": claim.servo, "message": claim.messages[0].id if claim.messages else 0}
+        about = {"servo": claim.servo, "message_id": claim.messages[0].id if claim.messages else 0}
         log.error("work failed", extra={**about, "faults": self._faults[claim.servo], "why": why})
         self._returns.add(claim.servo)
 
@@ -245,5 +245,5 @@ class Dispatcher:
 
 def _ids(found: Evidence) -> dict[str, object]:
     """Of which window, under which version, in which context."""
-    known = {"message": found.message, "version": found.version, "status": found.status, "context": found.context}
+    known = {"message_id": found.message, "version": found.version, "status": found.status, "context": found.context}
     return {key: value for key, value in known.items() if value not in (None, "")}

@@ -31,6 +31,9 @@ from servotwin.store.rows import Incoming, Kind, Put
 LETTERS = (Hello, Receipt, Fallback, Answer)
 
 
+_PIECE = 2047
+
+
 class Clocks(NamedTuple):
     """Time as the service sees it: since the epoch, and the one that never steps, both in s."""
 
@@ -151,7 +154,15 @@ def acknowledgement(window: Window) -> bytes:
 
 
 def _digest(data: bytes) -> bytes:
-    return blake2b(data, digest_size=16).digest()
+    """Of the whole, in pieces so small that hashlib keeps the interpreter to itself.
+
+    With larger ones it lets another thread in, and the event loop gets its turn again after that thread's: 270 us
+    instead of 25 for 20 kB while commits are being written.
+    """
+    whole, digest = memoryview(data), blake2b(digest_size=16)
+    for begin in range(0, len(data), _PIECE):
+        digest.update(whole[begin : begin + _PIECE])
+    return digest.digest()
 
 
 def _kind(message: Message) -> str:
