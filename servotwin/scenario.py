@@ -16,12 +16,14 @@ from servotwin import scenariofile
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.limits import Limits
+from servotwin.edge.noveltyrules import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
+from servotwin.novelty import model_of
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
@@ -257,8 +259,15 @@ class Scenario:
             retry=r.retry,
             limits=r.limits,
             model_version=self.servo.version,
+            novelty=self._novelty(),
             **r.requests,
         )
+
+    def _novelty(self) -> NoveltySettings | None:
+        """What the edge needs to tell which windows are worth sending."""
+        rules = self.recording.novelty
+        model = None if rules is None else model_of(self.servo, self.recording.sample_rate)
+        return None if rules is None or model is None else NoveltySettings(model, rules, self.twin.initial_gap)
 
     def seed_of(self, source: str) -> int:
         """The seed of one named source of randomness: the same for equal (seed, name, source), on every machine."""

@@ -10,8 +10,10 @@ from typing import Any
 
 from servotwin.control import controllerfile
 from servotwin.control.controller import Controller
+from servotwin.edge import noveltyfile
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.limits import Limits
+from servotwin.edge.noveltyrules import NoveltyRules
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.link.session import Retry
@@ -46,6 +48,8 @@ class Recording:
         When a window without acknowledgement is sent again.
     limits : Limits
         What an update must respect.
+    novelty : NoveltyRules, optional
+        Which windows the edge finds worth sending; None: every one. In a file, [novelty].
     fine_angle : bool
         Whether theta_m travels with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the
         estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do.
@@ -60,6 +64,7 @@ class Recording:
     longest_window: float | None = None
     longest_pre_trigger: float | None = None
     probe: ProbeLimits | None = None
+    novelty: NoveltyRules | None = None
 
     @property
     def requests(self) -> dict[str, Any]:
@@ -85,7 +90,7 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "theta_d0": table.number("theta_d0_deg", 0.0) * DEG,
         "reference": part(table, "reference", _reference),
         "gap": part(table, "gap", _gap),
-        "recording": replace(part(table, "recording", _recording), probe=_probe(table)),
+        "recording": replace(part(table, "recording", _recording), probe=_probe(table), novelty=_novelty(table)),
         "twin": part(table, "twin", twinfile.twin),
         **part(table, "disturbances", _disturbances),
     }
@@ -243,6 +248,12 @@ def _probe(table: Table) -> ProbeLimits | None:
     """[edge.probe]: the twin may request probing moves of the reference."""
     inner = table.table("edge")
     return part(inner, "probe", edgefile.probe) if "probe" in inner.values else None
+
+
+def _novelty(table: Table) -> NoveltyRules | None:
+    """[novelty]: the edge tells what is worth sending; an empty table takes the defaults."""
+    rules = part(table, "novelty", noveltyfile.rules)
+    return rules if "novelty" in table.values else None
 
 
 def _disturbances(table: Table) -> dict[str, float]:

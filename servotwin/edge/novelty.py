@@ -4,7 +4,7 @@ What counts is the change since the twin was last told: the baseline begins anew
 stands on, and at each that was sent as news. A window that says nothing of the gap moves nothing.
 """
 
-from math import inf
+from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 import msgspec
@@ -14,7 +14,7 @@ from servotwin.edge.cut import Cut
 from servotwin.edge.lostmotion import rests
 from servotwin.edge.noveltychart import Chart, begun, learnt, look
 from servotwin.edge.noveltyrules import NoveltyRules, NoveltySettings
-from servotwin.edge.noveltyscore import Score, score
+from servotwin.edge.noveltyscore import Offset, Score, score
 from servotwin.errors import InvalidInput
 
 PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
@@ -24,6 +24,7 @@ TIMED = "timed"
 """Why a window was cut that nothing but time led to."""
 
 _KEPT = 8  # windows that an update may stand on
+_WIDEST = 1.0  # rad: a spread beyond says nothing
 _STILL = 0.2  # of the margin: what moves less rests
 
 
@@ -56,6 +57,10 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1"):
         rad, leads at rest; high below low: none yet.
     bound : float
         rad, lost motion that the twin was told of.
+    offset : (float, float) or None
+        rad, the encoder's, and its standard deviation; None: no window of this boot has shown it.
+    noise : float
+        m, what the last fit left; 0: not known.
     """
 
     gap: float
@@ -69,6 +74,8 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1"):
     low: float = inf
     high: float = -inf
     bound: float = 0.0
+    offset: tuple[float, float] | None = None
+    noise: float = 0.0
 
 
 class Verdict(NamedTuple):
@@ -120,22 +127,57 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Judged:
     settings : NoveltySettings
     """
     rules, model = settings.rules, settings.model
-    theta_m, position = cut.signals["theta_m"], cut.signals["position"]
-    state = _rested(_updated(state, cut, rules), rests(theta_m, position, model.rate, model.static_gain, _still(rules)))
-    found = score(theta_m, position, model, state.gap)
-    if found is None or found.travel < rules.travel:
+    leads = rests(cut.signals["theta_m"], cut.signals["position"], model.rate, model.static_gain, _still(rules))
+    state = _rested(_updated(state, cut, rules), leads)
+    found = _read(state, cut, settings)
+    if found is None:
         return _silent(state, cut, settings)
     variance = found.std * found.std + rules.resolution * rules.resolution
     seen = look(state.chart, found.gap, variance, rules)
-    recent = (*state.recent, Recent(cut.sequence, found.gap, variance))[-_KEPT:]
-    state = structs.replace(state, gap=max(0.0, found.gap), chart=seen.chart, silent=0, recent=recent)
-    news = LOST_MOTION if _lost(state, rules) else SCORE if seen.sudden else CUSUM if seen.slow else ""
+    news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
+    state = _taught(state, cut, found, variance, rules)
+    state = structs.replace(state, chart=learnt(begun(seen.chart), found.gap, variance) if news else seen.chart)
     reason = _reason(state, cut, settings, news)
     if news:
-        state = structs.replace(state, chart=learnt(begun(state.chart), found.gap, variance), owed=_owed(news, rules))
+        state = structs.replace(state, owed=0 if news == CUSUM else rules.confirm)
     elif state.owed and reason:
         state = structs.replace(state, owed=state.owed - 1)
     return Judged(_sent(state, cut, settings, reason), Verdict(reason, found, seen.change, _range(state)))
+
+
+def _taught(state: NoveltyState, cut: Cut, found: Score, variance: float, rules: NoveltyRules) -> NoveltyState:
+    """What a window says beside the chart."""
+    return structs.replace(
+        state,
+        gap=max(0.0, found.gap),
+        silent=0,
+        recent=(*state.recent, Recent(cut.sequence, found.gap, variance))[-_KEPT:],
+        offset=_carried(state.offset, found.offset, rules),
+        noise=found.noise,
+    )
+
+
+def _read(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Score | None:
+    """What it says by itself, otherwise with the encoder's offset as known; None: nothing."""
+    signals, least = (cut.signals["theta_m"], cut.signals["position"]), settings.rules.travel
+    alone = score(*signals, settings.model, state.gap, usual=state.noise)
+    if alone is not None and min(alone.travel) >= least and alone.std < _WIDEST:
+        return alone
+    if state.offset is None:
+        return None
+    carried = score(*signals, settings.model, state.gap, Offset(*state.offset), state.noise)
+    return carried if carried is not None and max(carried.travel) >= least and carried.std < _WIDEST else None
+
+
+def _carried(known: tuple[float, float] | None, read: Offset, rules: NoveltyRules) -> tuple[float, float] | None:
+    """The offset with one more reading, which may have moved by the resolution since the last."""
+    if not read.std < inf:
+        return known
+    if known is None:
+        return read.value, hypot(read.std, rules.resolution)
+    before, new = (std * std + rules.resolution * rules.resolution for std in (known[1], read.std))
+    share = before / (before + new)
+    return known[0] + share * (read.value - known[0]), sqrt(share * new)
 
 
 def _silent(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Judged:
@@ -165,10 +207,6 @@ def _sent(state: NoveltyState, cut: Cut, settings: NoveltySettings, reason: str)
     return structs.replace(state, sent=cut.last / settings.model.rate, bound=max(state.bound, _range(state)))
 
 
-def _owed(news: str, rules: NoveltyRules) -> int:
-    return 0 if news == CUSUM else rules.confirm
-
-
 def _updated(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> NoveltyState:
     """With the update accepted since the last window: the baseline begins at the window it stands on."""
     if cut.parameter_version == state.version:
@@ -176,9 +214,7 @@ def _updated(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> NoveltyState
     state = structs.replace(state, version=cut.parameter_version)
     if cut.gap is None:
         return state
-    return structs.replace(
-        state, chart=_rebased(state, cut, rules), told=cut.gap, owed=0, low=inf, high=-inf, bound=0.0
-    )
+    return structs.replace(state, chart=_rebased(state, cut, rules), told=cut.gap, owed=0)
 
 
 def _rebased(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:

@@ -1,6 +1,6 @@
 """Least squares and autoregressions of short lists of floats."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import inf, log, sqrt
 from operator import mul
 from typing import NamedTuple
@@ -21,39 +21,51 @@ class Fit(NamedTuple):
     ----------
     coefficients : list of float
         One for each column; 0 for one that depends on those before it.
-    deviation : float
-        Of the last coefficient, for white noise of variance 1; inf: nothing shows it.
     residual : list of float
         What is left of the target.
+    places : list of int
+        The columns that depend on none before them.
+    triangle : list of lists
+        Column k of the upper triangle that turns orthonormal columns into those.
     """
 
     coefficients: list[float]
-    deviation: float
     residual: list[float]
+    places: list[int]
+    triangle: list[list[float]]
+
+    def deviation(self, weights: Mapping[int, float]) -> float:
+        """Of a weighted sum of coefficients, for white noise of variance 1; inf: nothing shows one of them."""
+        if any(weight != 0.0 and place not in self.places for place, weight in weights.items()):
+            return inf
+        found: list[float] = []
+        for place, column in zip(self.places, self.triangle, strict=True):
+            found.append((weights.get(place, 0.0) - dot(column[:-1], found)) / column[-1])
+        return sqrt(dot(found, found))
 
 
 def fit(columns: Sequence[Row], target: Row) -> Fit:
     """Least squares by Gram and Schmidt's method, each column twice."""
-    basis: list[tuple[int, list[float]]] = []
+    basis: list[list[float]] = []
+    places: list[int] = []
     triangle: list[list[float]] = []
     for place, column in enumerate(columns):
         shares, left = _off(basis, column)
         length = sqrt(dot(left, left))
         if length > _DEPENDENT * sqrt(dot(column, column)):
-            basis.append((place, [x / length for x in left]))
+            basis.append([x / length for x in left])
             triangle.append([*shares, length])
+            places.append(place)
     shares, left = _off(basis, target)
-    last = bool(basis) and basis[-1][0] == len(columns) - 1
-    found = dict(zip((place for place, _ in basis), _back(triangle, shares), strict=True))
-    coefficients = [found.get(place, 0.0) for place in range(len(columns))]
-    return Fit(coefficients, 1.0 / triangle[-1][-1] if last else inf, left)
+    found = dict(zip(places, _back(triangle, shares), strict=True))
+    return Fit([found.get(place, 0.0) for place in range(len(columns))], left, places, triangle)
 
 
-def _off(basis: Sequence[tuple[int, Row]], row: Row) -> tuple[list[float], list[float]]:
+def _off(basis: Sequence[Row], row: Row) -> tuple[list[float], list[float]]:
     """A row's shares along orthonormal ones, and what is left of it."""
     shares, left = [0.0] * len(basis), list(row)
     for _ in range(2):
-        for k, (_, known) in enumerate(basis):
+        for k, known in enumerate(basis):
             share = dot(known, left)
             shares[k] += share
             left = [x - share * y for x, y in zip(left, known, strict=True)]

@@ -3,19 +3,28 @@
 The baseline is the weighted mean of all windows since it began; a window is compared with those before it, and then
 learnt. Such recursive residuals are independent with one variance, however few windows the baseline stands on, so the
 limits mean the same from the second window on (Hawkins 1987). What the model has wrong shifts every window alike and
-is in the baseline; what it scatters beyond the windows' own spread is learnt as a factor of that spread, never below 1.
+is in the baseline. What it scatters beyond the windows' own spread is learnt as a factor of that, never below 1: from
+the median of second differences, which neither steady wear nor a single step moves.
 """
 
 from math import copysign, log1p, sqrt
+from statistics import median
 from typing import NamedTuple
 
 from msgspec import Struct, structs
 
 from servotwin.edge.noveltyrules import NoveltyRules
 
-_TRUSTED = 10.0  # windows that the stated spread counts as
-_MOST = 100.0  # windows that what was learnt of the spread counts as
-_CLIPPED = 3.0  # standard deviations that one window teaches at most
+_QUARTILE = 0.6744897501960817  # of a standard normal: the median of its size
+_PRIOR, _MOST = 5, 40  # second differences that the stated spread counts as; that are kept
+_TRUSTED, _EACH = 10.0, 0.35  # degrees of freedom of the stated spread, and of one second difference in a median
+
+
+class Seen(Struct, frozen=True, array_like=True):
+    """A window's gap (rad) and its variance (rad^2)."""
+
+    gap: float
+    variance: float
 
 
 class Chart(Struct, frozen=True):
@@ -25,18 +34,33 @@ class Chart(Struct, frozen=True):
     ----------
     gap, weight : float
         rad, the baseline, and 1/rad^2, one over its variance; 0: none yet.
-    scale, freedom : float
-        Square of the factor on the windows' own spreads, and how many windows it stands on.
+    anchor : float
+        rad, the baseline where it began.
     up, down : float
         Cumulative sums, standard deviations.
+    last : tuple of Seen
+        The last two windows, whatever the baseline.
+    bends : tuple of float
+        Sizes of the last second differences, standard deviations.
     """
 
     gap: float = 0.0
     weight: float = 0.0
-    scale: float = 1.0
-    freedom: float = _TRUSTED
+    anchor: float = 0.0
     up: float = 0.0
     down: float = 0.0
+    last: tuple[Seen, ...] = ()
+    bends: tuple[float, ...] = ()
+
+    @property
+    def factor(self) -> float:
+        """Of the windows' own spreads, at least 1."""
+        return max(1.0, median((*self.bends, *(_QUARTILE,) * _PRIOR)) / _QUARTILE)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the factor has."""
+        return _TRUSTED + _EACH * len(self.bends)
 
 
 class Looked(NamedTuple):
@@ -50,29 +74,39 @@ class Looked(NamedTuple):
 
 def look(chart: Chart, gap: float, variance: float, rules: NoveltyRules) -> Looked:
     """Compare a window (rad, rad^2) with the baseline, then learn it."""
-    if chart.weight == 0.0:
-        return Looked(learnt(chart, gap, variance), 0.0, sudden=False, slow=False)
-    raw = (gap - chart.gap) / sqrt(variance + 1.0 / chart.weight)
-    change = normal(raw / sqrt(max(chart.scale, 1.0)), chart.freedom)
-    up = max(0.0, chart.up + change - rules.allowance)
-    down = max(0.0, chart.down - change - rules.allowance)
-    square = min(raw * raw, _CLIPPED * _CLIPPED * max(chart.scale, 1.0))
-    scale = (chart.freedom * chart.scale + square) / (chart.freedom + 1.0)
-    freedom = min(chart.freedom + 1.0, _MOST)
-    after = structs.replace(chart, scale=scale, freedom=freedom, up=up, down=down)
+    change = up = down = 0.0
+    if chart.weight > 0.0:
+        raw = (gap - chart.gap) / sqrt(variance + 1.0 / chart.weight)
+        change = normal(raw / chart.factor, chart.freedom)
+        up = max(0.0, chart.up + change - rules.allowance)
+        down = max(0.0, chart.down - change - rules.allowance)
+    after = structs.replace(_bent(chart, Seen(gap, variance)), up=up, down=down)
+    worth = abs(gap - chart.anchor) >= rules.worth
     sudden, slow = abs(change) > rules.score_limit, max(up, down) > rules.cusum_limit
-    return Looked(learnt(after, gap, variance), change, sudden, slow)
+    return Looked(learnt(after, gap, variance), change, sudden and worth, slow and worth)
+
+
+def _bent(chart: Chart, new: Seen) -> Chart:
+    """With one more second difference."""
+    last = (*chart.last, new)[-3:]
+    if len(last) < 3:
+        return structs.replace(chart, last=last)
+    first, second, third = last
+    size = abs(first.gap - 2.0 * second.gap + third.gap)
+    bend = size / sqrt(first.variance + 4.0 * second.variance + third.variance)
+    return structs.replace(chart, last=last[1:], bends=(*chart.bends, bend)[-_MOST:])
 
 
 def learnt(chart: Chart, gap: float, variance: float) -> Chart:
     """With one more window in the baseline."""
     weight = chart.weight + 1.0 / variance
-    return structs.replace(chart, gap=chart.gap + (gap - chart.gap) / (variance * weight), weight=weight)
+    mean = chart.gap + (gap - chart.gap) / (variance * weight)
+    return structs.replace(chart, gap=mean, weight=weight, anchor=chart.anchor if chart.weight > 0.0 else mean)
 
 
 def begun(chart: Chart, gap: float = 0.0, weight: float = 0.0) -> Chart:
     """Another baseline; what was learnt of the spread stays, sums begin anew."""
-    return Chart(gap, weight, chart.scale, chart.freedom)
+    return structs.replace(chart, gap=gap, weight=weight, anchor=gap, up=0.0, down=0.0)
 
 
 def normal(student: float, freedom: float) -> float:

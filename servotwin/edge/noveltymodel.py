@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, repeat
-from math import isfinite
+from math import hypot, isfinite
 from operator import mul
 from typing import NamedTuple
 
@@ -54,7 +54,7 @@ class NoveltyModel:
         numbers = [part for mode in self.modes for value in mode for part in (value.real, value.imag)]
         if not all(map(isfinite, (*numbers, self.direct, self.static_gain))):
             raise InvalidInput("novelty model: modes and gains must be finite")
-        if not self.modes or max(abs(mode.decay) for mode in self.modes) >= 1.0:
+        if not self.modes or max(hypot(mode.decay.real, mode.decay.imag) for mode in self.modes) >= 1.0:
             raise InvalidInput("novelty model: needs modes, all of which decay")
         if not (isfinite(self.rate) and self.rate > 0.0):
             raise InvalidInput(f"novelty model sample rate = {self.rate!r} Hz: must be greater than 0")

@@ -15,6 +15,8 @@ class NoveltyRules:
     ----------
     resolution : float
         rad: changes of the gap far below it are no news; it is added to every window's own spread.
+    worth : float
+        rad: however sure it is, a change since the twin was last told that is smaller is not sent.
     score_limit : float
         Standard deviations from the baseline at which one window is news by itself.
     allowance, cusum_limit : float
@@ -39,6 +41,7 @@ class NoveltyRules:
     """
 
     resolution: float = radians(0.01)
+    worth: float = 0.0
     score_limit: float = 4.5
     allowance: float = 0.5
     cusum_limit: float = 7.0
@@ -56,8 +59,9 @@ class NoveltyRules:
             value = getattr(self, key)
             if not value > 0.0 or (value == inf and key in ("resolution", "travel", "settle")):
                 raise InvalidInput(f"novelty {key} = {value!r}: must be greater than 0")
-        if not 0.0 <= self.allowance < inf:
-            raise InvalidInput(f"novelty allowance = {self.allowance!r}: must be finite and at least 0")
+        for key in ("allowance", "worth"):
+            if not 0.0 <= getattr(self, key) < inf:
+                raise InvalidInput(f"novelty {key} = {getattr(self, key)!r}: must be finite and at least 0")
         for key in ("learn", "confirm", "patience"):
             if getattr(self, key) < 0:
                 raise InvalidInput(f"novelty {key} = {getattr(self, key)!r} windows: must be at least 0")
