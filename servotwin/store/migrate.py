@@ -13,12 +13,13 @@ from servotwin.store.schema import REVISION, metadata
 
 VERSIONS = "servotwin_version"
 """Table with the revision."""
+SCRIPTS = Path(__file__).with_name("migrations")
 # Any number, the same in every process that migrates.
 _LOCK = 7461127
 
 
-def migrate(engine: sa.Engine, to: str = REVISION) -> None:
-    """Make what is missing; nothing is done to a database that is up to date.
+def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> None:
+    """Make what is missing, up to a revision, by a folder of scripts; a database that is up to date is left alone.
 
     Raises
     ------
@@ -35,7 +36,7 @@ def migrate(engine: sa.Engine, to: str = REVISION) -> None:
         found = _found(connection)
         if found != to:
             _check(connection, found, to)
-            _upgrade(connection, to)
+            _upgrade(connection, to, scripts)
 
 
 def _found(connection: sa.Connection) -> str | None:
@@ -58,12 +59,12 @@ def _check(connection: sa.Connection, found: str | None, to: str) -> None:
         )
 
 
-def _upgrade(connection: sa.Connection, to: str) -> None:
+def _upgrade(connection: sa.Connection, to: str, scripts: Path) -> None:
     # Alembic takes longer to import than all the rest of the store, and is mostly not needed.
     from alembic import command
     from alembic.config import Config
 
     config = Config()
-    config.set_main_option("script_location", str(Path(__file__).with_name("migrations")).replace("%", "%%"))
+    config.set_main_option("script_location", str(scripts).replace("%", "%%"))
     config.attributes["connection"] = connection
     command.upgrade(config, to)

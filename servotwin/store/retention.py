@@ -85,8 +85,8 @@ def _shrink(store: Store) -> None:
     """Give pages that are free back to the file system; PostgreSQL uses them again by itself."""
     if store.engines.writer.dialect.name == SQLITE:
         with transaction(store.engines.writer) as connection:
-            # Each row that is fetched frees a page.
-            connection.exec_driver_sql(f"PRAGMA incremental_vacuum({_PAGES})").all()
+            # Each step of it frees one page, and it gives no rows: only as a script does the driver take all steps.
+            connection.connection.cursor().executescript(f"PRAGMA incremental_vacuum({_PAGES})")
 
 
 def _add(one: Forgotten, other: Forgotten) -> Forgotten:

@@ -1,0 +1,71 @@
+"""A process that writes to a store until it is killed, and says what is safe: `python store_process.py ROLE URL`.
+
+put     windows of servos s0 to s3 from sequence 0 on, through a group commit, from four threads: "NEW s0 17"
+work    claims, and commits an outcome with one piece of evidence and one letter for each message: "DONE 3"
+hold    claims, says what it has ("HELD 5 s0"), and never comes back
+"""
+
+import itertools
+import os
+import sys
+import threading
+import time
+
+from store_cases import outcome, window
+
+from servotwin.store.groupcommit import GroupCommit
+from servotwin.store.rows import Claim, Evidence, Outcome
+from servotwin.store.store import Store, open_store
+
+LEASE_S = 2.0
+BODY = bytes(range(256)) * 8
+SERVOS = ("s0", "s1", "s2", "s3")
+
+_telling = threading.Lock()
+
+
+def tell(*words: object) -> None:
+    with _telling:
+        os.write(1, (" ".join(map(str, words)) + "\n").encode())
+
+
+def put_all(group: GroupCommit, servo: str) -> None:
+    for sequence in itertools.count():
+        tell(group.put(window(servo, sequence, BODY)).result().name, servo, sequence)
+
+
+def worked(claim: Claim) -> Outcome:
+    evidence = [Evidence("estimate", message.id, b"seen") for message in claim.messages]
+    letters = tuple(b"about %d" % message.id for message in claim.messages)
+    return outcome(claim, *evidence, outgoing=letters)
+
+
+def work(store: Store, group: GroupCommit, owner: str) -> None:
+    while True:
+        claims = store.claim(owner, 2, LEASE_S, time.time(), per_servo=5)
+        futures = [group.commit(worked(claim)) for claim in claims]
+        tell("DONE", sum(future.result() for future in futures))
+        if not claims:
+            time.sleep(0.01)
+
+
+def hold(store: Store, owner: str) -> None:
+    for claim in store.claim(owner, 2, LEASE_S, time.time(), per_servo=5):
+        tell("HELD", claim.servo, len(claim.messages))
+    threading.Event().wait()
+
+
+def main(role: str, url: str) -> None:
+    store = open_store(url)
+    group, owner = GroupCommit(store), f"process {os.getpid()}"
+    if role == "put":
+        for servo in SERVOS:
+            threading.Thread(target=put_all, args=(group, servo)).start()
+    elif role == "work":
+        work(store, group, owner)
+    else:
+        hold(store, owner)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,153 @@
+"""Processes on one store, killed with SIGKILL in the middle of it: what was acknowledged is there, nothing is twice."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+import store_process
+from store_cases import SYSTEMS, addresses, window
+
+from servotwin.store.engine import transaction
+from servotwin.store.rows import Put
+from servotwin.store.schema import evidence, messages
+from servotwin.store.store import Store, open_store
+
+PROGRAM = Path(store_process.__file__)
+FAR = 4e9
+"""s since the epoch: every lease is over."""
+
+
+@pytest.fixture(scope="module", params=SYSTEMS)
+def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable]:
+    with addresses(request.param, tmp_path_factory.mktemp("stores")) as found:
+        yield found
+
+
+@contextmanager
+def process(role: str, url: str) -> Iterator[subprocess.Popen[str]]:
+    """One that is killed when the block ends."""
+    command = [sys.executable, str(PROGRAM), role, url]
+    paths = os.pathsep.join((str(PROGRAM.parent), str(PROGRAM.parent.parent)))
+    started = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ, "PYTHONPATH": paths}
+    )
+    with started:
+        try:
+            yield started
+        finally:
+            kill(started)
+
+
+def kill(started: subprocess.Popen[str]) -> None:
+    if started.poll() is None:
+        os.killpg(started.pid, signal.SIGKILL)
+
+
+def lines(started: subprocess.Popen[str], number: int) -> list[list[str]]:
+    """So many lines of its output."""
+    found = [line.split() for _, line in zip(range(number), started.stdout, strict=False)]
+    assert len(found) == number, "the process ended by itself"
+    return found
+
+
+def rest(started: subprocess.Popen[str]) -> list[list[str]]:
+    """What it still said before it was killed; a line that was cut off says nothing."""
+    return [line.split() for line in started.stdout if line.endswith("\n")]
+
+
+def finish(store: Store) -> None:
+    """Work through everything that is left."""
+    while found := store.claim("finisher", 16, 1.0, FAR):
+        assert all(store.commit([store_process.worked(one) for one in found], FAR))
+
+
+def numbers(store: Store, column: sa.Column) -> Counter[int]:
+    with transaction(store.engines.reader) as connection:
+        return Counter(connection.scalars(sa.select(column)))
+
+
+def check_each_once(store: Store) -> None:
+    """Every message has led to one piece of evidence and one letter."""
+    known = numbers(store, messages.c.id)
+    assert known
+    assert numbers(store, evidence.c.message) == known
+    posted = Counter(
+        int(post.body.split()[1]) for servo in store.servos() for post in store.outgoing(servo.servo, 0, 10**6)
+    )
+    assert posted == known
+    for servo in store.servos():
+        serials = [post.serial for post in store.outgoing(servo.servo, 0, 10**6)]
+        assert serials == list(range(1, servo.posted + 1))
+
+
+def test_killed_in_the_middle_of_group_commits(new_address: Callable[[], str]) -> None:
+    url = new_address()
+    safe: set[tuple[str, int]] = set()
+    open_store(url).close()
+    for acknowledged in (1, 150, 37):
+        with process("put", url) as writing, process("work", url) if "postgres" in url else no_process() as working:
+            told = lines(writing, len(safe) + acknowledged)
+            kill(writing)
+            told += rest(writing)
+            if working is not None:
+                lines(working, 1)
+        safe |= {(servo, int(sequence)) for _, servo, sequence in told}
+        store = open_store(url)
+        assert set(store.put([window(servo, n, store_process.BODY) for servo, n in sorted(safe)])) == {Put.KNOWN}
+        store.close()
+    store = open_store(url)
+    finish(store)
+    check_each_once(store)
+    assert all(store.window(servo, "boot", n).body == store_process.BODY for servo, n in safe)
+    store.close()
+
+
+@contextmanager
+def no_process() -> Iterator[None]:
+    """SQLite has one twin process."""
+    yield None
+
+
+def test_a_worker_killed_in_the_middle_of_outcomes(new_address: Callable[[], str]) -> None:
+    url = new_address()
+    store = open_store(url)
+    store.put([window(servo, n) for n in range(60) for servo in store_process.SERVOS])
+    for outcomes in (1, 4, 2):
+        with process("work", url) as working:
+            lines(working, outcomes)
+    finish(store)
+    check_each_once(store)
+    store.close()
+
+
+def test_what_a_killed_process_had_borrowed_another_one_does(new_address: Callable[[], str]) -> None:
+    url = new_address()
+    store = open_store(url)
+    store.put([window(servo, n) for n in range(12) for servo in store_process.SERVOS])
+    with process("hold", url) as holding:
+        assert [words[0] for words in lines(holding, 2)] == ["HELD", "HELD"]
+    with process("work", url) as working:
+        while store.waiting(0.0).messages:
+            lines(working, 1)
+    check_each_once(store)
+    store.close()
+
+
+def test_two_processes_share_the_work_and_one_is_killed(new_address: Callable[[], str]) -> None:
+    url = new_address()
+    store = open_store(url)
+    store.put([window(servo, n) for n in range(60) for servo in store_process.SERVOS])
+    with process("work", url) as one, process("work", url) as other:
+        lines(one, 2)
+        kill(one)
+        while store.waiting(0.0).messages:
+            lines(other, 1)
+    check_each_once(store)
+    store.close()

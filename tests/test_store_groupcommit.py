@@ -1,0 +1,264 @@
+"""Group commit: few transactions, answers only when they are safe, and no failure that it does not survive."""
+
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, wait
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from sqlalchemy import event
+from store_cases import letter, outcome, window
+
+from servotwin.errors import InvalidInput
+from servotwin.store.engine import transaction
+from servotwin.store.errors import StoreBusy, StoreUnavailable
+from servotwin.store.groupcommit import Bounds, GroupCommit
+from servotwin.store.rows import Evidence, Incoming, Outcome, Put
+from servotwin.store.store import Store, open_store
+
+PATIENCE_S = 60.0
+FULL = "database or disk is full"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = open_store(str(tmp_path / "store.db"))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def group(store: Store) -> Iterator[GroupCommit]:
+    started = GroupCommit(store, clock=lambda: 300.0)
+    yield started
+    started.close()
+
+
+class Gate:
+    """A store whose transactions wait until they are let through, and are counted."""
+
+    def __init__(self, store: Store) -> None:
+        self.store, self.opened, self.entered = store, threading.Event(), threading.Event()
+        self.sizes: list[int] = []
+        self.name = store.name
+
+    def write(self, items: Sequence[Incoming], made: Sequence[Outcome], now: float) -> tuple[list[Put], list[bool]]:
+        self.sizes.append(len(items) + len(made))
+        self.entered.set()
+        assert self.opened.wait(PATIENCE_S)
+        return self.store.write(items, made, now)
+
+
+@pytest.fixture
+def gate(store: Store) -> Iterator[Gate]:
+    made = Gate(store)
+    yield made
+    made.opened.set()
+
+
+def results(futures: Sequence[Future[Put]]) -> list[Put]:
+    return [future.result(PATIENCE_S) for future in futures]
+
+
+def test_messages_and_outcomes_of_many_threads(store: Store, group: GroupCommit) -> None:
+    store.put([window("worked")])
+    (claim,) = store.claim("me", 1, 30.0, 200.0)
+    became: list[Put] = []
+
+    def send(servo: str) -> None:
+        became.extend(group.put(window(servo, n % 20)).result(PATIENCE_S) for n in range(40))
+
+    threads = [threading.Thread(target=send, args=(f"s{k}",)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    assert group.commit(outcome(claim, outgoing=(b"u",))).result(PATIENCE_S) is True
+    assert group.commit(outcome(claim)).result(PATIENCE_S) is False
+    for thread in threads:
+        thread.join()
+    assert (became.count(Put.NEW), became.count(Put.KNOWN)) == (160, 160)
+    assert store.servo("worked").posted == 1
+
+
+def test_whatever_waits_is_taken_together(gate: Gate) -> None:
+    group = GroupCommit(gate, Bounds(together=8))
+    first = group.put(window(sequence=0))
+    assert gate.entered.wait(PATIENCE_S)
+    others = [group.put(window(sequence=n)) for n in range(1, 12)]
+    assert not first.done()
+    gate.opened.set()
+    assert results([first, *others]) == [Put.NEW] * 12
+    assert gate.sizes == [1, 8, 3]
+    group.close()
+
+
+def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
+    group = GroupCommit(gate, Bounds(together_bytes=2000))
+    futures = [group.put(window(sequence=0))]
+    assert gate.entered.wait(PATIENCE_S)
+    futures += [group.put(window(sequence=n, body=bytes(1000))) for n in range(1, 6)]
+    gate.opened.set()
+    results(futures)
+    assert gate.sizes == [1, 2, 2, 1]
+    group.close()
+
+
+@pytest.mark.parametrize("bounds", [Bounds(waiting=3), Bounds(waiting_bytes=3 * 7)])
+def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds: Bounds) -> None:
+    gate.store.put([window("worked")])
+    (claim,) = gate.store.claim("me", 1, 30.0, 200.0)
+    group = GroupCommit(gate, bounds)
+    futures = [group.put(window(sequence=0))]
+    assert gate.entered.wait(PATIENCE_S)
+    futures += [group.put(window(sequence=n)) for n in range(1, 4)]
+    with pytest.raises(StoreBusy, match="3 messages wait"):
+        group.put(window(sequence=4))
+    committed = group.commit(outcome(claim))
+    assert group.waiting == 4
+    gate.opened.set()
+    assert results(futures) == [Put.NEW] * 4
+    assert committed.result(PATIENCE_S) is True
+    assert results([group.put(window(sequence=4))]) == [Put.NEW]
+    group.close()
+
+
+def test_what_is_handed_over_cannot_be_cancelled(gate: Gate) -> None:
+    group = GroupCommit(gate)
+    futures = [group.put(window(sequence=n)) for n in range(3)]
+    assert not any(future.cancel() for future in futures)
+    gate.opened.set()
+    assert results(futures) == [Put.NEW] * 3
+    group.close()
+
+
+def test_closing_commits_what_waits_and_takes_nothing_more(gate: Gate) -> None:
+    group = GroupCommit(gate)
+    futures = [group.put(window(sequence=n)) for n in range(20)]
+    gate.opened.set()
+    group.close()
+    assert all(future.done() for future in futures)
+    assert gate.store.servo("a").windows == 20
+    with pytest.raises(StoreUnavailable, match="is being closed"):
+        group.put(window())
+
+
+def test_a_faulty_outcome_fails_alone(store: Store, gate: Gate) -> None:
+    store.put([window("a"), window("b")])
+    a, b = sorted(store.claim("me", 2, 30.0, 200.0))
+    group = GroupCommit(gate)
+    futures = [group.put(letter("c"))]
+    assert gate.entered.wait(PATIENCE_S)
+    faulty = group.commit(outcome(a, Evidence("estimate", 0, b"", context="nowhere")))
+    futures.append(group.put(letter("d")))
+    valid = group.commit(outcome(b))
+    gate.opened.set()
+    assert results(futures) == [Put.NEW] * 2
+    assert valid.result(PATIENCE_S) is True
+    assert isinstance(faulty.exception(PATIENCE_S), sa.exc.IntegrityError)
+    assert (store.servo("a").serial, store.servo("b").serial) == (0, 1)
+    group.close()
+
+
+def limit_pages(store: Store, more: int | None) -> None:
+    """Let the database grow by so many pages; None: by as many as it likes."""
+    with transaction(store.engines.writer) as connection:
+        pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
+        connection.exec_driver_sql(f"PRAGMA max_page_count = {2**31 if more is None else pages + more}")
+
+
+def test_a_full_disk_fails_what_it_must_and_is_survived(store: Store, group: GroupCommit) -> None:
+    assert results([group.put(window(sequence=0))]) == [Put.NEW]
+    limit_pages(store, 20)
+    futures = [group.put(window(sequence=n, body=bytes(50_000))) for n in range(1, 30)]
+    wait(futures, PATIENCE_S)
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    assert errors
+    assert all(isinstance(error, StoreUnavailable) and FULL in str(error) for error in errors)
+    safe = [n for n, future in enumerate(futures, 1) if future.exception() is None]
+    assert store.servo("a").windows == 1 + len(safe)
+    limit_pages(store, None)
+    again = results([group.put(window(sequence=n, body=bytes(50_000))) for n in range(1, 30)])
+    assert again == [Put.KNOWN if n in safe else Put.NEW for n in range(1, 30)]
+
+
+def test_a_full_disk_loses_no_outcome_that_was_acknowledged(store: Store, group: GroupCommit) -> None:
+    store.put([window()])
+    (claim,) = store.claim("me", 1, 30.0, 200.0)
+    limit_pages(store, 2)
+    large = outcome(claim, outgoing=(bytes(200_000),))
+    assert isinstance(group.commit(large).exception(PATIENCE_S), StoreUnavailable)
+    assert store.servo("a").serial == 0
+    limit_pages(store, None)
+    assert group.commit(large).result(PATIENCE_S) is True
+    assert [len(post.body) for post in store.outgoing("a", 0)] == [200_000]
+
+
+def test_a_read_only_database_is_survived(store: Store, group: GroupCommit) -> None:
+    with transaction(store.engines.writer) as connection:
+        connection.exec_driver_sql("PRAGMA query_only = ON")
+    with pytest.raises(StoreUnavailable, match="readonly") as refused:
+        results([group.put(window())])
+    assert str(refused.value).startswith(f"store {store.name}: not available now")
+    with transaction(store.engines.reader) as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM messages").scalar_one() == 0
+    store.engines.writer.dispose()
+    assert results([group.put(window())]) == [Put.NEW]
+
+
+def test_a_lost_connection_is_survived(store: Store, group: GroupCommit) -> None:
+    failing = True
+
+    def cut(*_: object) -> None:
+        if failing:
+            raise sa.exc.OperationalError("INSERT", None, OSError("connection was cut"))
+
+    event.listen(store.engines.writer, "before_cursor_execute", cut)
+    with pytest.raises(StoreUnavailable, match="connection was cut"):
+        results([group.put(window())])
+    failing = False
+    assert results([group.put(window())]) == [Put.NEW]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 2 MB, where one may be mounted."""
+    mount = shutil.which("mount")
+    if os.geteuid() != 0 or mount is None:
+        pytest.skip("only root may mount a small disk; max_page_count stands in for it")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    made = subprocess.run([mount, "-t", "tmpfs", "-o", "size=2m", "tmpfs", disk], check=False, capture_output=True)
+    if made.returncode:
+        pytest.skip("a small disk cannot be mounted here; max_page_count stands in for it")
+    yield disk
+    subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_disk_that_is_really_full_and_then_really_read_only(small_disk: Path) -> None:
+    store = open_store(str(small_disk / "store.db"))
+    group = GroupCommit(store)
+    hoard = small_disk / "hoard"
+    hoard.write_bytes(bytes(1_200_000))
+    futures = [group.put(window(sequence=n, body=os.urandom(50_000))) for n in range(40)]
+    wait(futures, PATIENCE_S)
+    errors = [error for future in futures if (error := future.exception()) is not None]
+    assert errors
+    assert all(isinstance(error, StoreUnavailable) for error in errors)
+    hoard.unlink()
+    assert results([group.put(window(sequence=100))]) == [Put.NEW]
+    safe = 1 + sum(future.exception() is None for future in futures)
+    assert store.servo("a").windows == safe
+    group.close()
+    store.close()
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    try:
+        with pytest.raises(InvalidInput, match=r"readonly|unable to open"):
+            open_store(str(small_disk / "store.db"))
+    finally:
+        subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
+    store = open_store(str(small_disk / "store.db"))
+    assert store.servo("a").windows == safe
+    store.close()

@@ -1,0 +1,173 @@
+"""The store against a dict: whatever order messages, claims, lapses of leases, outcomes and restarts come in."""
+
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, multiple, rule
+from store_cases import incoming
+
+from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome, Posted, Put
+from servotwin.store.store import open_store
+
+LEASE_S = 10.0
+QUEUES = {(Kind.WINDOW, Kind.LETTER), (Kind.PROOF,), (Kind.WINDOW, Kind.LETTER, Kind.PROOF)}
+
+servos = st.sampled_from(["a", "b", "c"])
+keys = st.sampled_from([f"k{n}" for n in range(8)])
+texts = st.sampled_from([b"x", b"y"])
+
+
+@dataclass
+class Model:
+    """What a servo should look like."""
+
+    state: bytes = b""
+    serial: int = 0
+    wake: float | None = None
+    lent_until: float | None = None
+    letters: list[bytes] = field(default_factory=list)
+
+
+@dataclass
+class Kept:
+    item: Incoming
+    done: bool = False
+
+
+class Against(RuleBasedStateMachine):
+    claims = Bundle("claims")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp())
+        self.store = open_store(str(self.folder / "store.db"))
+        self.now = 1000.0
+        self.servos: dict[str, Model] = {}
+        self.kept: dict[tuple[str, str], Kept] = {}
+
+    def teardown(self) -> None:
+        self.store.close()
+        shutil.rmtree(self.folder)
+
+    @rule(items=st.lists(st.tuples(servos, keys, texts, st.sampled_from(Kind)), min_size=1, max_size=5))
+    def put(self, items: list[tuple[str, str, bytes, Kind]]) -> None:
+        # A key is of one kind for ever, as a boot and a sequence are.
+        made = [incoming(s, f"{kind} {key}", body, kind, self.now) for s, key, body, kind in items]
+        assert self.store.put(made) == [self.expect_put(item) for item in made]
+
+    def expect_put(self, item: Incoming) -> Put:
+        self.servos.setdefault(item.servo, Model())
+        kept = self.kept.setdefault((item.servo, item.key), Kept(item))
+        if kept.item is item:
+            return Put.NEW
+        return Put.KNOWN if kept.item.digest == item.digest else Put.CONFLICT
+
+    def undone(self, servo: str, kinds: tuple[Kind, ...]) -> list[bytes]:
+        of = (kept.item for (whose, _), kept in self.kept.items() if whose == servo and not kept.done)
+        return [item.body + item.key.encode() for item in of if item.kind in kinds]
+
+    def due(self, servo: str, kinds: tuple[Kind, ...]) -> bool:
+        model = self.servos[servo]
+        if model.lent_until is not None and model.lent_until > self.now:
+            return False
+        woken = model.wake is not None and model.wake <= self.now and Kind.WINDOW in kinds
+        return woken or bool(self.undone(servo, kinds))
+
+    @rule(target=claims, limit=st.integers(1, 3), per_servo=st.integers(1, 4), kinds=st.sampled_from(sorted(QUEUES)))
+    def claim(self, limit: int, per_servo: int, kinds: tuple[Kind, ...]) -> object:
+        due = {servo for servo in self.servos if self.due(servo, kinds)}
+        found = self.store.claim("me", limit, LEASE_S, self.now, kinds, per_servo)
+        assert {one.servo for one in found} <= due
+        assert len(found) == min(limit, len(due))
+        for one in found:
+            self.check(one, kinds, per_servo)
+            self.servos[one.servo].lent_until = self.now + LEASE_S
+        return multiple(*found)
+
+    def check(self, claim: Claim, kinds: tuple[Kind, ...], per_servo: int) -> None:
+        model = self.servos[claim.servo]
+        assert (claim.state, claim.serial) == (model.state, model.serial)
+        expected = self.undone(claim.servo, kinds)
+        bodies = [self.body_of(claim.servo, message.id) for message in claim.messages]
+        if len(kinds) < 3:
+            assert bodies == expected[:per_servo]
+        else:
+            assert len(bodies) == len(set(bodies)) <= 2 * per_servo
+            assert set(bodies) <= set(expected)
+
+    def body_of(self, servo: str, message: int) -> bytes:
+        with self.store.engines.reader.begin() as connection:
+            query = "SELECT body, key FROM messages JOIN bodies ON message = id WHERE id = ? AND servo = ?"
+            body, key = connection.exec_driver_sql(query, (message, servo)).one()
+        return body + key.encode()
+
+    @rule(
+        lent=st.lists(consumes(claims), min_size=1, max_size=3),
+        letters=st.lists(texts, max_size=2),
+        wake=st.none() | st.floats(0.0, 30.0),
+        ask=st.none() | keys,
+        again=st.booleans(),
+    )
+    def commit(self, lent: list[Claim], letters: list[bytes], wake: float | None, ask: str | None, again: bool) -> None:
+        made = [self.outcome(claim, letters, wake, ask) for claim in lent]
+        made += made[:1] if again else []
+        assert self.store.commit(made, self.now) == [self.expect_commit(one) for one in made]
+
+    def outcome(self, claim: Claim, letters: list[bytes], wake: float | None, ask: str | None) -> Outcome:
+        done = tuple(message.id for message in claim.messages)
+        found = tuple(Evidence("estimate", message, b"") for message in done)
+        asked = () if ask is None else (incoming(claim.servo, f"{Kind.PROOF} {ask}", b"x", Kind.PROOF, self.now),)
+        at = None if wake is None else self.now + wake
+        return Outcome(claim.servo, claim.serial, b"%d" % claim.serial, at, done, found, tuple(letters), asked)
+
+    def expect_commit(self, made: Outcome) -> bool:
+        model = self.servos[made.servo]
+        if model.serial != made.serial:
+            return False
+        for message in made.done:
+            key = self.key_of(message)
+            assert not self.kept[made.servo, key].done, "done twice"
+            self.kept[made.servo, key].done = True
+        for item in made.enqueue:
+            self.expect_put(item)
+        model.state, model.serial, model.wake, model.lent_until = made.state, made.serial + 1, made.wake, None
+        model.letters += made.outgoing
+        return True
+
+    def key_of(self, message: int) -> str:
+        with self.store.engines.reader.begin() as connection:
+            return connection.exec_driver_sql("SELECT key FROM messages WHERE id = ?", (message,)).scalar_one()
+
+    @rule(seconds=st.floats(0.0, 15.0))
+    def time_passes(self, seconds: float) -> None:
+        self.now += seconds
+
+    @rule()
+    def release(self) -> None:
+        self.store.release("me")
+        for model in self.servos.values():
+            model.lent_until = None
+
+    @rule()
+    def restart(self) -> None:
+        self.store.close()
+        self.store = open_store(str(self.folder / "store.db"))
+
+    @invariant()
+    def it_tells_the_same(self) -> None:
+        for name, model in self.servos.items():
+            found = self.store.servo(name)
+            assert (found.serial, found.wake) == (model.serial, model.wake)
+            assert found.waiting == len(self.undone(name, (Kind.WINDOW, Kind.LETTER)))
+            assert self.store.outgoing(name, 0) == [Posted(n, body) for n, body in enumerate(model.letters, 1)]
+        waiting = self.store.waiting(self.now)
+        assert waiting.messages == sum(len(self.undone(name, (Kind.WINDOW, Kind.LETTER))) for name in self.servos)
+        assert waiting.proofs == sum(len(self.undone(name, (Kind.PROOF,))) for name in self.servos)
+
+
+Against.TestCase.settings = settings(max_examples=25, stateful_step_count=25)
+TestAgainst = Against.TestCase
