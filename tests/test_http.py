@@ -45,8 +45,6 @@ def link(twin: FakeTwin) -> Iterator[HttpTransport]:
 
 def release(transport: HttpTransport) -> None:
     transport.close()
-    transport._up.drop()
-    transport._down.drop()
 
 
 def test_windows_and_letters_arrive(twin: FakeTwin, link: HttpTransport) -> None:

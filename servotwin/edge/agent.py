@@ -169,11 +169,13 @@ class Agent:
             self._heard(message.servo)
         return []
 
-    def relieved(self) -> None:
-        """The outlet sends nothing of what it was offered last: if nothing else waits, the twin owes no answer."""
-        if not self.outlet.waiting:
+    def outlet_changed(self) -> None:
+        """What waits at the outlet has changed by itself: an earlier boot left something, or nothing is sent."""
+        if self.outlet.waiting:
+            self._supervisor.asked(self.time)
+        else:
             self._supervisor.answered(self.time, more=False)
-            self._deadline = self._next_deadline()
+        self._deadline = self._next_deadline()
 
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""

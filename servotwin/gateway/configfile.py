@@ -10,6 +10,7 @@ from typing import Any
 
 from servotwin.control import controllerfile
 from servotwin.control.controller import Controller
+from servotwin.edge import noveltyfile
 from servotwin.edge import settingsfile as edgefile
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
@@ -82,7 +83,7 @@ def read(table: Table) -> EdgeConfig:
             sensor=part(table, "sensor", lambda t: SensorGuard(**given(t, _SENSOR))),
             source=table.source,
         )
-    table.known("controller", "twin", "own", "start", "probe")
+    table.known("controller", "twin", "own", "start", "probe", "novelty")
     table.done()
     return config
 
@@ -115,6 +116,7 @@ def _agent(table: Table, rate: float, controller: Controller | None) -> AgentSet
         parameters=part(table, "start", lambda t: _start(t, settable)),
         supervision=part(table, "supervision", lambda t: _supervision(t, gains)),
         probe=probe,
+        novelty=part(table, "novelty", noveltyfile.settings) if "novelty" in table.values else None,
         **part(table, "window", lambda t: given(t, _WINDOW)),
     )
 

@@ -8,6 +8,7 @@ from dataclasses import fields
 from typing import Any
 
 from servotwin.control.controllerfile import written
+from servotwin.edge import noveltyfile
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.verdict import FallbackSet
@@ -60,6 +61,7 @@ def _tables(config: EdgeConfig) -> Values:
         "limits": _all(agent.limits, _LIMITS),
         "probe": None if agent.probe is None else _all(agent.probe, {"size": "size_m"}),
         "supervision": _supervision(agent.supervision),
+        "novelty": None if agent.novelty is None else noveltyfile.written(agent.novelty),
         "retry": _all(agent.retry),
         "keep": {**keep, "megabytes": config.keeping.bytes / MB},
         "sensor": _all(config.sensor, {"safe_voltage": "safe_voltage_v"}),

@@ -7,6 +7,7 @@ import ssl
 import time
 from collections.abc import Callable
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
+from threading import Lock
 from urllib.parse import quote, urlsplit
 
 import msgspec
@@ -63,10 +64,14 @@ class Line:
         self._parts, self._timeout, self._context, self._clock = urlsplit(url), timeout_s, context, clock
         self._headers = {"Authorization": f"Bearer {token}", "Accept": BODY}
         self._connection: HTTPConnection | None = None
-        self._closed = False
+        self._closed, self._busy = False, Lock()
 
     def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:
         """One request and its answer, of `limit` bytes at most; raises Unreachable."""
+        with self._busy:
+            return self._ask(method, path, body, headers, limit)
+
+    def _ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:
         fresh = self._connection is None
         try:
             return self._once(method, path, body, headers, limit)
@@ -74,7 +79,7 @@ class Line:
             self.drop()
             if fresh or isinstance(error, TimeoutError):
                 raise Unreachable(f"{type(error).__name__}: {error}") from None
-        return self.ask(method, path, body, headers, limit)
+        return self._ask(method, path, body, headers, limit)
 
     def drop(self) -> None:
         """Close the connection; the next request opens another."""
@@ -83,10 +88,13 @@ class Line:
             connection.close()
 
     def close(self) -> None:
-        """No more requests."""
+        """No more requests; the one under way fails at once."""
         self._closed = True
         connection = self._connection
-        if connection is not None and connection.sock is not None:
+        if self._busy.acquire(blocking=False):
+            self.drop()
+            self._busy.release()
+        elif connection is not None and connection.sock is not None:
             _shut(connection)
 
     def _once(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from threading import RLock
@@ -33,6 +34,7 @@ _DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
 _POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 _TAKE = "DELETE FROM letters WHERE digest = ?"
 _COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
+_NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
 _DROPPED = "dropped: "
 
 
@@ -66,6 +68,8 @@ class SqliteOutbox:
         self._index: dict[Key, Kept] = {}
         self._letters: dict[bytes, None] = {}
         self._counts: Counter[str] = Counter()
+        self._notes: dict[str, bytes] = {}
+        self._held = False
         self._owed: dict[tuple[Any, ...], Statement] = {}
         self.faults: Counter[str] = Counter()
         self.trouble = ""
@@ -179,8 +183,7 @@ class SqliteOutbox:
 
     def recall(self, what: str) -> int:
         """A number that was remembered; 0 at first."""
-        with self._lock:
-            return self._counts[what]
+        return self._counts[what]
 
     def remember(self, what: str, number: int) -> None:
         """Keep a number."""
@@ -189,11 +192,34 @@ class SqliteOutbox:
             self._owed["count", what] = Statement(_COUNT, (what, number))
             self.settle()
 
+    def note(self, name: str, value: bytes) -> None:
+        """Keep some bytes."""
+        with self._lock:
+            self._notes[name] = value
+            self._owed["note", name] = Statement(_NOTE, (name, value))
+            self.settle()
+
+    def noted(self, name: str) -> bytes | None:
+        """Bytes that were kept under this name."""
+        return self._notes.get(name)
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Whatever is done inside is written as one, at the end."""
+        with self._lock:
+            self._held = True
+            try:
+                yield
+            finally:
+                self._held = False
+                self.settle()
+
     def settle(self) -> bool:
         """Write what is owed; whether nothing is left. To be called now and then: it is how the outbox recovers."""
         with self._lock:
             try:
-                self._write()
+                if not self._held:
+                    self._write()
             except (sqlite3.Error, OSError) as error:
                 self._failed(error)
             return self.safe
@@ -226,6 +252,7 @@ class SqliteOutbox:
         self._index = {**{key: kept for key, kept in found.items() if ("window", key) not in self._owed}, **self._index}
         self._letters = {**{each: None for each in letters if ("letter", each) not in self._owed}, **self._letters}
         self._counts = Counter(counts) | self._counts
+        self._notes = dict(connection.execute("SELECT name, value FROM notes").fetchall()) | self._notes
 
     def _failed(self, error: Exception) -> None:
         """Go on without the disk, or with a new file."""
@@ -260,6 +287,7 @@ class SqliteOutbox:
         self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._owed}
         self._count(BROKEN)
         self._owed |= {("count", what): Statement(_COUNT, (what, n)) for what, n in self._counts.items()}
+        self._owed |= {("note", name): Statement(_NOTE, (name, value)) for name, value in self._notes.items()}
         try:
             put_aside(self._path)
         except OSError as error:

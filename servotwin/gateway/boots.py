@@ -1,0 +1,37 @@
+"""Names of boots: unique for ever, so that no window of one is taken for a window of another."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def next_boot(path: Path, random: bytes) -> str:
+    """A name for this start: how many there were, and something random where the count is lost.
+
+    Parameters
+    ----------
+    path : path
+        Holds the number of starts; where it cannot be read or written the name is unique all the same.
+    random : bytes
+        8 bytes.
+    """
+    count = _count(path) + 1
+    try:
+        beside = path.with_name(f"{path.name}.new")
+        with beside.open("w", encoding="ascii") as file:
+            file.write(f"{count}\n")
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError:
+        pass
+    return f"b{count}-{random.hex()}"
+
+
+def _count(path: Path) -> int:
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return 0
+    return int(text) if text.isdigit() and len(text) < 16 else 0

@@ -1,0 +1,137 @@
+"""What both roles have in common: the agent of each boot, its outlet, the link process, and what is told of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.store import kept, restored
+from servotwin.gateway.config import EdgeConfig
+from servotwin.gateway.frames import TicksFrame
+from servotwin.gateway.log import say
+from servotwin.gateway.outlet import PipeOutlet
+from servotwin.gateway.ticks import Counts
+
+Clock = Callable[[], float]
+CHILD_S, TOLD_S = 0.1, 1.0
+
+
+class Child(Protocol):
+    """Whatever takes what the outlet sends."""
+
+    def tend(self, now: float) -> None:
+        """See that it runs."""
+
+
+class Carried:
+    """The store of an agent whose disk is the link process's: begins with what it is given, hands on what is proved."""
+
+    def __init__(self, first: Parameters | None, outlet: PipeOutlet) -> None:
+        self._first, self._outlet = first, outlet
+
+    def save(self, parameters: Parameters) -> None:
+        """Let it be kept."""
+        self._outlet.save(parameters)
+
+    def load(self) -> Parameters | None:
+        """What to begin with."""
+        return self._first
+
+
+class Edge:
+    """One servo's edge, without its drive.
+
+    Parameters
+    ----------
+    config : EdgeConfig
+    boot : str
+        This start's name; where samples are missing a boot begins within it, named after it.
+    outlet : PipeOutlet
+    child : Child
+    first : Parameters, optional
+        Kept from an earlier start.
+    clock : callable
+        Monotonic, s.
+    """
+
+    def __init__(
+        self,
+        config: EdgeConfig,
+        boot: str,
+        outlet: PipeOutlet,
+        child: Child,
+        first: Parameters | None,
+        clock: Clock,
+    ) -> None:
+        self.config, self.clock = config, clock
+        self.counts: Counter[str] = Counter()
+        self.ticks = Counts()
+        self._boot, self._boots = boot, 0
+        self._outlet, self._child = outlet, child
+        self._child_due = self._told_due = clock()
+        self.agent = self._begun(first)
+
+    @property
+    def late(self) -> bool:
+        """Whether something is to be tended."""
+        return self.clock() >= self._child_due
+
+    def begin(self, why: str) -> None:
+        """Samples are missing: a new boot, on the parameters in force."""
+        self._boots += 1
+        self.counts[f"boot: {why}"] += 1
+        self.agent = self._begun(restored(kept(self.agent.parameters)))
+
+    def exchange(self) -> None:
+        """Send a piece of what waits, and let the agent hear what has come."""
+        heard = self._outlet.exchange()
+        if heard is None:
+            return
+        for message in heard.messages:
+            self.send(self.agent.receive(message))
+        if heard.standing:
+            self.agent.outlet_changed()
+        if heard.back:
+            self._outlet.say(self.agent.hello())
+
+    def send(self, sent: list[Outgoing]) -> None:
+        """What the agent says."""
+        for each in sent:
+            self._outlet.say(each.message)
+
+    def tend(self) -> None:
+        """Now and then: the link process, and the status."""
+        now = self.clock()
+        if now < self._child_due:
+            return
+        self._child_due = now + CHILD_S
+        self._child.tend(now)
+        if now >= self._told_due:
+            self._told_due = now + TOLD_S
+            self._outlet.tell(self._told())
+
+    def _begun(self, first: Parameters | None) -> Agent:
+        boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
+        self._outlet.boot = boot
+        settings = replace(self.config.agent, boot=boot)
+        agent = Agent(settings, store=Carried(first, self._outlet), outlet=self._outlet)
+        self._outlet.say(agent.hello())
+        say("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.tolerance)
+        return agent
+
+    def _told(self) -> TicksFrame:
+        agent, p = self.agent, self.agent.parameters
+        values: dict[str, float | int | str | None] = {
+            "version": p.version,
+            "tolerance_m": p.tolerance,
+            "gap_rad": p.gap,
+            "fallback": p.fallback,
+            "windows_cut": agent.windows_cut,
+            "longest_tick_s": self.ticks.longest,
+            **self.counts,
+        }
+        return TicksFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())

@@ -1,0 +1,104 @@
+"""What the link process does with what the control process hands it: judge, pack, keep; what is done is done once."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import msgspec
+
+from servotwin.edge.novelty import Novelty, dumps, loads
+from servotwin.edge.outlet import NOT_FINITE, WITHHELD
+from servotwin.edge.packing import pack
+from servotwin.edge.store import FileStore, restored
+from servotwin.errors import InvalidInput
+from servotwin.gateway.config import EdgeConfig
+from servotwin.gateway.frames import CutFrame, HandledFrame, LetterFrame, SaveFrame, TicksFrame, ToLink
+from servotwin.gateway.twinlink import CURSOR
+from servotwin.link.sqliteoutbox import SqliteOutbox
+from servotwin.messages import InvalidMessage
+
+_LAST, _NOVELTY = "last cut", "novelty"
+
+
+class Keeper:
+    """Takes frames; says which serials are safe.
+
+    Parameters
+    ----------
+    config : EdgeConfig
+    outbox : SqliteOutbox
+    """
+
+    def __init__(self, config: EdgeConfig, outbox: SqliteOutbox) -> None:
+        self._config, self._outbox = config, outbox
+        self._store = FileStore(config.path(config.keeping.parameters))
+        self._unsaved: SaveFrame | None = None
+        self._novelty: Novelty | None = None
+        self._boot = ""
+        self.faults: Counter[str] = Counter()
+
+    def take(self, frame: ToLink) -> list[int]:
+        """Do what a frame asks for."""
+        if isinstance(frame, CutFrame):
+            with self._outbox.together():
+                self._cut(frame)
+            return [frame.serial]
+        if isinstance(frame, LetterFrame):
+            self._outbox.post(frame.body)
+            return [frame.serial]
+        if isinstance(frame, SaveFrame):
+            before, self._unsaved = self._unsaved, frame
+            return ([] if before is None else [before.serial]) + self._save()
+        if isinstance(frame, HandledFrame):
+            self._outbox.remember(CURSOR, max(frame.serial, self._outbox.recall(CURSOR)))
+        assert not isinstance(frame, TicksFrame)
+        return []
+
+    def tend(self) -> list[int]:
+        """Try again what could not be done."""
+        self._outbox.settle()
+        return self._save()
+
+    def _cut(self, frame: CutFrame) -> None:
+        """Once: a frame that comes again, since nobody said that it was taken, is known by its place in its boot."""
+        here = msgspec.msgpack.encode((frame.boot, frame.sequence))
+        last = self._outbox.noted(_LAST)
+        boot, sequence = ("", -1) if last is None else msgspec.msgpack.decode(last, type=tuple[str, int])
+        if boot == frame.boot and frame.sequence <= sequence:
+            return
+        self._outbox.note(_LAST, here)
+        judge = self._judge(frame.boot)
+        wanted = frame.cut if judge is None else judge(frame.cut)
+        if judge is not None:
+            self._outbox.note(_NOVELTY, dumps(judge.state))
+        if wanted is None:
+            self._outbox.lost(WITHHELD)
+            return
+        try:
+            window = pack(wanted, self._config.settings(frame.boot))
+        except InvalidMessage:
+            self._outbox.lost(NOT_FINITE)
+        else:
+            self._outbox.put(window)
+
+    def _judge(self, boot: str) -> Novelty | None:
+        """Of this boot, with what was known before."""
+        settings = self._config.agent.novelty
+        if settings is not None and (self._novelty is None or boot != self._boot):
+            self._boot, known = boot, self._outbox.noted(_NOVELTY)
+            try:
+                self._novelty = Novelty(settings, None if known is None else loads(known))
+            except InvalidInput:
+                self._novelty = Novelty(settings)
+        return self._novelty
+
+    def _save(self) -> list[int]:
+        if self._unsaved is None:
+            return []
+        try:
+            self._store.save(restored(self._unsaved.kept))
+        except OSError:
+            self.faults["parameters not written"] += 1
+            return []
+        serial, self._unsaved = self._unsaved.serial, None
+        return [serial]

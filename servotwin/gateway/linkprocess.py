@@ -1,0 +1,206 @@
+"""The link process: packs, judges, keeps, sends and listens, so that the control process waits for none of it.
+
+`python -m servotwin.gateway.linkprocess edge.toml FD`; it ends when the other end of the socket FD is closed.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import signal
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from threading import Event, Thread
+from typing import Any
+
+from servotwin.gateway import frames
+from servotwin.gateway.config import EdgeConfig
+from servotwin.gateway.configfile import load
+from servotwin.gateway.keeping import Keeper
+from servotwin.gateway.log import say
+from servotwin.gateway.pipe import Pipe
+from servotwin.gateway.status import write_status
+from servotwin.gateway.ticks import summary
+from servotwin.gateway.twinlink import courier_of, listener_of, transport_of
+from servotwin.link.sqliteoutbox import SqliteOutbox
+from servotwin.messages import Acknowledge, encode
+
+NICE = 10
+TEND_S = 1.0
+
+
+class LinkProcess:
+    """One child of a control process.
+
+    Parameters
+    ----------
+    config : EdgeConfig
+    end : socket
+        To the control process.
+    """
+
+    def __init__(self, config: EdgeConfig, end: socket.socket) -> None:
+        self._config, self._end, self._pipe = config, end, Pipe(end)
+        keeping = config.keeping
+        self.outbox = SqliteOutbox(config.path(keeping.outbox), config.agent.servo, keeping.windows, keeping.bytes)
+        self.outbox.settle()
+        self._keeper = Keeper(config, self.outbox)
+        self._transport = transport_of(config)
+        self._courier = courier_of(config, self.outbox, self._transport, random.random)
+        self._listener = listener_of(config, self.outbox, self._transport, random.random)
+        self._news, self._stopping = Event(), Event()
+        self._wake, self._woken = socket.socketpair()
+        self._outgoing: list[bytes] = []
+        self._broken: list[BaseException] = []
+        self._ticks: frames.TicksFrame | None = None
+        self._told = (-1, Counter[str]())
+        self._faults: Counter[str] = Counter()
+
+    def run(self) -> None:
+        """Until the control process is gone."""
+        threads = [Thread(target=self._guarded, args=(work,)) for work in self._works()]
+        for thread in threads:
+            thread.start()
+        try:
+            self._serve()
+        finally:
+            self._end_all(threads)
+        if self._broken:
+            raise self._broken[0]
+
+    def _works(self) -> list[Callable[[], None]]:
+        return [] if self._transport is None else [self._send, self._listen]
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """A thread that fails ends the process: the control process starts another."""
+        try:
+            work()
+        except BaseException as error:
+            self._broken.append(error)
+            self._emit(b"")
+
+    def _serve(self) -> None:
+        tended = 0.0
+        while not (self._pipe.broken or self._broken):
+            self._stand()
+            while self._outgoing:
+                self._pipe.post(self._outgoing.pop(0))
+            self._pipe.pump()
+            left = max(0.0, tended + TEND_S - time.monotonic())
+            wanting = [self._end] if self._pipe.backlog else []
+            readable, _, _ = select.select([self._end, self._woken], wanting, [], left)
+            if self._woken in readable:
+                self._woken.recv(4096)
+            if self._end in readable:
+                for data in self._pipe.take():
+                    self._take(frames.to_link(data))
+            if time.monotonic() >= tended + TEND_S:
+                tended = time.monotonic()
+                self._tend()
+
+    def _take(self, frame: frames.ToLink) -> None:
+        if isinstance(frame, frames.TicksFrame):
+            self._ticks = frame
+            return
+        for serial in self._keeper.take(frame):
+            self._pipe.post(frames.encode(frames.DoneFrame(serial)))
+        self._news.set()
+
+    def _tend(self) -> None:
+        for serial in self._keeper.tend():
+            self._pipe.post(frames.encode(frames.DoneFrame(serial)))
+        try:
+            write_status(self._config.path(self._config.keeping.status), self._status())
+        except OSError:
+            self._faults["status not written"] += 1
+
+    def _stand(self) -> None:
+        """Tell the control process what waits, when that has changed: before it hears of an acknowledgement."""
+        now = len(self.outbox.pending()), Counter(self.outbox.dropped)
+        if now != self._told:
+            self._told = now
+            self._pipe.post(frames.encode(frames.StandingFrame(now[0], dict(now[1]))))
+
+    def _send(self) -> None:
+        assert self._courier is not None
+        while not self._stopping.is_set():
+            self._news.clear()
+            sent = self._courier.step(time.monotonic())
+            if sent.window is not None:
+                acknowledge = Acknowledge(self._config.agent.servo, *sent.window)
+                self._emit(frames.encode(frames.HeardFrame(0, encode(acknowledge))))
+            if sent.back:
+                self._emit(frames.encode(frames.BackFrame()))
+            if sent.wait_s > 0.0:
+                self._news.wait(min(sent.wait_s, 3600.0))
+
+    def _listen(self) -> None:
+        assert self._listener is not None
+        while not self._stopping.is_set():
+            told = self._listener.step()
+            for serial, body in told.messages:
+                self._emit(frames.encode(frames.HeardFrame(serial, body)))
+            self._stopping.wait(told.wait_s)
+
+    def _emit(self, frame: bytes) -> None:
+        """From another thread: let the main one send it."""
+        if frame:
+            self._outgoing.append(frame)
+        self._wake.send(b"w")
+
+    def _end_all(self, threads: list[Thread]) -> None:
+        self._stopping.set()
+        self._news.set()
+        if self._transport is not None:
+            self._transport.close()
+        for thread in threads:
+            thread.join()
+        self.outbox.close()
+        for end in (self._wake, self._woken):
+            end.close()
+        self._pipe.close()
+
+    def _status(self) -> dict[str, Any]:
+        ticks, box = self._ticks, self.outbox
+        known: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
+        if ticks is not None:
+            longest = float(ticks.values.get("longest_tick_s") or 0.0)
+            known |= {"boot": ticks.boot, "samples": ticks.samples, **ticks.values}
+            known["tick"] = summary(ticks.ticks, longest)
+        known["windows"] = {
+            "waiting": len(box.pending()),
+            "letters_waiting": len(box.letters()),
+            "dropped": {**(ticks.dropped if ticks is not None else {}), **box.dropped},
+        }
+        known["disk"] = {
+            "safe": box.safe,
+            "trouble": box.trouble,
+            "faults": dict(box.faults + self._faults + self._keeper.faults),
+        }
+        if self._courier is not None and self._listener is not None:
+            known["up"] = {"trouble": self._courier.trouble, **self._courier.counts}
+            known["down"] = {"trouble": self._listener.trouble, **self._listener.counts}
+        return {**known, "written": time.time()}
+
+
+def main(arguments: list[str]) -> int:
+    """Run as a child."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(NICE)
+    path, descriptor = arguments
+    end = socket.socket(fileno=int(descriptor))
+    try:
+        LinkProcess(load(path), end).run()
+    except Exception as error:
+        say("link process failed", error=f"{type(error).__name__}: {error}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

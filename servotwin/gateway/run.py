@@ -1,0 +1,155 @@
+"""Puts an edge together and runs it, until its drive is done or a signal comes."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from servotwin.edge.drive import Drive, DriveLost
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.store import FileStore
+from servotwin.errors import InvalidInput
+from servotwin.gateway.boots import next_boot
+from servotwin.gateway.child import LinkChild, starter
+from servotwin.gateway.config import EdgeConfig, token_of
+from servotwin.gateway.configfile import load
+from servotwin.gateway.control import Controlling
+from servotwin.gateway.drives import control_drive, supervised_drive
+from servotwin.gateway.edge import Edge
+from servotwin.gateway.log import say
+from servotwin.gateway.outlet import PipeOutlet
+from servotwin.gateway.supervise import Supervising
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_RECONNECT_S, _PIECE_S = 1.0, 0.02
+
+
+class Role(Protocol):
+    """What a role does with a drive."""
+
+    def step(self) -> bool:
+        """The next samples; whether the run goes on. Raises `DriveLost`."""
+
+    def lost(self) -> None:
+        """The drive is away."""
+
+    def stop(self) -> None:
+        """Leave the drive in order. Raises `DriveLost`."""
+
+
+class Stop:
+    """Becomes true at a signal.
+
+    Python's `signal` module waits for the end of a system call under way; a drive that is silent returns by itself.
+    """
+
+    def __init__(self) -> None:
+        self.wanted = False
+
+    def __call__(self, number: int, frame: Any) -> None:  # noqa: ARG002
+        self.wanted = True
+
+
+def run(path: str | os.PathLike[str]) -> None:
+    """Run the edge of an `edge.toml`.
+
+    Raises
+    ------
+    InvalidInput
+        The configuration, the token or the drive is not as it must be.
+    """
+    config = load(path)
+    if config.twin is not None:
+        token_of(config.twin, config.folder)
+    drive = control_drive(config) if config.role == "control" else supervised_drive(config)
+    first = first_parameters(config.path(config.keeping.parameters))
+    boot = next_boot(config.path(config.keeping.boots), os.urandom(8))
+    outlet = PipeOutlet(config.twin is not None)
+    child = LinkChild(starter(Path(path).resolve()), outlet)
+    stop = Stop()
+    before = [signal.signal(each, stop) for each in SIGNALS]
+    try:
+        edge = Edge(config, boot, outlet, child, first, time.monotonic)
+        until(stop, edge, drive, lambda: _role(edge, drive))
+    finally:
+        child.close()
+        drive.close()
+        for each, handler in zip(SIGNALS, before, strict=True):
+            signal.signal(each, handler)
+        say("end")
+
+
+def first_parameters(path: Path) -> Parameters | None:
+    """What an earlier start proved; a file that does not hold it is put aside, since the machine must run."""
+    try:
+        return FileStore(path).load()
+    except InvalidInput as error:
+        say("last parameters not readable", error=str(error))
+    except OSError as error:
+        say("last parameters not readable", error=str(error))
+        return None
+    try:
+        path.replace(path.with_name(f"{path.name}.broken"))
+    except OSError as error:
+        say("last parameters not put aside", error=str(error))
+    return None
+
+
+def until(stop: Stop, edge: Edge, drive: Drive, role_of: Callable[[], Role]) -> None:
+    """Connect, run, connect again where the drive was lost."""
+    role: Role | None = None
+    calm()
+    while not stop.wanted:
+        try:
+            drive.connect()
+            _check_rate(edge.config, drive)
+            role = role_of() if role is None else role
+            if not go_on(stop, role):
+                return
+        except DriveLost as error:
+            edge.counts["drive lost"] += 1
+            say("drive lost", error=str(error))
+            _wait(stop, edge)
+            if role is not None:
+                role.lost()
+
+
+def go_on(stop: Stop, role: Role) -> bool:
+    """Sample after sample; False: the run is over."""
+    step = role.step
+    while not stop.wanted:
+        if not step():
+            return False
+    role.stop()
+    return False
+
+
+def calm() -> None:
+    """Let the garbage collector leave what is there alone, and look for new cycles rarely: the loop makes none."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 1000)
+
+
+def _wait(stop: Stop, edge: Edge) -> None:
+    """A while without a drive; the link goes on."""
+    end = edge.clock() + _RECONNECT_S
+    while not stop.wanted and edge.clock() < end:
+        edge.exchange()
+        edge.tend()
+        time.sleep(_PIECE_S)
+
+
+def _role(edge: Edge, drive: Any) -> Role:
+    return Controlling(edge, drive) if edge.config.role == "control" else Supervising(edge, drive)
+
+
+def _check_rate(config: EdgeConfig, drive: Drive) -> None:
+    if drive.rate != config.agent.sample_rate:
+        told = f"sample_rate_hz = {config.agent.sample_rate!r} Hz: the drive's rate is {drive.rate!r} Hz"
+        raise InvalidInput(f"{config.source}: {told}; they must be equal")

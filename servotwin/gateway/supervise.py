@@ -1,0 +1,75 @@
+"""The role supervise: the drive controls by itself; its samples come in blocks, its parameters are written."""
+
+from __future__ import annotations
+
+from servotwin.edge.drive import Block, DriveRefused, SupervisedDrive
+from servotwin.gateway.edge import Edge
+
+LONGEST_BLOCK_S = 0.05
+"""What comes from the twin waits no longer than this for the drive."""
+
+
+class Supervising:
+    """Records a drive and writes its parameters.
+
+    Parameters
+    ----------
+    edge : Edge
+    drive : SupervisedDrive
+        Connected by whoever runs this.
+    """
+
+    def __init__(self, edge: Edge, drive: SupervisedDrive) -> None:
+        self._edge, self._drive = edge, drive
+        self._most = max(1, round(LONGEST_BLOCK_S * edge.config.agent.sample_rate))
+        self._due: int | None = None
+        self._written: object = None
+        self._moved = 0.0
+
+    def step(self) -> bool:
+        """One block; whether the run goes on. Raises `DriveLost`."""
+        self._follow()
+        block = self._drive.read(self._until())
+        began = self._edge.clock()
+        if block is None:
+            return False
+        if len(block.reference) > 0:
+            self._absorb(block)
+        self._edge.exchange()
+        self._edge.ticks.add(self._edge.clock() - began)
+        self._edge.tend()
+        return True
+
+    def lost(self) -> None:
+        """The drive is away: what it runs on when it comes back is not known."""
+        self._written, self._moved = None, 0.0
+
+    def stop(self) -> None:
+        """The drive runs on by itself, on its parameters; a probing move ends. Raises `DriveLost`."""
+        if self._moved:
+            self._drive.move(0.0)
+
+    def _absorb(self, block: Block) -> None:
+        if block.first != self._due and self._due is not None:
+            self._edge.counts["samples missed"] += max(0, block.first - self._due)
+            self._edge.begin("samples missing" if block.first > self._due else "machine counts anew")
+        self._due = block.last
+        self._edge.send(self._edge.agent.absorb_block(block.reference, block.theta_m, block.position, block.voltage))
+
+    def _until(self) -> int:
+        """Samples to read: no further than to where the agent acts."""
+        agent = self._edge.agent
+        return self._most if agent.deadline is None else max(1, min(self._most, agent.deadline - agent.samples))
+
+    def _follow(self) -> None:
+        """Let the drive run as the agent wants it to."""
+        agent = self._edge.agent
+        if agent.parameters is not self._written:
+            self._written = agent.parameters
+            try:
+                self._drive.write(agent.parameters)
+            except DriveRefused:
+                self._edge.counts["parameters refused by the drive"] += 1
+        if agent.offset != self._moved:
+            self._drive.move(agent.offset)
+            self._moved = agent.offset
