@@ -91,7 +91,7 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "reference": part(table, "reference", _reference),
         "gap": part(table, "gap", _gap),
         "recording": replace(part(table, "recording", _recording), probe=_probe(table), novelty=_novelty(table)),
-        "twin": part(table, "twin", twinfile.twin),
+        "twin": part(table, "twin", lambda inner: twinfile.twin(inner, folder)),
         **part(table, "disturbances", _disturbances),
     }
     values["controller"] = part(table, "controller", lambda t: _controller(t, servo.controller))

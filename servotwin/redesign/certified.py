@@ -62,11 +62,7 @@ def certify(
     """
     begin = clock()
     demands, trial = demands or Demands(), trial or Trial()
-    low, high = (bias + feedforward for bias in uncertainty.input_bias)
-    disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
-    if disturbed:
-        # The members' bias sets in together with the step: what it adds to the overshoot says nothing.
-        demands = replace(demands, overshoot=math.inf)
+    demands, disturbed = _for_disturbance(demands, uncertainty, feedforward)
     laws = candidates_of(servo, demands, uncertainty.gap[1], disturbed, noise > 0.0)
     candidates = [_fed(setting, feedforward) for setting in laws]
     ranked = _ranked(
@@ -83,6 +79,44 @@ def certify(
         best = tried if best is None or tried.settled > best.settled else best
     assert best is not None
     return Refusal(f"none of {len(candidates)} candidates is proved: the best {_shortcoming(best, demands)}", best)
+
+
+def confirm(
+    servo: Servo,
+    uncertainty: Uncertainty,
+    setting: Setting,
+    demands: Demands,
+    trial: Trial | None = None,
+    noise: float = 0.0,
+    clock: Callable[[], float] = perf_counter,
+) -> Certificate | Refusal:
+    """Whether one setting meets the demands on every machine the uncertainty allows; no other is looked at.
+
+    Parameters
+    ----------
+    servo, uncertainty, demands, trial, noise, clock
+        As for `certify`.
+    setting : Setting
+        With its feedforward.
+    """
+    begin, fed = clock(), setting.controller.feedforward
+    demands = _for_disturbance(demands, uncertainty, fed)[0]
+    members = draw(servo, uncertainty, demands.plants, demands.conditions, demands.seed)
+    (outcome,) = assess([setting], members, trial or Trial())
+    tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
+    tried = replace(tried, looked_at=1, seconds=clock() - begin)
+    missing = _shortcoming(tried, demands)
+    return Refusal(f"the setting {missing}", tried) if missing else tried
+
+
+def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: float) -> tuple[Demands, bool]:
+    """The demands where friction or bias act on a member, and whether they do.
+
+    The members' bias sets in together with the step: what it adds to the overshoot says nothing.
+    """
+    low, high = (bias + feedforward for bias in uncertainty.input_bias)
+    disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
+    return (replace(demands, overshoot=math.inf) if disturbed else demands), disturbed
 
 
 def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Setting]:

@@ -16,7 +16,7 @@ from servotwin.messages import Band
 from servotwin.plant.servo import Servo
 from servotwin.redesign.assess import NEAR, Trial
 from servotwin.redesign.certificate import Certificate, Demands, Refusal
-from servotwin.redesign.certified import certify
+from servotwin.redesign.certified import certify, confirm
 from servotwin.redesign.deadzones import gap_range
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
@@ -62,6 +62,7 @@ class CertifiedPolicy:
     bias_moved: float = 5e-3
     horizon: float = 40.0
     needs_estimate: ClassVar[bool] = False
+    owes: ClassVar[bool] = False
     clock: Callable[[], float] = field(default=perf_counter, compare=False)
 
     def redesign(self, evidence: Evidence) -> Redesign:
@@ -92,12 +93,18 @@ class CertifiedPolicy:
             return _fallen_back(prover.fallback(), region, found.reason)
         if _in_force(found.setting, evidence):
             return Redesign(None, estimate.gap, "what was proved is in force already", certificate=found)
-        return _sent(found, region.noise, estimate.gap, "")
+        sent = _sent(found, region.noise, estimate.gap, "")
+        return replace(sent, owed=region) if prover.owes else sent
 
     def prove(self, region: Region) -> Certificate | Refusal:
         """The cheapest setting that holds in a region, by simulation."""
         known = region.within(self.uncertainty)
         return certify(self.servo, known, self.held(), self.trial, region.feedforward, region.noise, self.clock)
+
+    def confirm(self, region: Region, setting: Setting) -> Certificate | Refusal:
+        """Whether one setting holds in a region."""
+        known = region.within(self.uncertainty)
+        return confirm(self.servo, known, setting, self.held(), self.trial, region.noise, self.clock)
 
     def held(self) -> Demands:
         """The demands, and the fallback set's band; a dead zone opens the loop inside of it only."""

@@ -12,6 +12,7 @@ from servotwin.messages import Band
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certificate import Certificate
 from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.region import Region
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Redesign:
         What the loop is predicted to stay within.
     certificate : Certificate, optional
         What the setting showed in simulation.
+    owed : Region, optional
+        What the setting is still to be proved for; None: nothing is. The certificate is of a wider one then.
     """
 
     tolerance: float | None
@@ -41,6 +44,7 @@ class Redesign:
     controller: Controller | None = None
     band: Band | None = None
     certificate: Certificate | None = None
+    owed: Region | None = None
 
 
 class Policy(Protocol):

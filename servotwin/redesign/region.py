@@ -42,7 +42,16 @@ class Region:
 
 
 class Prover(Protocol):
-    """Knows what holds in a region."""
+    """Knows what holds in a region.
+
+    Attributes
+    ----------
+    owes : bool
+        Whether what it knows stands on wider regions, and the exact proof is still to come.
+    """
+
+    @property
+    def owes(self) -> bool: ...
 
     def prove(self, region: Region) -> Certificate | Refusal:
         """A setting that holds there, or why there is none."""

@@ -25,12 +25,13 @@ from servotwin.messages import (
     encode,
     finite,
 )
-from servotwin.redesign.certificate import Certificate
+from servotwin.redesign.certificate import Certificate, Refusal
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.rows import Evidence
 from servotwin.twin.decode import decode_channel
 from servotwin.twin.glance import Glance
+from servotwin.twin.lookups import Question
 from servotwin.twin.state import TrendState, restored_trend, trend_state
 from servotwin.twin.wear import Expectation
 
@@ -76,11 +77,14 @@ class Rows:
     message : int
         Id of the message that everything now follows from; 0: none.
     found : list of Evidence
+    questions : list of Question
+        What is still to be proved.
     """
 
     def __init__(self, context: str) -> None:
         self.context, self.message = context, 0
         self.found: list[Evidence] = []
+        self.questions: list[Question] = []
 
     def add_window(self, _window: Window) -> bool:
         """It is in the store already, or it would not be here."""
@@ -144,12 +148,29 @@ class Rows:
         """What became of a request."""
         self._message("answer", answer, answer.outcome.value)
 
+    def add_question(self, question: Question) -> None:
+        """A proof that is still to come."""
+        self.questions.append(question)
+
+    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+        """What a proof showed of the setting that an update carries."""
+        shown = found if isinstance(found, Certificate) else found.best
+        body = {"question": question, "certificate": shown and _timeless(shown)}
+        self._of_update("proof", question, plain(body), "" if isinstance(found, Certificate) else found.reason)
+
+    def add_withdrawn(self, question: Question, why: str) -> None:
+        """What is taken back."""
+        self._of_update("withdrawn", question, plain({"version": question.version, "why": why}), why)
+
     def add_hello(self, hello: Hello) -> None:
         """A start of the edge."""
         self._message("hello", hello, hello.boot, hello.parameter_version)
 
     def _computed(self, kind: str, body: bytes, status: str, **values: Any) -> None:
         self.found.append(Evidence(kind, self.message, body, status=short(status), context=self.context, **values))
+
+    def _of_update(self, kind: str, question: Question, body: bytes, status: str) -> None:
+        self._computed(kind, body, status, version=question.version, window="{}/{}".format(*question.window))
 
     def _message(self, kind: str, message: ParameterMessage, status: str, version: int | None = None) -> None:
         self.found.append(Evidence(kind, self.message, encode(message), version=version, status=short(status)))

@@ -176,7 +176,7 @@ def _model(table: Table, name: str, folder: Path) -> Model:
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo = _servo(table, folder)
     law = part(table, "controller", lambda inner: servo.controller.replace(**given(inner, _CONTROLLER)))
-    settings = part(table, "twin", settingsfile.twin)
+    settings = part(table, "twin", partial(settingsfile.twin, folder=folder))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)
     policy_of(servo.replace(controller=law), settings)

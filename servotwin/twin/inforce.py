@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from servotwin.control.controller import Controller
-from servotwin.control.gains import with_gains
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.messages import Fallback, Gains, Hello, Update
+from servotwin.redesign.setting import Setting
 
 NEWEST = 16
 """Versions that are remembered, beside what the edge starts with and what runs there."""
@@ -18,6 +19,11 @@ class InForce:
 
     controller: Controller | None = None
     tolerance: float | None = None
+
+    def has(self, setting: Setting) -> bool:
+        """Whether it is a setting's gains and dead zone."""
+        same = self.controller is not None and gains_of(self.controller) == gains_of(setting.controller)
+        return same and self.tolerance == setting.tolerance
 
 
 @dataclass

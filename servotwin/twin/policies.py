@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certifiedpolicy import CertifiedPolicy
 from servotwin.redesign.deadzones import HysteresisPolicy, MarginPolicy
+from servotwin.redesign.lookup import TablePolicy
+from servotwin.redesign.lookupfile import load
 from servotwin.redesign.policy import PaperPolicy, Policy
 from servotwin.twin.settings import TwinSettings
 
@@ -24,7 +27,7 @@ def policy_of(servo: Servo, settings: TwinSettings) -> Policy:
     Raises
     ------
     InvalidInput
-        The policy cannot design for this controller.
+        The policy cannot design for this controller, or its table is not this model's.
     """
     return _MAKERS[settings.policy](servo, settings)
 
@@ -33,6 +36,12 @@ def certified(servo: Servo, settings: TwinSettings) -> CertifiedPolicy:
     """The certified policy; it feeds no more forward than cancels the largest input bias that is stated."""
     low, high = settings.uncertainty.input_bias
     return CertifiedPolicy(servo, settings.uncertainty, settings.demands, feedforward_limit=max(abs(low), abs(high)))
+
+
+def _certified(servo: Servo, settings: TwinSettings) -> Policy:
+    """Proving, or looking up."""
+    policy = certified(servo, settings)
+    return policy if settings.table is None else TablePolicy(policy, load(Path(settings.table), policy))
 
 
 def _margin(servo: Servo, settings: TwinSettings) -> MarginPolicy:
@@ -56,7 +65,7 @@ def _paper(servo: Servo, settings: TwinSettings) -> PaperPolicy:
 
 
 _MAKERS: Mapping[str, Callable[[Servo, TwinSettings], Policy]] = {
-    "certified": certified,
+    "certified": _certified,
     "margin": _margin,
     "hysteresis": _hysteresis,
     "paper": _paper,

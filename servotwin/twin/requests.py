@@ -13,6 +13,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, Memory, Seen, long_enough
 from servotwin.twin.inforce import InForce
 from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import Store
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,18 @@ class Requests:
             self.attempts = 0
         return decision
 
+    def after(
+        self, window: Window, estimate: GapEstimate, widest: float, runs: InForce, store: Store, now: float
+    ) -> list[Request]:
+        """What to send after a window, as of `learn`; decision and request are stored."""
+        decision = self.learn(window, estimate, widest, runs, now)
+        store.add_excitation(window, decision)
+        return self._stored(self.pending if decision.ask else None, store, now)
+
+    def answered(self, answer: Answer, store: Store, now: float) -> list[Request]:
+        """What to send after an answer, as of `settle`, stored."""
+        return self._stored(self.settle(answer), store, now)
+
     def settle(self, answer: Answer) -> Request | None:
         """Note an answer; the request to send instead, where this twin had forgotten how far its numbers went."""
         asked = self.pending
@@ -118,6 +131,13 @@ class Requests:
             return []
         if self.attempts >= self.insistence.attempts:
             self._close(None)
+        return self.send(now)
+
+    def _stored(self, request: Request | None, store: Store, now: float) -> list[Request]:
+        """Store and send a new request."""
+        if request is None:
+            return []
+        store.add_request(request)
         return self.send(now)
 
     def _close(self, outcome: Outcome | None) -> None:

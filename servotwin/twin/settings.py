@@ -17,7 +17,7 @@ from servotwin.tomltable import did_you_mean
 from servotwin.twin.triagesettings import TriageSettings
 
 POLICIES = ("certified", "margin", "hysteresis", "paper")
-_OWNERS = {"k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
+_OWNERS = {"table": "certified", "k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ class TwinSettings:
         for. "margin" needs the steps.
     demands : Demands
         What a certified setting must show.
+    table : str, optional
+        Of "certified": file of settings that were proved beforehand (`servotwin certify`). They are looked up, and the
+        proof for the exact evidence follows; None: it is made before anything is sent.
     k_dz, smoothing : float, optional
         Of "paper": the dead-zone gain of Eq 21, 1 unless given; the share of the previous gap that is kept at each
         update, 0 unless given, below 1.
@@ -78,6 +81,7 @@ class TwinSettings:
     policy: str = POLICIES[0]
     uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
     demands: Demands = field(default_factory=Demands)
+    table: str | None = None
     k_dz: float | None = None
     smoothing: float | None = None
     k_noise: float | None = None
@@ -115,7 +119,8 @@ class TwinSettings:
                 continue
             if owner != self.policy:
                 raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
-            _check(name, value, "", "finite and 0 or more", lambda x: x >= 0.0)
+            if name != "table":
+                _check(name, value, "", "finite and 0 or more", lambda x: x >= 0.0)
 
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""

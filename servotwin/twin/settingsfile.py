@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 from servotwin.identify import settingsfile
 from servotwin.identify.gap import METHODS
@@ -79,7 +80,7 @@ def _excitation(table: Table) -> ExcitationSettings:
     return ExcitationSettings(**given(table, EXCITATION))
 
 
-def twin(table: Table) -> TwinSettings:
+def twin(table: Table, folder: Path = Path()) -> TwinSettings:
     """[twin] with its tables `estimator`, `trend`, `excitation`, `triage`, `uncertainty` and `demands`."""
     default = TwinSettings()
     method = table.text("method", default.method, choices=tuple(METHODS))
@@ -91,6 +92,7 @@ def twin(table: Table) -> TwinSettings:
         policy=table.text("policy", default.policy, choices=POLICIES),
         uncertainty=part(table, "uncertainty", lambda inner: default.uncertainty.replace(**given(inner, UNCERTAINTY))),
         demands=part(table, "demands", lambda inner: Demands(**given(inner, DEMANDS))),
+        table=_path(table, "table", folder),
         k_dz=table.number("k_dz", None, minimum=0.0),
         smoothing=table.number("smoothing", None, minimum=0.0, maximum=1.0),
         k_noise=table.number("k_noise", None, minimum=0.0),
@@ -104,6 +106,11 @@ def twin(table: Table) -> TwinSettings:
         retry=table.number("retry_s", default.retry, positive=True),
         attempts=table.integer("attempts", default.attempts, minimum=1),
     )
+
+
+def _path(table: Table, key: str, folder: Path) -> str | None:
+    """A file's path, relative to `folder`."""
+    return str(folder / table.text(key)) if key in table.values else None
 
 
 def _trend(table: Table) -> TrendSettings:

@@ -17,9 +17,12 @@ from servotwin.errors import InvalidInput
 from servotwin.identify.trend import Trend, TrendSettings
 from servotwin.messages import Request, Update
 from servotwin.redesign.excitation import Memory
+from servotwin.redesign.policy import Policy
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.glance import Watch
 from servotwin.twin.inforce import InForce, Settings
+from servotwin.twin.lookups import Lookups
+from servotwin.twin.lookups import Memory as LookupMemory
 from servotwin.twin.requests import Requests
 from servotwin.twin.triage import Triage
 from servotwin.twin.versions import Versions
@@ -84,6 +87,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/1"):
     sent_at: float
     attempts: int
     watch: Watch | None = None
+    lookups: LookupMemory | None = None
 
 
 class Knowledge(NamedTuple):
@@ -96,6 +100,7 @@ class Knowledge(NamedTuple):
     delivery: Delivery
     tuned_for: float | None
     triage: Triage | None = None
+    policy: Policy | None = None
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -114,6 +119,7 @@ def pack(servo: str, knows: Knowledge) -> bytes:
         knows.delivery.sent_at,
         knows.delivery.attempts,
         None if knows.triage is None else knows.triage.watch,
+        knows.policy.memory if isinstance(knows.policy, Lookups) else None,
     )
     return _encoder.encode(state)
 
@@ -140,6 +146,7 @@ def unpack(servo: str, data: bytes, fresh: Knowledge) -> Knowledge:
         replace(fresh.delivery, sent_at=state.sent_at, attempts=state.attempts),
         state.tuned_for,
         _restored_triage(fresh.triage, state.watch),
+        _restored_policy(fresh.policy, state.lookups),
     )
 
 
@@ -209,4 +216,11 @@ def _restored_triage(fresh: Triage | None, watch: Watch | None) -> Triage | None
     """As the settings want it: without what it remembers, it begins anew."""
     if fresh is not None and watch is not None:
         fresh.watch = watch
+    return fresh
+
+
+def _restored_policy(fresh: Policy | None, memory: LookupMemory | None) -> Policy | None:
+    """As the settings want it: what was withdrawn stays so."""
+    if isinstance(fresh, Lookups) and memory is not None:
+        fresh.memory = memory
     return fresh

@@ -9,9 +9,11 @@ from servotwin.identify.disturbance import Disturbance
 from servotwin.identify.estimate import GapEstimate
 from servotwin.identify.trend import Trend
 from servotwin.messages import Answer, Fallback, Hello, Receipt, Request, Update, Window
+from servotwin.redesign.certificate import Certificate, Refusal
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.twin.glance import Glance
+from servotwin.twin.lookups import Question
 from servotwin.twin.wear import Expectation
 
 Identity = tuple[str, str, int]
@@ -73,6 +75,18 @@ class Store(Protocol):
         """Keep what the edge says to a request."""
         ...
 
+    def add_question(self, question: Question) -> None:
+        """Keep that a proof is still to come, and see to it."""
+        ...
+
+    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+        """Keep what a proof showed."""
+        ...
+
+    def add_withdrawn(self, question: Question, why: str) -> None:
+        """Keep that what was sent is taken back."""
+        ...
+
 
 @dataclass
 class MemoryStore:
@@ -91,6 +105,9 @@ class MemoryStore:
     excitations: dict[Identity, Decision] = field(default_factory=dict)
     requests: list[Request] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
+    proofs: list[tuple[Question, Certificate | Refusal]] = field(default_factory=list)
+    withdrawn: list[tuple[Question, str]] = field(default_factory=list)
 
     def add_window(self, window: Window) -> bool:
         """Keep a window under its identity; False when it was there already."""
@@ -145,3 +162,15 @@ class MemoryStore:
     def add_answer(self, answer: Answer) -> None:
         """Keep an answer."""
         self.answers.append(answer)
+
+    def add_question(self, question: Question) -> None:
+        """Keep a question."""
+        self.questions.append(question)
+
+    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+        """Keep a proof."""
+        self.proofs.append((question, found))
+
+    def add_withdrawn(self, question: Question, why: str) -> None:
+        """Keep a withdrawal."""
+        self.withdrawn.append((question, why))

@@ -17,7 +17,9 @@ from servotwin.identify.whitened.quick import Quick, quick_fit
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.twin.decode import decode_window
-from servotwin.twin.glance import Glance, Watch, allowed, glance
+from servotwin.twin.glance import Watch, allowed, glance
+from servotwin.twin.requests import Requests
+from servotwin.twin.store import Store
 from servotwin.twin.triagesettings import TriageSettings
 from servotwin.twin.wear import Expectation
 
@@ -40,26 +42,33 @@ class Triage:
     def __init__(self, servo: Servo, settings: TriageSettings) -> None:
         self.servo, self.settings, self.watch = servo, settings, Watch()
 
-    def look(self, message: WindowMessage, trend: Trend | None, asked: bool) -> Glance | None:
-        """A glance at a window; None where it is no window, which the estimator says better.
+    def spares(self, message: WindowMessage, trend: Trend | None, asks: Requests | None, store: Store) -> bool:
+        """Whether a glance at a window is enough; what it saw is stored.
 
         Parameters
         ----------
         message : messages.Window
         trend : Trend or None
             As it was left by the windows that counted.
-        asked : bool
-            Whether the edge was asked for a window that tells more, and none has come.
+        asks : Requests or None
+            While the edge is asked for a window that tells more, all are estimated.
+        store : Store
         """
+        asked = asks is not None and asks.pending is not None
         watch = msgspec.structs.replace(self.watch, doubt="a request is open") if asked else self.watch
         try:
             seen = glance(message, decode_window(message), self.servo, watch, _offset(trend), self.settings)
         except InvalidInput:
-            return None
+            return False  # why it is no window, the estimator says
+        store.add_glance(message, seen)
         if not seen.moved:
             usual = max(_FADES * watch.misfit, seen.misfit)
             self.watch = msgspec.structs.replace(watch, misfit=usual, glances=watch.glances + 1)
-        return seen
+        return not seen.moved
+
+    def doubt(self, why: str) -> None:
+        """The next window is estimated, whatever it shows."""
+        self.watch = msgspec.structs.replace(self.watch, doubt=why, glances=0)
 
     def learn(self, message: WindowMessage, estimate: GapEstimate, trend: Trend | None, why_not: str) -> None:
         """Note an estimate, and why it does not count, where it does not: then the next window is estimated too.
@@ -67,7 +76,7 @@ class Triage:
         What a glance at its own window says is what later ones are compared with.
         """
         if why_not:
-            self.watch = msgspec.structs.replace(self.watch, doubt=why_not, glances=0)
+            self.doubt(why_not)
             return
         window, before = decode_window(message), self.watch.misfit
         seen = quick_fit(window, self.servo, estimate.gap, _offset(trend))

@@ -17,17 +17,18 @@ from servotwin.messages import (
     InvalidMessage,
     Message,
     Receipt,
-    Request,
     Update,
 )
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.lookup import TablePolicy
 from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.drafting import draft
 from servotwin.twin.estimating import UNUSABLE, Estimator, Observer, estimate_from, estimator_of, observed
 from servotwin.twin.inforce import InForce, Settings
+from servotwin.twin.lookups import Lookups, Question, question_of
 from servotwin.twin.policies import policy_of
 from servotwin.twin.requests import Requests, requests_of
 from servotwin.twin.settings import TwinSettings
@@ -65,9 +66,9 @@ class Twin:
     start : InForce, optional
         What the edge runs before the first update.
     requests : Requests, optional
-        Asks for windows that tell more; None: takes them as they come.
+        Asks for windows that tell more.
     triage : Triage, optional
-        Says of which windows a glance is enough; None: every one is estimated.
+        Says of which windows a glance is enough.
     """
 
     def __init__(
@@ -84,7 +85,8 @@ class Twin:
     ) -> None:
         self.servo, self._requests = servo, requests
         self.settings = settings or TwinSettings()
-        self._estimator, self._policy, self._store, self._observer = estimator, policy, store, observer
+        self._policy = Lookups(policy) if isinstance(policy, TablePolicy) else policy
+        self._estimator, self._store, self._observer = estimator, store, observer
         self._versions, self._known = Versions(), Settings({0: start or InForce()})
         self._wear = Wear(self.settings.initial_gap, self.settings.trend)
         self._delivery = Delivery(self.settings.retry, self.settings.attempts)
@@ -105,9 +107,8 @@ class Twin:
     ) -> Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator`, `policy` replace theirs.
 
-        The model's controller is the one that runs: policies design for it.
-        Without `start` the edge is taken to begin with the servo's own controller.
-        With the `state` of an earlier twin of that servo it goes on where that one was.
+        The model's controller is the one that runs: policies design for it. Without `start` the edge is taken to begin
+        with it. With the `state` of an earlier twin of that servo it goes on where that one was.
 
         Raises
         ------
@@ -141,12 +142,14 @@ class Twin:
             The state is not understood, or another servo's.
         """
         knows = unpack(self.servo, state, self._knowledge())
-        self._versions, self._known, self._wear, self._requests, self._delivery, self._tuned_for, self._triage = knows
+        self._versions, self._known, self._wear, self._requests, self._delivery, self._tuned_for, self._triage, _ = (
+            knows
+        )
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """What to send after a message that arrived at `now` (s, a clock of the twin's own).
 
-        A window is committed to the store, acknowledged and learnt from, unless the store has it already.
+        A window is stored, acknowledged and learnt from, unless the store has it already.
 
         Raises
         ------
@@ -164,7 +167,8 @@ class Twin:
         if isinstance(message, Fallback):
             return self._fallen_back(message)
         if isinstance(message, Answer):
-            return self._answered(message, now)
+            self._store.add_answer(message)
+            return [] if self._requests is None else [*self._requests.answered(message, self._store, now)]
         if isinstance(message, Hello):
             return self._greeted(message)
         raise InvalidMessage(f"a twin does not receive {type(message).__name__} messages")
@@ -204,7 +208,7 @@ class Twin:
         self._steady(now)
         self._versions.hear(message.boot, message.parameter_version)
         heard = now if arrived is None else arrived
-        if self._nothing_new(message):
+        if self._triage is not None and self._triage.spares(message, self.trend, self._requests, self._store):
             return []
         expected = self._wear.expect(message.boot, message.middle, heard)
         estimate, disturbed = estimate_from(message, self._estimator, expected), observed(message, self._observer)
@@ -218,42 +222,33 @@ class Twin:
         unasked = stale or (why_not and self._policy.needs_estimate)
         redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
-        asked = [] if stale or estimate.method == UNUSABLE else self._ask(message, estimate, now, heard)
+        asked = [] if stale else self._ask(message, estimate, now, heard)
         if redesign.tolerance is None:
             return asked
         self._tuned_for = redesign.gap
-        drafted = draft(message, estimate, redesign, self.settings.validity)
-        return self._send(self._versions.issue(drafted), now) + asked
+        update = self._versions.issue(draft(message, estimate, redesign, self.settings.validity))
+        sent = self._send(update, now)
+        if redesign.owed is not None:
+            self._store.add_question(question_of(update, redesign))
+        return sent + asked
 
-    def _nothing_new(self, message: WindowMessage) -> bool:
-        """Whether a glance at the window is enough."""
-        asked = self._requests is not None and self._requests.pending is not None
-        seen = None if self._triage is None else self._triage.look(message, self.trend, asked)
-        if seen is not None:
-            self._store.add_glance(message, seen)
-        return seen is not None and not seen.moved
+    def prove(self, question: Question) -> None:
+        """Prove what was looked up, and withdraw it where that fails: then the next update is the fallback set."""
+        if not isinstance(self._policy, Lookups):
+            raise InvalidInput("nothing is to be proved, as no table is used any more")
+        why = self._policy.settle(question, [self._known.of(each) for each in self._versions.running], self._store)
+        if why:
+            self._versions.give_up()
+            if self._triage is not None:
+                self._triage.doubt(why)
 
     def _ask(self, message: WindowMessage, estimate: GapEstimate, now: float, heard: float) -> list[Message]:
         """A request, where windows tell too little."""
-        if self._requests is None:
+        if self._requests is None or estimate.method == UNUSABLE:
             return []
-        trend = self._wear.expect(message.boot, estimate.time, heard).trend
-        widest = math.inf if trend is None else trend.gap_interval[1]
+        expected = self._wear.expect(message.boot, estimate.time, heard)
         runs = self._known.of(self._versions.in_force)
-        decision = self._requests.learn(message, estimate, widest, runs, now)
-        self._store.add_excitation(message, decision)
-        return self._request(self._requests.pending if decision.ask else None, now)
-
-    def _answered(self, answer: Answer, now: float) -> list[Message]:
-        self._store.add_answer(answer)
-        return [] if self._requests is None else self._request(self._requests.settle(answer), now)
-
-    def _request(self, request: Request | None, now: float) -> list[Message]:
-        """Store and send a new request."""
-        if request is None or self._requests is None:
-            return []
-        self._store.add_request(request)
-        return [*self._requests.send(now)]
+        return [*self._requests.after(message, estimate, expected.widest, runs, self._store, now)]
 
     def _redesign(self, estimate: GapEstimate, disturbed: Disturbance, why_not: str) -> Redesign:
         now = self._known.of(self._versions.in_force)
@@ -264,7 +259,7 @@ class Twin:
             return Redesign(None, math.nan, str(error))
 
     def _greeted(self, message: Hello) -> list[Message]:
-        """The edge started, or came back, with what it says."""
+        """The edge started, or came back."""
         self._store.add_hello(message)
         if self._versions.hear(message.boot, message.parameter_version):
             self._known.hear(message)
@@ -298,4 +293,4 @@ class Twin:
 
     def _knowledge(self) -> Knowledge:
         parts = self._versions, self._known, self._wear, self._requests, self._delivery
-        return Knowledge(*parts, self._tuned_for, self._triage)
+        return Knowledge(*parts, self._tuned_for, self._triage, self._policy)

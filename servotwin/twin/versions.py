@@ -74,6 +74,11 @@ class Versions:
             return self._number(refused, self.in_force)
         return None
 
+    @property
+    def running(self) -> tuple[int, ...]:
+        """What is in force, and what is on its way."""
+        return self.in_force, *(() if self.pending is None else (self.pending.version,))
+
     def give_up(self) -> None:
         """Stop waiting for a receipt."""
         self.pending = None

@@ -41,6 +41,11 @@ class Expectation:
         known, shared = self.trend.prior, self.trend.settings.shared_error_rad
         return known.offset, math.hypot(known.offset_std, 0.5 * shared)
 
+    @property
+    def widest(self) -> float:
+        """rad: the gap is no wider; inf where nothing is known."""
+        return math.inf if self.trend is None else self.trend.gap_interval[1]
+
     def gap_rate(self, settings: TrendSettings) -> float:
         """rad/s: root mean square of the growth to reckon with inside the window.
 

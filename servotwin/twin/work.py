@@ -7,6 +7,7 @@ evidence whose status begins with "failed", and the next message finds the twin 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -14,10 +15,11 @@ from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Message, Window
 from servotwin.messages.compression import decompress
-from servotwin.store.rows import Claim, Outcome, Stored
+from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Stored
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import Rows, failed
 from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin.lookups import Question, decode_question, encode_question
 from servotwin.twin.twin import Twin
 
 ONE_BY_ONE, GIVEN_UP = 3, 5
@@ -72,6 +74,7 @@ class _Worker:
             tuple(stored.id for stored in taken),
             tuple(self.rows.found),
             tuple(messages.encode(message) for message in self.sent),
+            enqueue=tuple(_asked(question, now) for question in self.rows.questions),
             contexts=(self.context,) if any(row.context for row in self.rows.found) else (),
         )
 
@@ -88,12 +91,13 @@ class _Worker:
 
     def _try(self, message: int, act: Callable[[], list[Message]]) -> bool:
         """Let the twin act on a message; where anything goes wrong, it is as if there had been none, and False."""
-        kept = len(self.rows.found)
+        kept, asked = len(self.rows.found), len(self.rows.questions)
         self.rows.message = message
         try:
             sent, self.state = act(), self.twin.state()
         except Exception as error:
             self.rows.found[kept:] = [failed(message, f"{type(error).__name__}: {error}")]
+            del self.rows.questions[asked:]
             self.twin.restore(self.state)
             return False
         self.sent += sent
@@ -105,13 +109,24 @@ def told(twin: Twin, stored: Stored, now: float) -> list[Message]:
 
     Raises
     ------
-    InvalidMessage
+    InvalidMessage, InvalidInput
         The body is not understood, or nothing for a twin.
     """
+    if stored.kind is Kind.PROOF:
+        if twin.settings.enabled:
+            twin.prove(decode_question(stored.body))
+        return []
     message = messages.decode(decompress(stored.body, stored.encoding, MAX_BYTES))
     if not twin.settings.enabled:
         return []
     return twin.learn(message, now, stored.received) if isinstance(message, Window) else twin.receive(message, now)
+
+
+def _asked(question: Question, now: float) -> Incoming:
+    """A proof on the queue."""
+    body = encode_question(question)
+    digest = hashlib.sha256(body).digest()
+    return Incoming(question.servo, Kind.PROOF, digest.hex(), body, "", digest, now)
 
 
 def _unchanged(claim: Claim, taken: Sequence[Stored], why: str) -> Outcome:
