@@ -10,8 +10,9 @@ from pathlib import Path
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES
+from servotwin.service.mqttconfig import MqttConfig, mqtt
 from servotwin.service.secretfile import read_secret
-from servotwin.tomltable import Reader, Table, given, named
+from servotwin.tomltable import Reader, Table, given, named, part
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
 """Environment variable with the password of the store."""
@@ -64,6 +65,8 @@ class ServiceConfig:
     job_timeout_s : float
         A worker that takes longer over one servo is replaced.
     log_level : str
+    mqtt : MqttConfig or None
+        A broker over which edges may reach the service as well.
     """
 
     bind: str = "127.0.0.1"
@@ -88,6 +91,7 @@ class ServiceConfig:
     future_slack_s: float = 60.0
     job_timeout_s: float = 300.0
     log_level: str = "info"
+    mqtt: MqttConfig | None = None
 
     def __post_init__(self) -> None:
         if (self.tls_certificate is None) != (self.tls_key is None):
@@ -97,6 +101,11 @@ class ServiceConfig:
                 f"bind = {self.bind!r} can be reached from other machines: that is allowed only with tokens, and with "
                 "tls_certificate and tls_key or, where a proxy does the TLS, behind_proxy = true"
             )
+
+        if self.mqtt is not None and not self.mqtt.local and self.tokens is None:
+            raise InvalidInput(f"mqtt url = {self.mqtt.broker.url!r} is not on this machine: that asks for tokens")
+        if self.mqtt is not None and self.lockstep:
+            raise InvalidInput("lockstep = true and mqtt exclude each other: in lock-step edges ask over HTTP")
 
     def __repr__(self) -> str:
         return f"ServiceConfig(bind={self.bind!r}, port={self.port!r}, store={self.store!r})"
@@ -165,6 +174,8 @@ def service(table: Table, folder: Path, environment: Mapping[str, str] = os.envi
     """
     paths = given(table, {key: (key, _path(folder)) for key in ("tls_certificate", "tls_key", "tokens")})
     values = {**given(table, PLAIN), **paths, **_store(table, folder, environment)}
+    if "mqtt" in table.values:
+        values["mqtt"] = part(table, "mqtt", lambda inner: mqtt(inner, folder, environment))
     with named(table):
         return ServiceConfig(**values)
 

@@ -14,6 +14,7 @@ from uuid import uuid4
 from fastapi import FastAPI
 
 from servotwin.errors import InvalidInput
+from servotwin.service import brokerdesk
 from servotwin.service.app import make_app
 from servotwin.service.auth import Authority, TokenFile
 from servotwin.service.config import SQLITE
@@ -24,6 +25,7 @@ from servotwin.service.ingest import Clocks, Ingest
 from servotwin.service.landing import Landing
 from servotwin.service.limits import Bodies, Buckets
 from servotwin.service.metrics import Metrics
+from servotwin.service.mqtt import Bridge
 from servotwin.service.outgoing import Outgoing
 from servotwin.service.pool import Pool
 from servotwin.service.proofs import Allowance
@@ -72,14 +74,15 @@ class System:
         self._parts = Parts(store, self.shelf, self.pool, self._commit, self.outgoing.post, self.metrics, self.clocks)
         self.dispatcher = Dispatcher(self._parts, self._owner, Allowance(self.config.proofs_per_minute))
         self._tasks: list[asyncio.Task[None]] = []
+        self._buckets = Buckets(self.config.rate_limit_per_s, self.config.rate_burst, self.clocks.monotonic)
+        self._bridge = self._over_mqtt()
         self._watch()
 
     @property
     def app(self) -> FastAPI:
         """The HTTP API; its lifespan begins and ends everything else."""
-        buckets = Buckets(self.config.rate_limit_per_s, self.config.rate_burst, self.clocks.monotonic)
         gate, bodies = (
-            Gate(self.authority, self._knows, buckets),
+            Gate(self.authority, self._knows, self._buckets),
             Bodies(self.config.max_body_bytes, self.config.body_timeout_s),
         )
         edge = EdgeApi(gate, bodies, self.ingest, self.outgoing, self.dispatcher.poke)
@@ -97,10 +100,14 @@ class System:
             self._spawn(self.dispatcher.run())
         if not math.isinf(self.config.retention_days):
             self._spawn(self._forget())
+        if self._bridge is not None:
+            await self._bridge.begin()
 
     async def end(self) -> None:
         """Commit what came, finish what is begun, end the workers."""
         self.outgoing.close()
+        if self._bridge is not None:
+            await self._bridge.end()
         await self.dispatcher.stop()
         for task in self._tasks:
             task.cancel()
@@ -119,6 +126,14 @@ class System:
         slack = math.inf if self.config.lockstep else self.config.future_slack_s
         boots = Boots(self.config.speed, slack)
         return Ingest(self._put, self._knows, boots, self.metrics, self.config.max_body_bytes, self.clocks)
+
+    def _over_mqtt(self) -> Bridge | None:
+        if self.config.mqtt is None:
+            return None
+        parts = brokerdesk.Parts(
+            self.authority, self._knows, self._buckets, self.ingest, self.outgoing, self.dispatcher.poke, self.metrics
+        )
+        return Bridge(self.config.mqtt.broker, brokerdesk.Desk(parts), self.config.mqtt.group)
 
     async def _put(self, incoming: Incoming) -> Put:
         return await self._landing(self.commits.put(incoming))
@@ -159,6 +174,9 @@ class System:
         )
         watch("servotwin_polls", "Polls that wait for a message.", lambda: self.outgoing.polls)
         watch("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
+        bridge = self._bridge
+        if bridge is not None:
+            watch("servotwin_broker_connected", "Whether the MQTT broker is there.", lambda: bridge.connected)
         watch("servotwin_store_ok", "Whether the store could do what it was asked last.", lambda: not self.shelf.fault)
 
     @asynccontextmanager
