@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Coroutine
 from contextlib import AbstractAsyncContextManager
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -38,9 +39,9 @@ def make_app(edge: EdgeApi, read: ReadApi, step: StepApi | None, metrics: Metric
     )
     for method, path, endpoint, says in _routes(edge, read, step):
         app.add_api_route(path, endpoint, methods=[method], openapi_extra=says, response_model=None)
-    app.add_exception_handler(Refused, lambda request, error: refusal(metrics, request, error))
-    app.add_exception_handler(HTTPException, lambda _request, error: _no_such(metrics, error))
-    app.add_exception_handler(RequestValidationError, lambda _request, error: _no_such(metrics, error))
+    app.add_exception_handler(Refused, partial(refusal, metrics))
+    app.add_exception_handler(HTTPException, partial(_no_such, metrics))
+    app.add_exception_handler(RequestValidationError, partial(_no_such, metrics))
     app.add_exception_handler(Disconnected, _gone)
     return app
 
@@ -81,7 +82,7 @@ async def refusal(metrics: Metrics, request: Request, error: Exception) -> Respo
     return _json({"code": error.refusal.value, "detail": error.detail}, error.status, headers)
 
 
-async def _no_such(metrics: Metrics, error: Exception) -> Response:
+async def _no_such(metrics: Metrics, _request: Request, error: Exception) -> Response:
     """Neither a path nor a method of this API, or arguments that are none."""
     status = error.status_code if isinstance(error, HTTPException) else 400
     metrics.refused.add(Refusal.NOT_UNDERSTOOD.value)

@@ -75,7 +75,7 @@ def listening(config: ServiceConfig, port: int | None = None) -> socket.socket:
     """
     where = config.bind, config.port if port is None else port
     family = socket.AF_INET6 if ":" in config.bind else socket.AF_INET
-    # Named as TCP: asyncio sends small packets at once only where a socket says that it is. Answers take 50 ms otherwise.
+    # Named as TCP: asyncio sends small packets at once only where a socket says that it is; else answers take 50 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
