@@ -25,7 +25,7 @@ def control_drive(table: Table, folder: Path) -> ControlDrive:
 
 def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
     """The same of a drive with its own controller."""
-    return _read(table, folder, {"simulated": _supervised, "replay": _replay})
+    return _read(table, folder, {"simulated": _supervised, "replay": _replay, "opcua": _opcua})
 
 
 def _read(table: Table, folder: Path, kinds: dict[str, Callable[[Table, Path], _Drive]]) -> _Drive:
@@ -57,6 +57,13 @@ def _replay(table: Table, folder: Path) -> SupervisedDrive:
         table.boolean("loop", False),
         table.number("block_s", 0.05, positive=True),
     )
+
+
+def _opcua(table: Table, folder: Path) -> SupervisedDrive:
+    from servotwin.drives.opcua.drive import OpcUaDrive
+    from servotwin.drives.opcua.settings import of_table
+
+    return OpcUaDrive(of_table(table, folder))
 
 
 def _address(table: Table, folder: Path) -> str:

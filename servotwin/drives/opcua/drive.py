@@ -1,0 +1,155 @@
+"""The drive: samples from ring buffers, parameters committed as one."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from math import inf
+
+import msgspec
+
+from servotwin.drives.opcua import model, ring
+from servotwin.drives.opcua.session import Session
+from servotwin.drives.opcua.settings import OpcUaSettings
+from servotwin.edge.drive import Block, DriveLost, DriveRefused
+from servotwin.edge.parameters import Parameters
+from servotwin.errors import InvalidInput
+from servotwin.messages import Gains
+
+CHANGES = 8
+"""Versions whose first sample is remembered: more are never between two looks at the samples."""
+
+_ASKING = 0.01  # s between two looks whether parameters were taken
+
+
+class OpcUaDrive:
+    """`edge.drive.SupervisedDrive` of OPC UA nodes.
+
+    Samples written over before they were read show as a hole in the blocks' numbers; reconnected to the same run of the
+    machine it goes on with the sample that is due, as long as the ring buffers hold it.
+
+    Parameters
+    ----------
+    settings : OpcUaSettings
+    clock, sleep : callable
+        Monotonic seconds, and how to wait for some.
+    """
+
+    can_move = False
+    lag = 0.0
+
+    def __init__(
+        self,
+        settings: OpcUaSettings,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._settings, self._clock, self._sleep = settings, clock, sleep
+        self._session: Session | None = None
+        self._ready: deque[Block] = deque()
+        self._changes: deque[ring.Change] = deque(maxlen=CHANGES)
+        self._next: int | None = None
+        self._looked = -inf
+        self._margin, self.rate, self.machine = 0, 0.0, ""
+
+    def connect(self) -> None:
+        """Reach the server, at first or again; in a new run of the machine samples count from the present one."""
+        self.close()
+        self._session = Session(self._settings)
+        self.rate, self._margin, machine, count, version, since = self._session.read(
+            (*model.FIXED, "Machine", "Count", "Version", "Since")
+        )
+        if not all(type(number) is int for number in (self._margin, count, version, since)) or not _is_rate(self.rate):
+            raise InvalidInput(f"drive {self._settings.url}: its variables do not hold what the model says")
+        if machine != self.machine:
+            self.machine, self._next = machine, count
+            self._ready.clear()
+            self._changes.clear()
+        self._learn(ring.Change(since, version))
+
+    def read(self, most: int = 0) -> Block | None:
+        """The next samples; never None, since a drive's run does not end."""
+        deadline = self._clock() + self._settings.silence_s
+        while not self._ready:
+            self._sleep(max(0.0, self._looked + self._settings.poll_s - self._clock()))
+            self._looked = self._clock()
+            self._look(self._connected)
+            if not self._ready and self._clock() > deadline:
+                raise self._lost(f"no new sample for {self._settings.silence_s:g} s")
+        block = self._ready.popleft()
+        if not 0 < most < len(block.reference):
+            return block
+        self._ready.appendleft(_part(block, most, None))
+        return _part(block, 0, most)
+
+    def write(self, parameters: Parameters) -> None:
+        """Write all, commit, and wait for the drive's decision."""
+        session = self._connected
+        before, committed = session.read((model.COMMIT, model.DECISION[0]))
+        gains = parameters.gains or Gains(0.0, 0.0, 0.0, 1.0)
+        values = (parameters.version, parameters.tolerance, parameters.gains is not None)
+        session.write(dict(zip(model.PARAMETERS, (*values, *msgspec.structs.astuple(gains)), strict=True)))
+        commit = (max(before, committed) + 1) % 2**32
+        session.write({model.COMMIT: commit})
+        self._wait_for(session, commit)
+
+    def move(self, _offset: float) -> None:
+        """Nothing: the model has no probing moves."""
+
+    def close(self) -> None:
+        """End the session."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    @property
+    def _connected(self) -> Session:
+        if self._session is None:
+            raise DriveLost(f"drive {self._settings.url}: not connected")
+        return self._session
+
+    def _look(self, session: Session) -> None:
+        """Take what is new in the rings."""
+        machine, before, *signals, version, since, after = session.read(model.STATE)
+        if machine != self.machine:
+            raise self._lost("the machine began anew")
+        reading = ring.Reading(before, after, tuple(signals))
+        if not ring.sound(reading) or type(version) is not int or type(since) is not int:
+            raise self._lost("its variables do not hold what the model says")
+        self._learn(ring.Change(since, version))
+        due = before if self._next is None else self._next
+        first, fresh = ring.whole(reading, due, self._margin)
+        self._next = before
+        self._ready.extend(ring.blocks(first, fresh, list(self._changes)) if len(fresh[0]) else ())
+
+    def _learn(self, change: ring.Change) -> None:
+        if not self._changes or self._changes[-1] != change:
+            self._changes.append(change)
+
+    def _wait_for(self, session: Session, commit: int) -> None:
+        """Until the drive has decided."""
+        deadline = self._clock() + self._settings.silence_s
+        while True:
+            committed, refused, version, since = session.read((*model.DECISION, "Version", "Since"))
+            if committed == commit:
+                break
+            if self._clock() > deadline:
+                raise self._lost(f"parameters were not decided about for {self._settings.silence_s:g} s")
+            self._sleep(_ASKING)
+        if refused:
+            raise DriveRefused(f"drive {self._settings.url}: {refused}")
+        self._learn(ring.Change(since, version))
+
+    def _lost(self, why: str) -> DriveLost:
+        self.close()
+        return DriveLost(f"drive {self._settings.url}: {why}")
+
+
+def _is_rate(value: object) -> bool:
+    return isinstance(value, float) and 0.0 < value < inf
+
+
+def _part(block: Block, first: int, last: int | None) -> Block:
+    signals = (block.reference, block.theta_m, block.position, block.voltage)
+    return Block(block.first + first, block.version, *(signal[first:last] for signal in signals))

@@ -1,0 +1,34 @@
+"""The information model: one object with these variables, in one namespace (docs/howto/write-a-drive.md).
+
+Sample k of every signal is at place k modulo the arrays' length. The drive writes samples first and raises `Count`
+afterwards, by at most `Block` samples at a time; so whoever reads `Count`, the arrays, and `Count` again knows which
+places hold what they should. Parameters are written first, `Commit` after them: the drive looks at them when `Commit`
+changes, takes all or none, and then says so in `Committed` and `Refused`.
+"""
+
+NAMESPACE = "urn:servotwin:drive:1"
+OBJECT = "Drive"
+
+FIXED = ("Rate", "Block")
+"""Double, Hz; UInt32."""
+
+SIGNALS = ("Reference", "ThetaM", "Position", "Voltage")
+"""Double[]: m, rad, m, V."""
+
+STATE = ("Machine", "Count", *SIGNALS, "Version", "Since", "Count")
+"""String, the name of the machine's present run; UInt64, samples taken in it; the arrays; Int64, version in force, and
+UInt64, the first sample under it; the count again. Read in this order in one request."""
+
+GAINS = ("Kp", "Ki", "Kd", "Tf", "Enter", "Leave", "Feedforward")
+"""Double: V/m, V/(m s), V s/m, s, tolerances, tolerances, V."""
+
+PARAMETERS = ("NewVersion", "Tolerance", "SetGains", *GAINS)
+"""Int64; Double, m; Boolean, whether the gains count too; the gains."""
+
+COMMIT = "Commit"
+"""UInt32, another number each time."""
+
+DECISION = ("Committed", "Refused")
+"""UInt32, the last `Commit` that was decided; String, why not, or empty."""
+
+EVERY = tuple(dict.fromkeys((*FIXED, *STATE, *PARAMETERS, COMMIT, *DECISION)))

@@ -1,0 +1,141 @@
+"""An OPC UA session in a thread of its own, behind plain calls that wait."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Coroutine, Mapping, Sequence
+from concurrent.futures import TimeoutError as NoAnswer
+from contextlib import suppress
+from typing import Any, TypeVar
+
+from servotwin.drives.opcua import model
+from servotwin.drives.opcua.settings import OpcUaSettings
+from servotwin.edge.drive import DriveLost, DriveRefused
+from servotwin.errors import InvalidInput
+
+_Result = TypeVar("_Result")
+_CLOSING = 2.0  # s
+
+NEVER = (
+    "BadCertificate",
+    "BadIdentityToken",
+    "BadNoMatch",
+    "BadSecurity",
+    "BadUserAccess",
+    "BadUserSignature",
+)
+"""How the names of errors begin that trying again does not mend."""
+
+
+class Session:
+    """One connection, open from the start.
+
+    Parameters
+    ----------
+    settings : OpcUaSettings
+
+    Raises
+    ------
+    DriveLost
+        There is no answer.
+    InvalidInput
+        asyncua is not installed, the server does not let us in, or it has no such drive.
+    """
+
+    def __init__(self, settings: OpcUaSettings) -> None:
+        try:
+            from asyncua import ua
+            from asyncua.client.client import Client
+            from asyncua.ua.uaerrors import UaError
+        except ModuleNotFoundError:
+            raise InvalidInput("drive kind opcua needs asyncua; give: pip install 'servotwin[opcua]'") from None
+        self._ua, self._settings = ua, settings
+        self._failures = (OSError, TimeoutError, NoAnswer, asyncio.CancelledError, UaError, ValueError)
+        self._client = Client(settings.url, timeout=settings.silence_s)
+        self._nodes: dict[str, Any] = {}
+        self._types: dict[str, Any] = {}
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="opcua", daemon=True)
+        self._thread.start()
+        try:
+            self._wait(self._connect())
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self, names: Sequence[str]) -> list[Any]:
+        """Values of variables, in one request."""
+        return self._wait(self._client.read_values([self._nodes[name] for name in names]))
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Set variables in one request.
+
+        Raises
+        ------
+        DriveRefused
+            The server does not take one of them.
+        """
+        nodes = [self._nodes[name] for name in values]
+        typed = [self._typed(name, value) for name, value in values.items()]
+        statuses = self._wait(self._client.write_values(nodes, typed, raise_on_partial_error=False))
+        for name, status in zip(values, statuses, strict=True):
+            if not status.is_good():
+                raise DriveRefused(f"OPC UA variable {name} = {values[name]!r}: {status.name}")
+
+    def close(self) -> None:
+        """End the session, the thread and its loop."""
+        if self._loop.is_closed():
+            return
+        asyncio.run_coroutine_threadsafe(self._end(), self._loop)
+        self._thread.join(2.0 * _CLOSING)
+        if not self._thread.is_alive():
+            self._loop.close()
+
+    async def _connect(self) -> None:
+        s, client = self._settings, self._client
+        if s.user is not None and s.password is not None:
+            client.set_user(s.user)
+            client.set_password(s.password)
+        if s.certificate is not None and s.private_key is not None and s.server_certificate is not None:
+            from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+            files = str(s.certificate), str(s.private_key)
+            await client.set_security(
+                SecurityPolicyBasic256Sha256, *files, server_certificate=str(s.server_certificate)
+            )
+        await client.connect()
+        place = await client.get_namespace_index(model.NAMESPACE)
+        drive = await client.nodes.objects.get_child(f"{place}:{s.node}")
+        self._nodes = {name: await drive.get_child(f"{place}:{name}") for name in model.EVERY}
+        for name in (*model.PARAMETERS, model.COMMIT):
+            self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
+
+    def _typed(self, name: str, value: Any) -> Any:
+        return self._ua.DataValue(self._ua.Variant(value, self._types[name]))
+
+    def _wait(self, work: Coroutine[Any, Any, _Result]) -> _Result:
+        """The result of something in the loop's thread."""
+        waiting = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return waiting.result(2.0 * self._settings.silence_s)
+        except self._failures as error:
+            waiting.cancel()
+            raise self._meaning(error) from None
+
+    def _meaning(self, error: BaseException) -> Exception:
+        """What an error of the stack means for who drives."""
+        name, url = type(error).__name__, self._settings.url
+        told = f"drive {url}: {name}" + (f" ({error})" if str(error) else "")
+        missing = isinstance(error, ValueError) and not isinstance(error, OSError)
+        return InvalidInput(told) if missing or name.startswith(NEVER) else DriveLost(told)
+
+    async def _end(self) -> None:
+        """Leave in order if the server lets us, and let no task go on."""
+        with suppress(*self._failures):
+            await asyncio.wait_for(self._client.disconnect(), _CLOSING)
+        rest = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        for task in rest:
+            task.cancel()
+        await asyncio.gather(*rest, return_exceptions=True)
+        self._loop.call_soon(self._loop.stop)

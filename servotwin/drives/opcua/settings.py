@@ -1,0 +1,100 @@
+"""How an OPC UA drive is reached."""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from servotwin.drives.opcua.model import OBJECT
+from servotwin.errors import InvalidInput
+from servotwin.tomltable import Table
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(frozen=True)
+class OpcUaSettings:
+    """How an OPC UA drive is reached.
+
+    Parameters
+    ----------
+    url : str
+        opc.tcp://HOST:PORT[/PATH].
+    node : str
+        Browse name of the drive's object below Objects, in the model's namespace.
+    user, password : str, optional
+        Both or neither; without certificates on this machine only, since the password would be read on its way.
+    certificate, private_key, server_certificate : Path, optional
+        All or none, PEM or DER: what is said is signed and encrypted (Basic256Sha256), and the server must hold the
+        private key of its certificate.
+    poll_s : float
+        s from one look at the samples to the next; the rings must hold several times as much.
+    silence_s : float
+        s without an answer, or a new sample, after which the drive counts as lost.
+    """
+
+    url: str
+    node: str = OBJECT
+    user: str | None = None
+    password: str | None = field(default=None, repr=False)
+    certificate: Path | None = None
+    private_key: Path | None = None
+    server_certificate: Path | None = None
+    poll_s: float = 0.05
+    silence_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.url)
+        if parts.scheme != "opc.tcp" or not parts.hostname or parts.username is not None:
+            raise InvalidInput(
+                f"url = {self.url!r} is not allowed; give opc.tcp://HOST:PORT, and a user by its own key"
+            )
+        if (self.user is None) != (self.password is None):
+            raise InvalidInput("user and password_file (or password_env): both are needed, or neither")
+        secured = [value is not None for value in (self.certificate, self.private_key, self.server_certificate)]
+        if any(secured) != all(secured):
+            raise InvalidInput("certificate, private_key and server_certificate: all of them are needed, or none")
+        if not any(secured) and parts.hostname not in LOOPBACK:
+            raise InvalidInput(
+                f"url = {self.url!r}: beyond this machine certificate, private_key and server_certificate are needed"
+            )
+
+
+def of_table(table: Table, folder: Path) -> OpcUaSettings:
+    """From the table [drive]; paths are relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        A value is not allowed, or a file with the password is readable by others.
+    """
+    keys = ("certificate", "private_key", "server_certificate")
+    files = {key: folder / path for key in keys if (path := table.text(key, None)) is not None}
+    return OpcUaSettings(
+        table.text("url"),
+        table.text("node", OpcUaSettings.node),
+        table.text("user", None),
+        _password(table, folder),
+        **files,
+        poll_s=table.number("poll_s", OpcUaSettings.poll_s, positive=True),
+        silence_s=table.number("silence_s", OpcUaSettings.silence_s, positive=True),
+    )
+
+
+def _password(table: Table, folder: Path) -> str | None:
+    """From a file of mode 0600, or from an environment variable: never from the table itself."""
+    name, variable = table.text("password_file", None), table.text("password_env", None)
+    if variable is not None:
+        if variable not in os.environ:
+            raise table.invalid("password_env", "the name of an environment variable that is set")
+        return os.environ[variable]
+    if name is None:
+        return None
+    path = folder / name
+    try:
+        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        raise table.invalid("password_file", "a text file that can be read") from None
+    if mode & 0o077:
+        raise table.invalid("password_file", "a file of mode 0600: this one is open to others")
+    return text

@@ -1,0 +1,132 @@
+"""An OPC UA server that drives a simulated machine: `python opcua_machine.py OPTIONS` with OPTIONS as JSON.
+
+plant: a machine's TOML; url; speed; ring: samples; block: samples; user, password; certificate, private_key.
+It prints "ready URL" when it listens.
+"""
+
+import asyncio
+import json
+import os
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from asyncua import Server, ua
+from asyncua.crypto.permission_rules import User, UserRole
+
+from servotwin.drives.opcua import model
+from servotwin.drives.simulated.plants import SupervisedPlant
+from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.errors import InvalidInput
+from servotwin.messages import Gains
+
+STARTS = {
+    "Rate": (0.0, ua.VariantType.Double),
+    "Block": (0, ua.VariantType.UInt32),
+    "Machine": ("", ua.VariantType.String),
+    "Count": (0, ua.VariantType.UInt64),
+    "Version": (0, ua.VariantType.Int64),
+    "Since": (0, ua.VariantType.UInt64),
+    "NewVersion": (0, ua.VariantType.Int64),
+    "SetGains": (False, ua.VariantType.Boolean),
+    "Commit": (0, ua.VariantType.UInt32),
+    "Committed": (0, ua.VariantType.UInt32),
+    "Refused": ("", ua.VariantType.String),
+}
+
+
+class Users:
+    """One user, if any."""
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self._known = options.get("user"), options.get("password")
+
+    def get_user(self, _server: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
+        del certificate
+        return User(role=UserRole.User) if (username, password) == self._known else None
+
+
+class Machine:
+    """The variables and the plant behind them."""
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self.options = options
+        self.plant = SupervisedPlant(MachineSettings.load(options["plant"]))
+        self.rings = np.zeros((4, options.get("ring", 4000)))
+        self.variables: dict[str, Any] = {}
+        self.committed = 0
+
+    async def offer(self, server: Server) -> None:
+        place = await server.register_namespace(model.NAMESPACE)
+        drive = await server.nodes.objects.add_object(place, self.options.get("node", model.OBJECT))
+        for name in model.EVERY:
+            value, kind = STARTS.get(name, (0.0, ua.VariantType.Double))
+            start = self.rings[0].tolist() if name in model.SIGNALS else value
+            self.variables[name] = await drive.add_variable(place, name, start, kind)
+            if name in model.PARAMETERS or name == model.COMMIT:
+                await self.variables[name].set_writable()
+        await self.set("Rate", 5000.0)
+        await self.set("Block", self.plant.block)
+        await self.set("Machine", os.urandom(4).hex())
+
+    async def set(self, name: str, value: Any) -> None:
+        await self.variables[name].write_value(value, STARTS.get(name, (0.0, ua.VariantType.Double))[1])
+
+    async def step(self) -> None:
+        await self.decide()
+        first = self.plant.index
+        self.plant.advance(self.plant.block)
+        found = self.plant.read(first, self.plant.block)
+        assert found is not None
+        self.rings[:, np.arange(first, self.plant.index) % self.rings.shape[1]] = found.values
+        for name, ring in zip(model.SIGNALS, self.rings, strict=True):
+            await self.set(name, ring.tolist())
+        await self.set("Count", self.plant.index)
+
+    async def decide(self) -> None:
+        commit = await self.variables["Commit"].read_value()
+        if commit == self.committed:
+            return
+        self.committed = commit
+        version, tolerance, with_gains, *gains = [await self.variables[name].read_value() for name in model.PARAMETERS]
+        refused = ""
+        try:
+            self.plant.write(version, tolerance, Gains(*gains) if with_gains else None)
+        except (InvalidInput, ValueError) as error:
+            refused = str(error)
+        else:
+            await self.set("Since", self.plant.index)
+            await self.set("Version", version)
+        await self.set("Refused", refused)
+        await self.set("Committed", commit)
+
+    async def run(self, speed: float) -> None:
+        start, begin = time.monotonic(), self.plant.index
+        while True:
+            due = start + (self.plant.index - begin) / (5000.0 * speed)
+            await asyncio.sleep(max(0.0, due - time.monotonic()))
+            if time.monotonic() - due > 0.5:  # stopped for a while: that time is given up
+                start, begin = time.monotonic(), self.plant.index
+            await self.step()
+
+
+async def serve(options: dict[str, Any]) -> None:
+    server = Server(user_manager=Users(options) if "user" in options else None)
+    await server.init()
+    server.set_endpoint(options["url"])
+    if "certificate" in options:
+        await server.load_certificate(options["certificate"])
+        await server.load_private_key(options["private_key"])
+        server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+    if "user" in options:
+        server.set_identity_tokens([ua.UserNameIdentityToken])
+    machine = Machine(options)
+    await machine.offer(server)
+    async with server:
+        print("ready", options["url"], flush=True)
+        await machine.run(options.get("speed", 1.0))
+
+
+if __name__ == "__main__":
+    asyncio.run(serve(json.loads(sys.argv[1])))
