@@ -13,6 +13,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
+from servotwin.link.broker import is_mqtt
 from servotwin.tomltable import Table
 
 ROLES = ("control", "supervise")
@@ -28,15 +29,19 @@ class TwinLink:
     Parameters
     ----------
     url : str
-        http(s)://host[:port][/path].
+        http(s)://host[:port][/path], or a broker's: mqtt(s)://host[:port].
     token_file, token_env : str, optional
         Where the servo's token is: a file of mode 0600, or an environment variable; one of them.
     ca_file : str, optional
-        Certificates that the twin's is checked against; None: the system's.
+        Certificates that the twin's, or the broker's, is checked against; None: the system's.
     timeout_s : float
         For an answer, s.
     wait_s : float
         How long one poll waits for something new, s.
+    user : str, optional
+        Of the edge at the broker.
+    password_file, password_env : str, optional
+        Where the user's password is, as the token is given.
     """
 
     url: str
@@ -45,22 +50,29 @@ class TwinLink:
     ca_file: str | None = None
     timeout_s: float = 10.0
     wait_s: float = 25.0
+    user: str | None = None
+    password_file: str | None = None
+    password_env: str | None = None
 
     def __post_init__(self) -> None:
-        try:
-            parts = urlsplit(self.url)
-            good = parts.scheme in ("http", "https") and parts.hostname and not (parts.query or parts.fragment)
-            good = good and parts.username is None and (parts.port is None or parts.port > 0)
-        except ValueError:
-            good = False
-        if not good:
-            raise InvalidInput(f"url = {self.url!r} is not allowed; give http(s)://host[:port][/path]")
+        if not (self.over_mqtt or _is_http(self.url)):
+            allowed = "http(s)://host[:port][/path] or mqtt(s)://host[:port]"
+            raise InvalidInput(f"url = {self.url!r} is not allowed; give {allowed}")
+        if not self.over_mqtt and self.user is not None:
+            raise InvalidInput(f"user = {self.user!r} is for a broker, mqtt(s)://host[:port]; url is {self.url!r}")
+        if (self.password_file, self.password_env).count(None) != (2 if self.user is None else 1):
+            raise InvalidInput("user and one of password_file and password_env belong together")
         if (self.token_file is None) == (self.token_env is None):
             raise InvalidInput("token_file or token_env is needed, and only one of them")
         if not 0.0 < self.timeout_s < inf:
             raise InvalidInput(f"timeout_s = {self.timeout_s!r} s: must be finite and greater than 0")
         if not 0.0 <= self.wait_s <= 30.0:
             raise InvalidInput(f"wait_s = {self.wait_s!r} s: must be 0 to 30")
+
+    @property
+    def over_mqtt(self) -> bool:
+        """Whether the twin is reached over a broker."""
+        return is_mqtt(self.url)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,20 +204,40 @@ def token_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.e
     InvalidInput
         There is none, or others may read its file; the token itself is never shown.
     """
-    if twin.token_env is not None:
-        token = environment.get(twin.token_env, "").strip()
-        return _checked(token, f"environment variable {twin.token_env}")
-    assert twin.token_file is not None
-    path = folder / twin.token_file
+    return _secret("token", twin.token_file, twin.token_env, folder, environment)
+
+
+def password_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str | None:
+    """The password of the edge's user at the broker, None where there is no user; raises InvalidInput as `token_of`."""
+    if twin.user is None:
+        return None
+    return _secret("password", twin.password_file, twin.password_env, folder, environment)
+
+
+def _is_http(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        good = parts.scheme in ("http", "https") and parts.hostname and not (parts.query or parts.fragment)
+        return bool(good) and parts.username is None and (parts.port is None or parts.port > 0)
+    except ValueError:
+        return False
+
+
+def _secret(what: str, file: str | None, variable: str | None, folder: Path, environment: Mapping[str, str]) -> str:
+    """From a private file or the environment."""
+    if variable is not None:
+        return _checked(what, environment.get(variable, "").strip(), f"environment variable {variable}")
+    assert file is not None
+    path = folder / file
     try:
         if path.stat().st_mode & 0o077:
             raise InvalidInput(f"{path}: others than its owner may open it; give it mode 0600")
-        return _checked(path.read_text(encoding="utf-8").strip(), str(path))
+        return _checked(what, path.read_text(encoding="utf-8").strip(), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(f"{path}: the token cannot be read ({error})") from None
+        raise InvalidInput(f"{path}: the {what} cannot be read ({error})") from None
 
 
-def _checked(token: str, where: str) -> str:
-    if not token or not token.isascii() or not token.isprintable() or " " in token:
-        raise InvalidInput(f"{where}: holds no token; printable characters without spaces are allowed")
-    return token
+def _checked(what: str, secret: str, where: str) -> str:
+    if not secret or not secret.isascii() or not secret.isprintable() or " " in secret:
+        raise InvalidInput(f"{where}: holds no {what}; printable characters without spaces are allowed")
+    return secret

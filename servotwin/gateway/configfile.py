@@ -29,6 +29,9 @@ _TWIN: Mapping[str, Reader] = {
     "ca_file": ("ca_file", Table.text),
     "timeout_s": ("timeout_s", Table.number),
     "wait_s": ("wait_s", Table.number),
+    "user": ("user", Table.text),
+    "password_file": ("password_file", Table.text),
+    "password_env": ("password_env", Table.text),
 }
 _KEEPING: Mapping[str, Reader] = {
     "outbox": ("outbox", Table.text),

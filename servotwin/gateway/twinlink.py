@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from servotwin.gateway.config import EdgeConfig, token_of
+from servotwin.gateway.config import EdgeConfig, password_of, token_of
+from servotwin.link.broker import Broker
 from servotwin.link.courier import Courier
 from servotwin.link.http import HttpTransport
 from servotwin.link.listener import Listener
+from servotwin.link.mqtt import MqttTransport
 from servotwin.link.sqliteoutbox import SqliteOutbox
 from servotwin.link.transport import Transport
 
@@ -22,6 +24,9 @@ def transport_of(config: EdgeConfig) -> Transport | None:
         return None
     ca_file = None if twin.ca_file is None else str(config.path(twin.ca_file))
     token = token_of(twin, config.folder)
+    if twin.over_mqtt:
+        broker = Broker(twin.url, twin.user, password_of(twin, config.folder), ca_file)
+        return MqttTransport(broker, config.agent.servo, token, twin.timeout_s, twin.wait_s)
     return HttpTransport(twin.url, config.agent.servo, token, ca_file, twin.timeout_s, twin.wait_s)
 
 
