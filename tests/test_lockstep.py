@@ -12,7 +12,7 @@ from servotwin.cosim import Loop, cosimulate
 from servotwin.drives.simulated.client import SimulatedSupervised
 from servotwin.errors import InvalidInput
 from servotwin.lockstep import HttpTwin, LockStep, lock_step
-from servotwin.messages import Update, encode
+from servotwin.messages import Update, decode, encode
 from servotwin.scenario import Scenario
 from servotwin.twin.evidence import plain
 
@@ -118,7 +118,7 @@ def test_deployed_is_simulated(
     assert [encode(each) for each in found.receipts] == [encode(each) for each in loop.receipts]
     assert len(loop.updates) >= updates
     assert dict.fromkeys(encode(each) for each in found.sent if isinstance(each, Update)) == dict.fromkeys(
-        encode(update) for update in loop.updates
+        encode(decode(encode(update))) for update in loop.updates
     )
     estimates = {key: msgspec.msgpack.decode(body)["estimate"] for key, body in stored(tmp_path, "estimate").items()}
     assert estimates == {key: msgspec.msgpack.decode(body) for key, body in in_memory(loop).items()}
