@@ -33,6 +33,7 @@ class FakeTwin:
         self.sockets: set[socket.socket] = set()
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), type("Bound", (Handler,), {"twin": self}))
         self.server.daemon_threads = True
+        self.server.handle_error = lambda *_: None  # an edge that is killed leaves its connections as they are
         self.thread = threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True)
         self.thread.start()
 

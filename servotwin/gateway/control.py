@@ -73,7 +73,6 @@ class Controlling:
         self._safe = sensor.safe_voltage
         self._due: int | None = None
         self._reference = edge.config.agent.reference
-        self._samples = 0
 
     def step(self) -> bool:
         """One sample; whether the run goes on. Raises `DriveLost`."""
@@ -103,15 +102,14 @@ class Controlling:
     def _tick(self, sample: Sample) -> None:
         edge, agent = self._edge, self._edge.agent
         if isfinite(sample.reference):
-            self._reference = sample.reference
+            self._reference = sample.reference  # where there is none, the last one holds
         wanted = self._reference + agent.offset
         if agent.parameters is not self._in_force:
             self._in_force = agent.parameters
             self.law.change(self._law(self._in_force), wanted, sample.position)
-        given = wanted if isfinite(sample.reference) else sample.reference
-        voltage = self.law.tick(given, sample.position)
+        voltage = self.law.tick(wanted, sample.position)
         self._drive.write(voltage)
-        if self.law.bad:
+        if not isfinite(sample.reference + sample.theta_m + sample.position):
             edge.counts["bad samples"] += 1
         edge.send(agent.absorb(wanted, sample.theta_m, sample.position, voltage))
 

@@ -21,9 +21,8 @@ def _simulated(table: Table, role: str, folder: Path) -> Drive:
     silence = table.number("silence_s", 5.0, minimum=0.0)
     kind, _, path = address.partition(":")
     placed = f"unix:{folder / path}" if kind == "unix" else address
-    return (
-        client.SimulatedControl(placed, silence) if role == "control" else client.SimulatedSupervised(placed, silence)
-    )
+    made = client.SimulatedControl if role == "control" else client.SimulatedSupervised
+    return made(placed, silence)
 
 
 KINDS: Mapping[str, Reader] = {"simulated": _simulated}

@@ -11,13 +11,13 @@ from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import kept, restored
 from servotwin.gateway.config import EdgeConfig
-from servotwin.gateway.frames import TicksFrame
+from servotwin.gateway.frames import TicksFrame, Value
 from servotwin.gateway.log import say
 from servotwin.gateway.outlet import PipeOutlet
 from servotwin.gateway.ticks import Counts
 
 Clock = Callable[[], float]
-CHILD_S, TOLD_S = 0.1, 1.0
+CHILD_S, TOLD_S, PIECE_S = 0.1, 1.0, 0.005
 
 
 class Child(Protocol):
@@ -54,8 +54,8 @@ class Edge:
     child : Child
     first : Parameters, optional
         Kept from an earlier start.
-    clock : callable
-        Monotonic, s.
+    clock, pause : callable
+        Monotonic, s; wait for so long, s.
     """
 
     def __init__(
@@ -66,19 +66,15 @@ class Edge:
         child: Child,
         first: Parameters | None,
         clock: Clock,
+        pause: Callable[[float], None],
     ) -> None:
-        self.config, self.clock = config, clock
+        self.config, self.clock, self._pause = config, clock, pause
         self.counts: Counter[str] = Counter()
         self.ticks = Counts()
         self._boot, self._boots = boot, 0
         self._outlet, self._child = outlet, child
         self._child_due = self._told_due = clock()
         self.agent = self._begun(first)
-
-    @property
-    def late(self) -> bool:
-        """Whether something is to be tended."""
-        return self.clock() >= self._child_due
 
     def begin(self, why: str) -> None:
         """Samples are missing: a new boot, on the parameters in force."""
@@ -114,6 +110,17 @@ class Edge:
             self._told_due = now + TOLD_S
             self._outlet.tell(self._told())
 
+    def finish(self, seconds: float) -> None:
+        """Give the link process a while to take what is left, and a last word on how it went."""
+        end, told = self.clock() + seconds, False
+        while self.clock() < end and not (told and self._outlet.settled):
+            if self._outlet.settled:
+                self._outlet.tell(self._told())
+                told = True
+            self.exchange()
+            self._child.tend(self.clock())
+            self._pause(PIECE_S)
+
     def _begun(self, first: Parameters | None) -> Agent:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
         self._outlet.boot = boot
@@ -125,7 +132,7 @@ class Edge:
 
     def _told(self) -> TicksFrame:
         agent, p = self.agent, self.agent.parameters
-        values: dict[str, float | int | str | None] = {
+        values: dict[str, Value] = {
             "version": p.version,
             "tolerance_m": p.tolerance,
             "gap_rad": p.gap,

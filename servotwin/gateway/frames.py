@@ -15,6 +15,8 @@ from servotwin.edge.cut import Cut
 from servotwin.edge.store import Kept
 from servotwin.messages import InvalidMessage
 
+Value = float | int | str | bool | None
+
 
 class CutFrame(Struct, frozen=True, array_like=True, tag="cut"):
     """A cut window, raw: doubles as this machine has them."""
@@ -63,7 +65,7 @@ class TicksFrame(Struct, frozen=True, array_like=True, tag="ticks"):
 
     boot: str
     samples: int
-    values: dict[str, float | int | str | None]
+    values: dict[str, Value]
     dropped: dict[str, int]
     ticks: bytes
 

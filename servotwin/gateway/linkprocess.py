@@ -27,7 +27,7 @@ from servotwin.gateway.status import write_status
 from servotwin.gateway.ticks import summary
 from servotwin.gateway.twinlink import courier_of, listener_of, transport_of
 from servotwin.link.sqliteoutbox import SqliteOutbox
-from servotwin.messages import Acknowledge, encode
+from servotwin.messages import Acknowledge, InvalidMessage, encode
 
 NICE = 10
 TEND_S = 1.0
@@ -96,11 +96,17 @@ class LinkProcess:
             if self._woken in readable:
                 self._woken.recv(4096)
             if self._end in readable:
-                for data in self._pipe.take():
-                    self._take(frames.to_link(data))
+                self._receive()
             if time.monotonic() >= tended + TEND_S:
                 tended = time.monotonic()
                 self._tend()
+
+    def _receive(self) -> None:
+        for data in self._pipe.take():
+            try:
+                self._take(frames.to_link(data))
+            except InvalidMessage:
+                self._faults["frame not understood"] += 1
 
     def _take(self, frame: frames.ToLink) -> None:
         if isinstance(frame, frames.TicksFrame):
@@ -159,6 +165,7 @@ class LinkProcess:
             self._transport.close()
         for thread in threads:
             thread.join()
+        self._tend()
         self.outbox.close()
         for end in (self._wake, self._woken):
             end.close()
@@ -184,7 +191,7 @@ class LinkProcess:
         if self._courier is not None and self._listener is not None:
             known["up"] = {"trouble": self._courier.trouble, **self._courier.counts}
             known["down"] = {"trouble": self._listener.trouble, **self._listener.counts}
-        return {**known, "written": time.time()}
+        return {**known, "link_process": os.getpid(), "written": time.time()}
 
 
 def main(arguments: list[str]) -> int:

@@ -72,6 +72,11 @@ class PipeOutlet:
         """Whether a link process listens."""
         return self._pipe is not None and not self._pipe.broken
 
+    @property
+    def settled(self) -> bool:
+        """Whether the link process has taken everything."""
+        return not self._kept and (self._pipe is None or self._pipe.backlog == 0)
+
     def connect(self, pipe: Pipe) -> None:
         """A new link process: it is given everything that the last one may not have taken."""
         self.disconnect()

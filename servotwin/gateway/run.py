@@ -26,7 +26,7 @@ from servotwin.gateway.outlet import PipeOutlet
 from servotwin.gateway.supervise import Supervising
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_RECONNECT_S, _PIECE_S = 1.0, 0.02
+_RECONNECT_S, _PIECE_S, _FINISH_S = 1.0, 0.02, 3.0
 
 
 class Role(Protocol):
@@ -74,8 +74,9 @@ def run(path: str | os.PathLike[str]) -> None:
     stop = Stop()
     before = [signal.signal(each, stop) for each in SIGNALS]
     try:
-        edge = Edge(config, boot, outlet, child, first, time.monotonic)
+        edge = Edge(config, boot, outlet, child, first, time.monotonic, time.sleep)
         until(stop, edge, drive, lambda: _role(edge, drive))
+        edge.finish(_FINISH_S)
     finally:
         child.close()
         drive.close()
