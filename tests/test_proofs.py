@@ -216,6 +216,5 @@ def test_a_question_comes_back_from_its_bytes(fleet: Fleet) -> None:
     question = decode_question(asked.body)
     assert isinstance(question, Question)
     assert msgspec.msgpack.encode(question) == asked.body
-    assert isinstance(
-        policy_of(SERVO, fleet.models[0].settings).policy.confirm(*(question.region, question.setting)), Certificate
-    )
+    policy = certified(SERVO, fleet.models[0].settings)
+    assert isinstance(policy.confirm(question.region, question.setting), Certificate)
