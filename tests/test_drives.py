@@ -2,6 +2,8 @@
 
 import signal
 import socket
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from servotwin.control import law
 from servotwin.control.gains import gains_of
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.client import SimulatedControl, SimulatedSupervised
+from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, Sample, SupervisedDrive
 from servotwin.edge.parameters import Parameters
@@ -220,6 +223,48 @@ def test_rubbish_from_a_client_ends_that_client_only(tmp_path: Path) -> None:
             drive.close()
             drive.connect()
             assert len(drive.read(5).position) == 5
+
+
+def test_without_its_edge_the_voltage_holds_until_the_watchdog_takes_it_away(tmp_path: Path) -> None:
+    path = plant_file(tmp_path, "control", endless=True, watchdog_s=0.01)
+    alone, attended = (ControlledPlant(MachineSettings.load(path)) for _ in range(2))
+    for plant in (alone, attended):
+        plant.tick(0.7)
+    for sample in range(200):
+        alone.run_alone()
+        attended.tick(0.7 if sample < 50 else 0.0)
+        assert alone.sample() == attended.sample()
+    assert (alone.index, alone.over) == (201, False)
+
+
+def test_samples_wait_for_their_reader_and_not_for_ever(tmp_path: Path) -> None:
+    plant = SupervisedPlant(MachineSettings.load(plant_file(tmp_path, "supervise", 1.0, keep_s=0.1)))
+    for _ in range(19):
+        plant.advance(250)
+    plant.write(4, 1e-5, None)
+    assert plant.read(4200, 10).first == 4250
+    assert plant.read(4300, 10).values.shape == (4, 10)
+    assert plant.read(4750, 10) is None
+    plant.advance(1000)
+    assert (plant.index, plant.over) == (4999 + 1, True)
+    assert (plant.read(4750, 10).version, plant.read(4749, 10).version) == (4, 0)
+    assert plant.read(5000, 1) is None
+
+
+def test_the_clients_need_neither_numpy_nor_asyncua() -> None:
+    program = """
+import sys
+for name in ("numpy", "scipy", "numba", "asyncua", "typer", "rich"):
+    sys.modules[name] = None
+from servotwin.drives.table import control_drive, supervised_drive
+from servotwin.drives.opcua.drive import OpcUaDrive
+from servotwin.tomltable import Table
+from pathlib import Path
+control_drive(Table("t", {"kind": "simulated", "address": "unix:x"}), Path()).close()
+supervised_drive(Table("t", {"kind": "replay", "log": "x.csv"}), Path()).close()
+supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), Path()).close()
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 @pytest.mark.parametrize(
