@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -129,12 +130,12 @@ class Connection:
 
     def __init__(self, broker: Broker, wanted: Wanted, events: Events) -> None:
         self._wanted, self._events = wanted, events
-        self._number, self._fresh, self._closing = 0, True, False
+        self._number, self._fresh, self._up, self._closing = 0, True, False, False
         self._client = _client(broker, wanted)
         self._client.on_socket_open = _no_delay
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_subscribe, self._client.on_message = self._subscribed, self._message
-        self._client.on_connect_fail = lambda *_: self._events.lost("the broker cannot be reached")
+        self._client.on_connect_fail = self._failed
         self._client.connect_async(
             *broker.address, keepalive=KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(wanted)
         )
@@ -160,7 +161,7 @@ class Connection:
         if reason.is_failure:
             self._events.lost(f"the broker refuses the connection ({reason})")
             return
-        self._number += 1
+        self._number, self._up = self._number + 1, True
         self._fresh = not flags.session_present
         client.subscribe([(topic, _at_least_once()) for topic in self._wanted.topics])
 
@@ -172,8 +173,13 @@ class Connection:
         self._events.ready(self._fresh)
 
     def _disconnected(self, _client: Client, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        if not self._closing:
+        if self._up and not self._closing:
             self._events.lost(f"the connection to the broker broke ({reason})")
+        self._up = False
+
+    def _failed(self, _client: Client, _user: Any) -> None:
+        """Called while the exception is being handled, which paho does not pass on."""
+        self._events.lost(f"the broker cannot be reached ({sys.exc_info()[1]})")
 
     def _message(self, _client: Client, _user: Any, message: MQTTMessage) -> None:
         number, mid, qos = self._number, message.mid, message.qos

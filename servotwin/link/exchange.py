@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from servotwin.link.seal import OVERHEAD, TO_TWIN, Sealed, opened, seal
 from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
-from servotwin.messages.checks import Count, require
+from servotwin.messages.checks import Count
 
 ROOT = "servotwin"
 GONE = f"{ROOT}/gone"
@@ -160,9 +160,8 @@ def answered(key: bytes, servo: str, data: bytes) -> tuple[int, Answer | Strange
 
 
 def _read(data: bytes, limit: int) -> Sealed | Stranger | None:
-    """None: neither."""
-    require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed", Refusal.TOO_LARGE)
+    """None: neither, or too large to look at."""
     try:
-        return _down.decode(data)
+        return _down.decode(data) if len(data) <= limit else None
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return None

@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta, Struct
 
-from servotwin.messages import InvalidMessage
+from servotwin.messages import InvalidMessage, Refusal
 from servotwin.messages.checks import Count, Name, require
 
 TO_EDGE, TO_TWIN = "to edge", "to twin"
@@ -66,9 +66,8 @@ def opened(key: bytes, direction: str, servo: str, data: bytes, limit: int) -> S
     InvalidMessage
         Too large, not a sealed message, another servo's, or the seal is broken.
     """
-    require(
-        len(data) <= limit + OVERHEAD, f"sealed message of {len(data)} bytes: at most {limit + OVERHEAD} are allowed"
-    )
+    most = limit + OVERHEAD
+    require(len(data) <= most, f"sealed message of {len(data)} bytes: at most {most} are allowed", Refusal.TOO_LARGE)
     try:
         found = _decoder.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

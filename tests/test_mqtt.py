@@ -1,0 +1,409 @@
+"""The link over MQTT with a real broker: exactly once, whatever dies; nobody speaks for another's servo."""
+
+import asyncio
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mosquitto import Login, Mosquitto, Tls, broker, free_port
+from relay import Relay, State, Weather
+from selfsigned import self_made
+
+from servotwin.errors import InvalidInput
+from servotwin.link import exchange
+from servotwin.link.broker import Broker, Connection, Events, Wanted
+from servotwin.link.mqtt import MqttTransport
+from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
+from servotwin.link.transport import Parcel, Refused, Unreachable, squeezed
+from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Window, checksum, encode, pack_channel
+from servotwin.service.auth import Authority
+from servotwin.service.brokerdesk import Desk, Parts
+from servotwin.service.future import Boots
+from servotwin.service.ingest import Ingest
+from servotwin.service.landing import Landing
+from servotwin.service.limits import Buckets
+from servotwin.service.metrics import Metrics
+from servotwin.service.mqtt import Bridge
+from servotwin.service.outgoing import Outgoing
+from servotwin.service.tokens import Verifiers
+from servotwin.store.groupcommit import GroupCommit
+from servotwin.store.rows import Outcome, Posted
+from servotwin.store.store import Store, open_store
+
+CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
+SERVOS = ("axis-1", "axis-2")
+TOKENS = {servo: f"token of {servo}" for servo in SERVOS}
+VERIFIERS = Verifiers({servo: verifier_of(token) for servo, token in TOKENS.items()})
+PATIENCE = 60.0
+
+
+def window(sequence: int, servo: str = "axis-1") -> Window:
+    return Window(servo, "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+
+
+def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
+    return Parcel(servo, *squeezed(encode(window(sequence, servo))), "b0", sequence)
+
+
+class Twin:
+    """The service without HTTP and without estimation, on a thread of its own."""
+
+    def __init__(self, at: Broker, store: Store) -> None:
+        self.metrics, self.store = Metrics(), store
+        self.commits = GroupCommit(store)
+        self._broker, self._began, self._thread = at, threading.Event(), threading.Thread(target=self._run)
+        self._thread.start()
+        assert self._began.wait(PATIENCE)
+
+    def post(self, servo: str, body: bytes) -> None:
+        """What a worker's outcome does."""
+        (claim,) = (each for each in self.store.claim("test", 10, 60.0, 0.0) if each.servo == servo)
+        done = tuple(message.id for message in claim.messages)
+        assert self.store.commit([Outcome(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [True]
+        self._loop.call_soon_threadsafe(self.outgoing.post, servo)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(PATIENCE)
+        self.commits.close()
+
+    def _run(self) -> None:
+        asyncio.run(self._main())
+
+    async def _main(self) -> None:
+        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), Landing()
+        self.outgoing = Outgoing(self._posted, 100, 0.2)
+        boots = Boots(1.0, 1e9)
+        ingest = Ingest(lambda incoming: landing(self.commits.put(incoming)), SERVOS.__contains__, boots, self.metrics)
+        buckets = Buckets(1e6, 1e6, self._loop.time)
+        parts = Parts(
+            Authority(VERIFIERS), SERVOS.__contains__, buckets, ingest, self.outgoing, lambda: None, self.metrics
+        )
+        bridge = Bridge(self._broker, Desk(parts), "twins")
+        await bridge.begin()
+        while not bridge.connected:
+            await asyncio.sleep(0.01)
+        self._began.set()
+        await self._stop.wait()
+        self.outgoing.close()
+        await bridge.end()
+
+    async def _posted(self, servo: str, serial: int) -> list[Posted]:
+        return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Mosquitto]:
+    with broker(tmp_path / "broker") as running:
+        yield running
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = open_store(f"sqlite:///{tmp_path}/twin.db")
+    yield store
+    store.close()
+
+
+@contextmanager
+def twin(at: Broker, store: Store) -> Iterator[Twin]:
+    running = Twin(at, store)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@contextmanager
+def edge(at: Broker, servo: str = "axis-1", token: str | None = None, **times: float) -> Iterator[MqttTransport]:
+    options = {"timeout_s": 10.0, "wait_s": 5.0} | times
+    transport = MqttTransport(at, servo, TOKENS[servo] if token is None else token, **options)
+    try:
+        yield transport
+    finally:
+        transport.close()
+
+
+def insist(deliver: Callable[[], None]) -> int:
+    """As an outbox does: again and again; how often it took."""
+    for times in range(1, 100):
+        try:
+            deliver()
+        except Unreachable:
+            continue
+        return times
+    raise AssertionError("never delivered")
+
+
+def kept(store: Store, servo: str = "axis-1") -> list[int]:
+    """Sequences of the windows in the store."""
+    return sorted(held.sequence for held in store.windows(servo, 10_000))
+
+
+def refusals(running: Twin) -> dict[str, int]:
+    return {code: number for (code,), number in running.metrics.refused.values.items()}
+
+
+def test_windows_letters_and_messages_go_both_ways(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there, edge(at, wait_s=20.0) as here, ThreadPoolExecutor(1) as pool:
+        here.deliver(parcel(0))
+        here.deliver(parcel(0))
+        here.deliver(Parcel("axis-1", encode(Hello("axis-1", "b0", 0.0, 10.0, 0, 0.0, ""))))
+        assert kept(store) == [0]
+        polled = pool.submit(here.listen, 0)
+        there.post("axis-1", b"first")
+        (sealed,) = polled.result(PATIENCE)
+        found = opened(key_of(verifier_of(TOKENS["axis-1"])), TO_EDGE, "axis-1", sealed, 100)
+        assert (found.serial, found.body) == (1, b"first")
+        assert here.listen(0) == [sealed]
+        assert there.metrics.taken.values == {("window", "new"): 1, ("window", "known"): 1, ("letter", "new"): 1}
+
+
+def test_a_poll_without_news_ends_empty(server: Mosquitto, store: Store) -> None:
+    with twin(Broker(server.url), store), edge(Broker(server.url), wait_s=0.1) as here:
+        assert here.listen(0) == []
+
+
+def test_small_packets_leave_at_once(server: Mosquitto, store: Store) -> None:
+    """Without TCP_NODELAY a window takes 88 ms there and back on one machine."""
+    with edge(Broker(server.url)) as here:
+        here._ready.wait(PATIENCE)
+        assert here._connection._client.socket().getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
+
+
+def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as one, twin(at, store) as other, edge(at) as first, edge(at, "axis-2") as second:
+        for k in range(20):
+            first.deliver(parcel(k))
+            second.deliver(parcel(k, "axis-2"))
+        taken = [sum(each.metrics.taken.values.values()) for each in (one, other)]
+        assert sum(taken) == 40
+        assert min(taken) > 0
+        assert kept(store) == kept(store, "axis-2") == list(range(20))
+
+
+def test_a_user_and_a_password_where_the_broker_asks_for_them(tmp_path: Path, store: Store) -> None:
+    logins = Login("edge", "edge's password"), Login("twin", "twin's password")
+    with broker(tmp_path / "broker", logins) as server:
+        twins, edges = (Broker(server.url, *login) for login in reversed(logins))
+        with twin(twins, store), edge(edges) as here, edge(Broker(server.url), timeout_s=1.0) as nobody:
+            here.deliver(parcel(0))
+            with pytest.raises(Unreachable, match="refuses the connection"):
+                nobody.deliver(parcel(1))
+    assert kept(store) == [0]
+    assert "password" not in repr(edges)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_over_tls_the_brokers_certificate_is_checked(tmp_path: Path, store: Store) -> None:
+    """The socket of a handshake that failed is left by paho to the garbage collector, which warns."""
+    files = Tls(*self_made(tmp_path))
+    with broker(tmp_path / "broker", tls=files) as server:
+        trusted = Broker(server.url, ca_file=str(files.certificate))
+        with twin(trusted, store), edge(trusted) as here, edge(Broker(server.url), timeout_s=1.0) as doubting:
+            here.deliver(parcel(0))
+            with pytest.raises(Unreachable, match="certificate verify failed"):
+                doubting.deliver(parcel(1))
+    assert kept(store) == [0]
+    with pytest.raises(InvalidInput, match="holds no certificates"):
+        MqttTransport(Broker("mqtts://127.0.0.1", ca_file=str(tmp_path / "absent.pem")), "axis-1", "token")
+
+
+def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store), edge(at, timeout_s=3.0) as here:
+        tries = 0
+        for k in range(60):
+            if k in (20, 40):
+                server.kill()
+                server.start()
+            tries += insist(lambda k=k: here.deliver(parcel(k)))
+        assert kept(store) == list(range(60))
+
+
+def test_a_twin_that_begins_late_gets_all(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with edge(at, timeout_s=0.5) as here:
+        with pytest.raises(Unreachable, match="no answer of a twin"):
+            here.deliver(parcel(0))
+        with twin(at, store):
+            insist(lambda: here.deliver(parcel(0)))
+        assert kept(store) == [0]
+
+
+def test_a_poll_outlives_a_cut_connection(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there, Relay(server.port) as relay:
+        away = Broker(f"mqtt://127.0.0.1:{relay.port}")
+        with edge(away, wait_s=20.0) as here, ThreadPoolExecutor(1) as pool:
+            here.deliver(parcel(0))
+            polled = pool.submit(here.listen, 0)
+            relay.cut()
+            there.post("axis-1", b"news")
+            assert len(polled.result(PATIENCE)) == 1
+
+
+def test_a_delayed_and_cut_line_stores_each_window_once(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store), Relay(server.port, Weather((0.0, 0.05), (0.5, 1.5)), seed=5) as relay:
+        with edge(Broker(f"mqtt://127.0.0.1:{relay.port}"), timeout_s=2.0) as here:
+            for k in range(30):
+                insist(lambda k=k: here.deliver(parcel(k)))
+        assert relay.counts["cut"] > 0
+    assert kept(store) == list(range(30))
+
+
+def test_news_that_a_twin_is_gone_ends_a_poll(server: Mosquitto, store: Store) -> None:
+    """A twin's connection that breaks without a good-bye, as when it is killed."""
+    at = Broker(server.url)
+    with (
+        Relay(server.port) as relay,
+        twin(Broker(f"mqtt://127.0.0.1:{relay.port}"), store),
+        edge(at, wait_s=30.0, timeout_s=PATIENCE) as here,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        here.deliver(parcel(0))
+        polled = pool.submit(here.listen, 0)
+        relay.become(State.DOWN)
+        with pytest.raises(Unreachable, match="gone"):
+            polled.result(PATIENCE)
+
+
+def test_another_servos_token_speaks_for_nobody_else(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there:
+        for token in (TOKENS["axis-2"], "guess", ""):
+            with edge(at, "axis-1", token) as here, pytest.raises(Refused, match="bad_token") as refused:
+                here.deliver(parcel(0))
+            assert refused.value.reason.passing
+        assert refusals(there) == {"bad_token": 3}
+    assert kept(store) == []
+
+
+def test_a_window_of_another_servo_is_refused(server: Mosquitto, store: Store) -> None:
+    with twin(Broker(server.url), store) as there, edge(Broker(server.url)) as here:
+        for wrong, code in ((parcel(0, "axis-2"), "other_name"), (Parcel("axis-1", b"\xc1"), "not_understood")):
+            with pytest.raises(Refused, match=code):
+                here.deliver(wrong)
+        with pytest.raises(Refused, match="not_understood"):
+            here.deliver(parcel(0)._replace(encoding="gzip"))
+        assert refusals(there) == {"other_name": 1, "not_understood": 2}
+    assert kept(store) == kept(store, "axis-2") == []
+
+
+def test_too_large_a_message_is_refused_before_it_is_sent_or_parsed(server: Mosquitto, store: Store) -> None:
+    big = bytes(MAX_BYTES + 1)
+    with twin(Broker(server.url), store) as there, edge(Broker(server.url), timeout_s=2.0) as here:
+        with pytest.raises(Refused, match="too_large"):
+            here.deliver(Parcel("axis-1", big))
+        raw(server, exchange.up("axis-1"), bytes(2 * MAX_BYTES))
+        here.deliver(parcel(0))
+        assert refusals(there) == {"too_large": 1}
+
+
+def test_what_is_no_question_is_counted_and_the_rest_goes_on(server: Mosquitto, store: Store) -> None:
+    key = key_of(verifier_of(TOKENS["axis-1"]))
+    good = exchange.ask(key, "axis-1", 5, exchange.Listen(0, 0.0))
+    bad = [
+        b"",
+        b"\x00",
+        b"nonsense",
+        good[:-1],
+        good[:-1] + bytes([good[-1] ^ 1]),
+        seal(key, TO_TWIN, "axis-1", 1, b""),
+    ]
+    with twin(Broker(server.url), store) as there, edge(Broker(server.url)) as here:
+        for payload in bad:
+            raw(server, exchange.up("axis-1"), payload)
+        raw(server, exchange.up("axis-9"), good)
+        raw(server, "servotwin/bad name/up", good)
+        here.deliver(parcel(0))
+        assert refusals(there) == {"bad_token": len(bad) + 1}
+
+
+def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -> None:
+    """Whoever may publish to the edge's topic cannot acknowledge a window."""
+    key = key_of(verifier_of("another token"))
+    forged = [b"", b"\x00" * 100] + [exchange.answer(key, "axis-1", serial, exchange.Taken()) for serial in range(3)]
+    with edge(Broker(server.url), timeout_s=1.0) as here:
+        for payload in forged:
+            raw(server, exchange.down("axis-1"), payload)
+        with pytest.raises(Unreachable, match="no answer"):
+            here.deliver(parcel(0))
+
+
+def test_an_answer_belongs_to_its_question() -> None:
+    key = key_of(verifier_of("token"))
+    data = exchange.answer(key, "axis-1", 7, exchange.NotTaken(Refusal.CONFLICT, "Another one is kept."))
+    assert exchange.answered(key, "axis-1", data) == (7, exchange.NotTaken(Refusal.CONFLICT, "Another one is kept."))
+    for foreign in ((key, "axis-2"), (key_of(verifier_of("other")), "axis-1")):
+        with pytest.raises(InvalidMessage):
+            exchange.answered(*foreign, data)
+    with pytest.raises(InvalidMessage):
+        exchange.asked(key, "axis-1", data)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_from_a_broker_never_do_more_than_be_refused(data: bytes) -> None:
+    key = key_of(verifier_of("token"))
+    for read in (lambda: exchange.asked(key, "axis-1", data), lambda: exchange.answered(key, "axis-1", data)):
+        with suppress(InvalidMessage):
+            assert not isinstance(read(), exchange.Asked)
+    assert exchange.stranger(data) is None or len(data) > 32
+
+
+def test_closing_wakes_whoever_waits(server: Mosquitto) -> None:
+    with edge(Broker(server.url), timeout_s=PATIENCE) as here, ThreadPoolExecutor(1) as pool:
+        delivered = pool.submit(here.deliver, parcel(0))
+        here.close()
+        with pytest.raises(Unreachable):
+            delivered.result(PATIENCE)
+        with pytest.raises(Unreachable, match="closed"):
+            here.listen(0)
+
+
+def test_no_broker_is_no_twin() -> None:
+    with edge(Broker(f"mqtt://127.0.0.1:{free_port()}"), timeout_s=0.5) as here, pytest.raises(Unreachable):
+        here.deliver(parcel(0))
+
+
+@pytest.mark.parametrize(
+    "url", ["http://host", "mqtt://", "mqtt://host/path", "mqtt://me:secret@host", "mqtt://host:0", "mqtt://host:x"]
+)
+def test_an_address_that_is_none_is_named(url: str) -> None:
+    with pytest.raises(InvalidInput, match=r"give mqtt\(s\)://host"):
+        Broker(url)
+
+
+def test_without_paho_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "paho.mqtt.client", None)
+    with pytest.raises(InvalidInput, match=r"pip install 'servotwin\[mqtt\]'"):
+        MqttTransport(Broker("mqtt://127.0.0.1"), "axis-1", "token")
+
+
+def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
+    """Publish as anybody may."""
+    arrived, ready = threading.Event(), threading.Event()
+
+    def message(_topic: str, _payload: bytes, acknowledge: Callable[[], None]) -> None:
+        acknowledge()
+        arrived.set()
+
+    events = Events(message, lambda _: ready.set(), lambda _: None)
+    wanted = Wanted("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
+    connection = Connection(Broker(server.url), wanted, events)
+    try:
+        assert ready.wait(PATIENCE)
+        assert connection.publish(topic, payload, 60.0)
+        assert arrived.wait(PATIENCE)
+    finally:
+        connection.close()
