@@ -140,6 +140,14 @@ def test_messages_from_before_a_clock_was_set_back_are_claimed(store: Store) -> 
     assert store.waiting(200.0) == Waiting(1, 0, 0.0)
 
 
+def test_a_lease_from_before_a_clock_was_set_back_has_ended(store: Store) -> None:
+    store.put([window()])
+    assert len(claim(store, now=9000.0)) == 1
+    assert claim(store, "you", now=8980.0) == []
+    assert len(claim(store, "you", now=200.0)) == 1
+    assert claim(store, now=201.0) == []
+
+
 def test_proofs_are_claimed_only_when_asked_for(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)

@@ -61,7 +61,7 @@ class System:
     """
 
     def __init__(self, twin: TwinFile, store: Store, clocks: Clocks | None = None, pool: Pool | None = None) -> None:
-        self.config, self.store, self.clocks = twin.service, store, clocks or Clocks()
+        self.config, self.store, self.clocks = twin.service, store, clocks or Clocks.of_machine()
         self.metrics, self.shelf, self._landing = Metrics(), Shelf(), Landing()
         self.pool = pool or Pool(self.config.workers, twin.start, self.config.job_timeout_s)
         self.tokens = None if self.config.tokens is None else TokenFile(self.config.tokens)

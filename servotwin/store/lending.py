@@ -24,7 +24,9 @@ def lend(
     lent: list[str] = []
     for condition, order, share in _queues(now, kinds, limit):
         wanted = min(share, limit - len(lent))
-        free = sa.or_(twins.c.lease_until.is_(None), twins.c.lease_until <= now)
+        # One that ends later than any made by now comes from before a clock was set back.
+        late = until + (until - now)
+        free = sa.or_(twins.c.lease_until.is_(None), twins.c.lease_until <= now, twins.c.lease_until > late)
         query = sa.select(twins.c.servo).where(condition, free).order_by(order).limit(wanted)
         if only is not None:
             query = query.where(twins.c.servo == only)
