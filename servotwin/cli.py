@@ -248,6 +248,70 @@ def twin(
     run(config, port)
 
 
+@app.command()
+def enroll(
+    name: Annotated[str, typer.Argument(help="The servo's name, or the operator's.")],
+    twin: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    edge: Annotated[Path | None, typer.Option(help="The edge's folder; the servo's name by default.")] = None,
+    role: Annotated[str, typer.Option(help="control: the edge ticks; supervise: the drive does.")] = "supervise",
+    sample_rate_hz: Annotated[float, typer.Option(help="Of the edge.")] = 5000.0,
+    drive: Annotated[Path | None, typer.Option(help="A TOML with the table [drive]; a simulated one without.")] = None,
+    url: Annotated[str | None, typer.Option(help="Where the edge reaches the twin; its own address without.")] = None,
+    operator: Annotated[Path | None, typer.Option(help="Enroll an operator instead; the token goes here.")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Replace the token that there is.")] = False,
+) -> None:
+    """Make a servo known to the twin: a token of its own, and a folder with all that its edge needs."""
+    from servotwin import provision
+
+    if operator is not None:
+        made = provision.enroll_operator(twin, name, operator, again)
+    else:
+        wanted = name, edge or Path(name), role, sample_rate_hz, provision.drive_of(drive), url, again
+        made = provision.enroll(twin, provision.Enrolment(*wanted))
+    for path in made:
+        print(f"written: {path}")
+
+
+@app.command()
+def audit(
+    servo: Annotated[str, typer.Argument(help="The servo's name.")],
+    config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),
+    url: Annotated[str | None, typer.Option(help="Ask a service instead: https://twin:8765.")] = None,
+    token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
+    ca: Annotated[Path | None, typer.Option(help="Certificates that the service's is checked against.")] = None,
+    limit: Annotated[int, typer.Option(min=1, max=1000, help="Windows at most.")] = 20,
+    json: Annotated[bool, typer.Option("--json", help="One JSON array instead of a table.")] = False,
+) -> None:
+    """The evidence chain of a servo: window, estimate, version, receipt, effect."""
+    from servotwin.service.audittable import audit as run
+
+    run(servo, config, url, token, ca, limit, json)
+
+
+@app.command()
+def backup(
+    to: Annotated[Path, typer.Argument(help="The file to be written.")],
+    config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+) -> None:
+    """Copy the twin's SQLite store as it is at one moment, while the twin runs on."""
+    from servotwin.service.keeping import back_up
+
+    back_up(config, to)
+
+
+@app.command()
+def restore(
+    backed_up: Annotated[Path, typer.Argument(help="What `servotwin backup` wrote.")],
+    config: Annotated[Path, typer.Option(help="The twin's file; its store must not exist, or be empty.")] = Path(
+        "twin.toml"
+    ),
+) -> None:
+    """Put a backup in the place of the twin's store."""
+    from servotwin.service.keeping import put_back
+
+    put_back(config, backed_up)
+
+
 def main() -> None:
     """Entry point of the `servotwin` command."""
     app()

@@ -6,6 +6,7 @@ import ipaddress
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
@@ -172,7 +173,8 @@ def service(table: Table, folder: Path, environment: Mapping[str, str] = os.envi
     InvalidInput
         A key is unknown, a value is not allowed, a file that it names cannot be read, or is readable by others.
     """
-    paths = given(table, {key: (key, _path(folder)) for key in ("tls_certificate", "tls_key", "tokens")})
+    paths = given(table, {key: (key, partial(_file, folder)) for key in ("tls_certificate", "tls_key")})
+    paths |= given(table, {"tokens": ("tokens", lambda table, key: folder / table.text(key))})
     values = {**given(table, PLAIN), **paths, **_store(table, folder, environment)}
     if "mqtt" in table.values:
         values["mqtt"] = part(table, "mqtt", lambda inner: mqtt(inner, folder, environment))
@@ -180,21 +182,11 @@ def service(table: Table, folder: Path, environment: Mapping[str, str] = os.envi
         return ServiceConfig(**values)
 
 
-def _path(folder: Path) -> _PathReader:
-    return _PathReader(folder)
-
-
-@dataclass(frozen=True)
-class _PathReader:
-    """Reads a path relative to a folder."""
-
-    folder: Path
-
-    def __call__(self, table: Table, key: str) -> Path:
-        path = self.folder / table.text(key)
-        if not path.is_file():
-            raise table.invalid(key, f"the path of a file, relative to {self.folder}")
-        return path
+def _file(folder: Path, table: Table, key: str) -> Path:
+    path = folder / table.text(key)
+    if not path.is_file():
+        raise table.invalid(key, f"the path of a file, relative to {folder}")
+    return path
 
 
 def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> dict[str, str | None]:

@@ -1,0 +1,179 @@
+"""A servo made known: its token, the twin's verifier of it, and a folder with all that its edge needs."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from servotwin.errors import InvalidInput
+from servotwin.gateway.config import ROLES, UNBOOTED, EdgeConfig, TwinLink
+from servotwin.gateway.configfile import edge_toml, load
+from servotwin.link.seal import verifier_of
+from servotwin.messages import NAME_PATTERN
+from servotwin.outputs import make_directory, write_text
+from servotwin.scenario import Scenario
+from servotwin.scenariofile import Recording
+from servotwin.service.config import ServiceConfig
+from servotwin.service.secretfile import PRIVATE, write_private
+from servotwin.service.tokens import Verifiers, read_tokens, write_tokens
+from servotwin.service.twinfile import TwinFile, read_twin
+from servotwin.tomltable import read_toml
+
+TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "twin.crt"
+SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
+
+
+@dataclass(frozen=True)
+class Enrolment:
+    """What is wanted of an edge.
+
+    Attributes
+    ----------
+    servo : str
+    folder : Path
+        Made if it is missing.
+    role : str
+        "control" or "supervise".
+    sample_rate : float
+        Hz.
+    drive : mapping
+        The table [drive] of its file.
+    url : str or None
+        Where the edge reaches the twin; None: where the twin's file says that it listens.
+    again : bool
+        A servo that has a token gets another one; the former counts no more.
+    """
+
+    servo: str
+    folder: Path
+    role: str = "supervise"
+    sample_rate: float = 5000.0
+    drive: Mapping[str, object] = field(default_factory=lambda: SIMULATED)
+    url: str | None = None
+    again: bool = False
+
+
+def enroll(path: Path, wanted: Enrolment) -> list[Path]:
+    """Make a servo known to the twin of that file; the files that were written.
+
+    The edge's folder is written first: a token counts only once the edge has it. An edge.toml that is there stays.
+
+    Raises
+    ------
+    InvalidInput
+        The servo has no model, has a token already, or something cannot be written.
+    """
+    twin = read_twin(path)
+    tokens = _tokens_file(twin)
+    known = _known(tokens)
+    _check(wanted, known)
+    new = not (wanted.folder / CONFIG).exists()
+    text = edge_toml(edge_config(twin, wanted)) if new else ""
+    token, folder = secrets.token_urlsafe(32), make_directory(wanted.folder)
+    made = _configured(twin, folder, text) if new else []
+    write_private(folder / TOKEN, token + "\n")
+    made.append(folder / TOKEN)
+    write_tokens(tokens, replace(known, servos={**known.servos, wanted.servo: verifier_of(token)}))
+    return [*made, tokens]
+
+
+def enroll_operator(path: Path, name: str, file: Path, again: bool = False) -> list[Path]:
+    """Make an operator known, whose token goes to `file`; as `enroll`."""
+    twin = read_twin(path)
+    tokens = _tokens_file(twin)
+    known = _known(tokens)
+    _check_name(name, known.operators, again)
+    token = secrets.token_urlsafe(32)
+    write_private(file, token + "\n")
+    write_tokens(tokens, replace(known, operators={**known.operators, name: verifier_of(token)}))
+    return [file, tokens]
+
+
+def drive_of(path: Path | None) -> Mapping[str, object]:
+    """The table [drive] that a TOML file holds; a simulated one without a file."""
+    return SIMULATED if path is None else dict(read_toml(path).table("drive", required=True).values)
+
+
+def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
+    """What the edge of a servo runs on: guarded as the twin's policy needs it, proved where it is proved.
+
+    Raises
+    ------
+    InvalidInput
+        The servo has no model, or nothing is proved for its stated range.
+    """
+    model = twin.fleet.model_of(wanted.servo)
+    law = model.servo.controller.replace(sample_rate=wanted.sample_rate if wanted.role == "control" else None)
+    recording = Recording(sample_rate=wanted.sample_rate)
+    scenario = Scenario(
+        servo=model.servo.replace(controller=law),
+        duration=1.0,
+        name=wanted.servo,
+        recording=recording,
+        twin=model.settings,
+    )
+    agent = replace(scenario.agent_settings(), boot=UNBOOTED)
+    certificate = None if twin.service.tls_certificate is None else CERTIFICATE
+    link = TwinLink(wanted.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
+    return EdgeConfig(agent, wanted.role, agent.controller or law, wanted.drive, link, folder=wanted.folder)
+
+
+def url_of(service: ServiceConfig) -> str:
+    """Where the service listens, as its file says.
+
+    Raises
+    ------
+    InvalidInput
+        It does not: any port, or every address.
+    """
+    if service.port == 0 or service.bind in ("0.0.0.0", "::"):
+        raise InvalidInput(f"bind = {service.bind!r}, port = {service.port}: say with --url where edges reach the twin")
+    host = f"[{service.bind}]" if ":" in service.bind else service.bind
+    return f"{'http' if service.tls_key is None else 'https'}://{host}:{service.port}"
+
+
+def _configured(twin: TwinFile, folder: Path, text: str) -> list[Path]:
+    made = [write_text(folder / CONFIG, text)]
+    if twin.service.tls_certificate is not None:
+        made.append(Path(shutil.copy(twin.service.tls_certificate, folder / CERTIFICATE)))
+    return made
+
+
+def _tokens_file(twin: TwinFile) -> Path:
+    if twin.service.tokens is None:
+        raise InvalidInput(f'{twin.path}: [service] names no file of tokens; add tokens = "tokens.toml"')
+    return twin.service.tokens
+
+
+def _known(tokens: Path) -> Verifiers:
+    if not tokens.exists():
+        tokens.touch(PRIVATE)
+    return read_tokens(tokens)
+
+
+def _check(wanted: Enrolment, known: Verifiers) -> None:
+    if wanted.role not in ROLES:
+        raise InvalidInput(f"role = {wanted.role!r} is not allowed; give one of {', '.join(ROLES)}")
+    _check_name(wanted.servo, known.servos, wanted.again)
+    _check_folder(wanted)
+
+
+def _check_folder(wanted: Enrolment) -> None:
+    """Another servo's edge is not given this one's token."""
+    file, token = wanted.folder / CONFIG, wanted.folder / TOKEN
+    whose = load(file).agent.servo if file.exists() else wanted.servo
+    if whose != wanted.servo:
+        raise InvalidInput(f"{file}: is that of servo {whose!r}; give {wanted.servo!r} another folder")
+    if token.exists() and not wanted.again:
+        raise InvalidInput(f"{token}: there is a token already; give --again to replace it by a new one")
+
+
+def _check_name(name: str, known: Mapping[str, bytes], again: bool) -> None:
+    if not re.match(NAME_PATTERN, name):
+        raise InvalidInput(f"name {name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+    if name in known and not again:
+        raise InvalidInput(f"{name!r} has a token already; give --again to replace it by a new one")

@@ -1,0 +1,140 @@
+"""Enrolling servos and operators, reading the evidence chain, backup and restore: the commands."""
+
+import json
+import stat
+
+import httpx
+import pytest
+from service_system import OPERATOR, bearer, place, process, twin_file, window
+from typer.testing import CliRunner
+
+from servotwin import cli
+from servotwin.edge.settings import AgentSettings
+from servotwin.gateway.config import token_of
+from servotwin.gateway.configfile import load
+from servotwin.link.seal import verifier_of
+from servotwin.messages import encode
+from servotwin.service.tokens import read_tokens
+from servotwin.store.store import open_store
+
+PATIENCE = 60.0
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def fresh(folder, service=""):
+    return twin_file(folder, f'port = 8765\ntokens = "tokens.toml"\n{service}'.replace("port = 8765", ""), tokens=False)
+
+
+def test_a_servo_is_enrolled_and_its_edge_can_begin(tmp_path):
+    twin, edge = fresh(tmp_path), tmp_path / "edge"
+    done = run("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "https://twin:1", "--role", "control")
+    assert done.exit_code == 0, done.output
+    config = load(edge / "edge.toml")
+    token = token_of(config.twin, edge)
+    assert token not in done.output
+    assert (config.agent.servo, config.role, config.twin.url) == ("ax-7", "control", "https://twin:1")
+    assert isinstance(config.agent, AgentSettings)
+    assert read_tokens(tmp_path / "tokens.toml").servos == {"ax-7": verifier_of(token)}
+    for secret in (edge / "token", tmp_path / "tokens.toml"):
+        assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    assert token not in (edge / "edge.toml").read_text()
+
+
+def test_a_second_token_replaces_the_first_only_when_asked_for_and_leaves_the_edge_s_file(tmp_path):
+    twin, edge = fresh(tmp_path), tmp_path / "edge"
+    options = ("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "http://127.0.0.1:1")
+    assert run(*options).exit_code == 0
+    (edge / "edge.toml").write_text((edge / "edge.toml").read_text() + "# mine\n")
+    before = read_tokens(tmp_path / "tokens.toml"), (edge / "token").read_text()
+    refused = run(*options)
+    assert refused.exit_code == 2
+    assert "--again" in refused.stderr
+    assert (read_tokens(tmp_path / "tokens.toml"), (edge / "token").read_text()) == before
+    assert run(*options, "--again").exit_code == 0
+    token = (edge / "token").read_text().strip()
+    assert token != before[1].strip()
+    assert read_tokens(tmp_path / "tokens.toml").servos == {"ax-7": verifier_of(token)}
+    assert (edge / "edge.toml").read_text().endswith("# mine\n")
+
+
+def test_another_servo_s_folder_is_left_alone(tmp_path):
+    twin, edge = fresh(tmp_path), tmp_path / "edge"
+    options = ("--twin", twin, "--edge", edge, "--url", "http://127.0.0.1:1")
+    assert run("enroll", "ax-7", *options).exit_code == 0
+    token = (edge / "token").read_text()
+    for more in ((), ("--again",)):
+        found = run("enroll", "ax-8", *options, *more)
+        assert found.exit_code == 2
+        assert "'ax-7'" in found.stderr
+    assert (edge / "token").read_text() == token
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("stranger", "--url", "http://h"), "has no model"),
+        (("ax-1",), "--url"),
+        (("ax-1", "--url", "ftp://h"), "url"),
+        (("ax-1", "--url", "http://h", "--role", "guess"), "control, supervise"),
+        (("ax-1", "--url", "http://h", "--drive", "no.toml"), "no.toml"),
+        (("ax 1", "--url", "http://h"), "name 'ax 1'"),
+    ],
+)
+def test_what_cannot_be_enrolled_leaves_nothing_behind(tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    twin = fresh(tmp_path)
+    found = run("enroll", *arguments, "--twin", twin, "--edge", tmp_path / "edge")
+    assert found.exit_code == 2
+    assert said in found.stderr
+    assert found.stderr.count("\n") == 1
+    tokens = tmp_path / "tokens.toml"
+    assert not tokens.exists() or read_tokens(tokens).servos == {}
+    assert not (tmp_path / "edge" / "edge.toml").exists()
+    assert not (tmp_path / "edge" / "token").exists()
+
+
+def test_without_a_file_of_tokens_nobody_is_enrolled(tmp_path):
+    found = run("enroll", "ax-1", "--twin", twin_file(tmp_path, tokens=False), "--edge", tmp_path / "edge")
+    assert found.exit_code == 2
+    assert "tokens" in found.stderr
+
+
+def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
+    twin, token = twin_file(tmp_path), tmp_path / "operator"
+    assert run("enroll", "boss", "--operator", token, "--twin", twin).exit_code == 0
+    with process(twin) as (_running, url):
+        sent = window()
+        with httpx.Client(base_url=url, timeout=PATIENCE) as client:
+            assert client.put(place(sent), content=encode(sent), headers=bearer()).status_code == 201
+            while client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"]:
+                pass
+        asked = run("audit", "ax-1", "--url", url, "--token", token, "--json")
+        assert asked.exit_code == 0, asked.output
+        refused = run("audit", "ax-1", "--url", url)
+        assert refused.exit_code == 2
+        assert "token" in refused.stderr
+    read = run("audit", "ax-1", "--config", twin, "--json")
+    assert json.loads(read.stdout) == json.loads(asked.stdout)
+    [link] = json.loads(read.stdout)
+    assert (link["window"]["boot"], link["window"]["sequence"]) == ("b", 0)
+    table = run("audit", "ax-1", "--config", twin)
+    assert "b/0" in table.stdout
+    assert "estimate" in table.stdout
+    unknown = run("audit", "ax-9", "--config", twin)
+    assert unknown.exit_code == 2
+    assert "ax-9" in unknown.stderr
+
+
+def test_a_store_is_backed_up_and_put_back(tmp_path):
+    twin = twin_file(tmp_path)
+    store = open_store(f"sqlite:///{tmp_path / 'twin.db'}")
+    store.close()
+    assert run("backup", tmp_path / "copy.db", "--config", twin).exit_code == 0
+    for each in tmp_path.glob("twin.db*"):
+        each.unlink()
+    assert run("restore", tmp_path / "copy.db", "--config", twin).exit_code == 0
+    assert (tmp_path / "twin.db").exists()
+    assert run("restore", tmp_path / "nothing.db", "--config", twin).exit_code == 2
