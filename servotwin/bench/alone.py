@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from servotwin.bench import accuracy, endurance
+from servotwin.bench.novelty import command as worth_sending
 from servotwin.bench.policies import command as side_by_side
 from servotwin.errors import InvalidInput
 
@@ -24,10 +25,15 @@ def _policies(date: str, output: Path | None, quick: bool) -> None:
     side_by_side.policies(date, output, side_by_side.QUICK if quick else side_by_side.MACHINES)
 
 
+def _novelty(date: str, output: Path | None, quick: bool) -> None:
+    worth_sending.novelty(date, output, worth_sending.QUICK if quick else None)
+
+
 ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     accuracy.NAME: _estimator,
     endurance.NAME: _hostile,
     side_by_side.NAME: _policies,
+    worth_sending.NAME: _novelty,
 }
 
 

@@ -1,7 +1,8 @@
 """Whether a cut window is worth sending: state and cut in, state and verdict out.
 
-What counts is the change since the twin was last told: the baseline begins anew at each window that an accepted update
-stands on, and at each that was sent as news. A window that says nothing of the gap moves nothing.
+What counts is the change since the twin was last told: the baseline begins anew at each window that was sent as news.
+An accepted update has it learnt again: what was learnt before counts as a few windows, and where the update stands on a
+window that said nothing here, it moves with the update's gap. A window that says nothing of the gap moves nothing.
 """
 
 from math import hypot, inf, sqrt
@@ -12,7 +13,7 @@ from msgspec import Struct, structs
 
 from servotwin.edge.cut import Cut
 from servotwin.edge.lostmotion import rests
-from servotwin.edge.noveltychart import Chart, begun, learnt, look
+from servotwin.edge.noveltychart import Chart, begun, look, relearning
 from servotwin.edge.noveltyrules import NoveltyRules, NoveltySettings
 from servotwin.edge.noveltyscore import Offset, Score, score
 from servotwin.errors import InvalidInput
@@ -26,14 +27,6 @@ TIMED = "timed"
 _KEPT = 8  # windows that an update may stand on
 _WIDEST = 1.0  # rad: a spread beyond says nothing
 _STILL = 0.2  # of the margin: what moves less rests
-
-
-class Recent(Struct, frozen=True, array_like=True):
-    """A window that said something: its sequence, gap (rad) and variance (rad^2)."""
-
-    sequence: int
-    gap: float
-    variance: float
 
 
 class NoveltyState(Struct, frozen=True, tag="novelty/1"):
@@ -52,7 +45,8 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1"):
         s of this boot, end of the last window sent.
     owed, silent : int
         Windows still to be sent whatever they say; windows in a row that said nothing.
-    recent : tuple of Recent
+    recent : tuple of int
+        Sequences of the last windows that said something.
     low, high : float
         rad, leads at rest; high below low: none yet.
     bound : float
@@ -70,7 +64,7 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1"):
     told: float | None = None
     sent: float | None = None
     silent: int = 0
-    recent: tuple[Recent, ...] = ()
+    recent: tuple[int, ...] = ()
     low: float = inf
     high: float = -inf
     bound: float = 0.0
@@ -132,11 +126,9 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Judged:
     found = _read(state, cut, settings)
     if found is None:
         return _silent(state, cut, settings)
-    variance = found.std * found.std + rules.resolution * rules.resolution
-    seen = look(state.chart, found.gap, variance, rules)
+    seen = look(state.chart, found.gap, found.std, rules)
     news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
-    state = _taught(state, cut, found, variance, rules)
-    state = structs.replace(state, chart=learnt(begun(seen.chart), found.gap, variance) if news else seen.chart)
+    state = structs.replace(_taught(state, cut, found, rules), chart=seen.chart)
     reason = _reason(state, cut, settings, news)
     if news:
         state = structs.replace(state, owed=0 if news == CUSUM else rules.confirm)
@@ -145,13 +137,13 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Judged:
     return Judged(_sent(state, cut, settings, reason), Verdict(reason, found, seen.change, _range(state)))
 
 
-def _taught(state: NoveltyState, cut: Cut, found: Score, variance: float, rules: NoveltyRules) -> NoveltyState:
+def _taught(state: NoveltyState, cut: Cut, found: Score, rules: NoveltyRules) -> NoveltyState:
     """What a window says beside the chart."""
     return structs.replace(
         state,
         gap=max(0.0, found.gap),
         silent=0,
-        recent=(*state.recent, Recent(cut.sequence, found.gap, variance))[-_KEPT:],
+        recent=(*state.recent, cut.sequence)[-_KEPT:],
         offset=_carried(state.offset, found.offset, rules),
         noise=found.noise,
     )
@@ -208,26 +200,22 @@ def _sent(state: NoveltyState, cut: Cut, settings: NoveltySettings, reason: str)
 
 
 def _updated(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> NoveltyState:
-    """With the update accepted since the last window: the baseline begins at the window it stands on."""
+    """With the update accepted since the last window."""
     if cut.parameter_version == state.version:
         return state
     state = structs.replace(state, version=cut.parameter_version)
     if cut.gap is None:
         return state
-    return structs.replace(state, chart=_rebased(state, cut, rules), told=cut.gap, owed=0)
+    return structs.replace(state, chart=_relearnt(state, cut, rules), told=cut.gap, owed=0)
 
 
-def _rebased(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:
-    """From the window that the update stands on; where that was not looked at, moved by as much as the update's gap."""
-    since = [each for each in state.recent if cut.basis is not None and each.sequence >= cut.basis]
-    if since and since[0].sequence == cut.basis:
-        chart = begun(state.chart)
-        for each in since:
-            chart = learnt(chart, each.gap, each.variance)
-        return chart
-    if state.told is None or state.chart.weight == 0.0 or cut.gap is None:
+def _relearnt(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:
+    """A baseline that stands on few windows; where the update's own said nothing here, moved by as much as its gap."""
+    if cut.basis in state.recent or state.chart.weight == 0.0:
+        return relearning(state.chart, rules.relearn)
+    if state.told is None or cut.gap is None:
         return begun(state.chart)
-    return begun(state.chart, state.chart.gap + cut.gap - state.told, 1.0 / rules.settle**2)
+    return begun(state.chart, state.chart.gap + cut.gap - state.told, 1.0 / (rules.settle * rules.settle))
 
 
 def _rested(state: NoveltyState, leads: list[float]) -> NoveltyState:

@@ -3,8 +3,8 @@
 The baseline is the weighted mean of all windows since it began; a window is compared with those before it, and then
 learnt. Such recursive residuals are independent with one variance, however few windows the baseline stands on, so the
 limits mean the same from the second window on (Hawkins 1987). What the model has wrong shifts every window alike and
-is in the baseline. What it scatters beyond the windows' own spread is learnt as a factor of that, never below 1: from
-the median of second differences, which neither steady wear nor a single step moves.
+is in the baseline. How far windows scatter, against what each says of its own spread, is learnt as a factor: from the
+median of second differences, which neither steady wear nor a single step moves.
 """
 
 from math import copysign, log1p, sqrt
@@ -17,11 +17,11 @@ from servotwin.edge.noveltyrules import NoveltyRules
 
 _QUARTILE = 0.6744897501960817  # of a standard normal: the median of its size
 _PRIOR, _MOST = 5, 40  # second differences that the stated spread counts as; that are kept
-_TRUSTED, _EACH = 10.0, 0.35  # degrees of freedom of the stated spread, and of one second difference in a median
+_TRUSTED, _EACH = 10.0, 0.2  # degrees of freedom of the stated spread, and of one second difference in a median
 
 
 class Seen(Struct, frozen=True, array_like=True):
-    """A window's gap (rad) and its variance (rad^2)."""
+    """A window's gap (rad) and its own variance (rad^2)."""
 
     gap: float
     variance: float
@@ -54,8 +54,8 @@ class Chart(Struct, frozen=True):
 
     @property
     def factor(self) -> float:
-        """Of the windows' own spreads, at least 1."""
-        return max(1.0, median((*self.bends, *(_QUARTILE,) * _PRIOR)) / _QUARTILE)
+        """Of the windows' own spreads."""
+        return median((*self.bends, *(_QUARTILE,) * _PRIOR)) / _QUARTILE
 
     @property
     def freedom(self) -> float:
@@ -64,7 +64,10 @@ class Chart(Struct, frozen=True):
 
 
 class Looked(NamedTuple):
-    """The chart with a window learnt, the window's standardised change, and whether either limit is passed."""
+    """The chart with a window learnt, the window's standardised change, and whether it is news by either limit.
+
+    Where it is, the baseline has begun anew with it.
+    """
 
     chart: Chart
     change: float
@@ -72,18 +75,20 @@ class Looked(NamedTuple):
     slow: bool
 
 
-def look(chart: Chart, gap: float, variance: float, rules: NoveltyRules) -> Looked:
-    """Compare a window (rad, rad^2) with the baseline, then learn it."""
+def look(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> Looked:
+    """Compare a window (gap and standard deviation, rad) with the baseline, then learn it."""
+    own = std * std + rules.resolution * rules.resolution
+    variance = max(own * chart.factor * chart.factor, rules.resolution * rules.resolution)
     change = up = down = 0.0
     if chart.weight > 0.0:
-        raw = (gap - chart.gap) / sqrt(variance + 1.0 / chart.weight)
-        change = normal(raw / chart.factor, chart.freedom)
+        change = normal((gap - chart.gap) / sqrt(variance + 1.0 / chart.weight), chart.freedom)
         up = max(0.0, chart.up + change - rules.allowance)
         down = max(0.0, chart.down - change - rules.allowance)
-    after = structs.replace(_bent(chart, Seen(gap, variance)), up=up, down=down)
-    worth = abs(gap - chart.anchor) >= rules.worth
+    after = structs.replace(_bent(chart, Seen(gap, own)), up=up, down=down)
     sudden, slow = abs(change) > rules.score_limit, max(up, down) > rules.cusum_limit
-    return Looked(learnt(after, gap, variance), change, sudden and worth, slow and worth)
+    if (sudden or slow) and abs(gap - chart.anchor) >= rules.worth:
+        return Looked(begun(after, gap, 1.0 / variance), change, sudden, slow)
+    return Looked(_learnt(after, gap, variance), change, sudden=False, slow=False)
 
 
 def _bent(chart: Chart, new: Seen) -> Chart:
@@ -97,7 +102,7 @@ def _bent(chart: Chart, new: Seen) -> Chart:
     return structs.replace(chart, last=last[1:], bends=(*chart.bends, bend)[-_MOST:])
 
 
-def learnt(chart: Chart, gap: float, variance: float) -> Chart:
+def _learnt(chart: Chart, gap: float, variance: float) -> Chart:
     """With one more window in the baseline."""
     weight = chart.weight + 1.0 / variance
     mean = chart.gap + (gap - chart.gap) / (variance * weight)
@@ -107,6 +112,12 @@ def learnt(chart: Chart, gap: float, variance: float) -> Chart:
 def begun(chart: Chart, gap: float = 0.0, weight: float = 0.0) -> Chart:
     """Another baseline; what was learnt of the spread stays, sums begin anew."""
     return structs.replace(chart, gap=gap, weight=weight, anchor=gap, up=0.0, down=0.0)
+
+
+def relearning(chart: Chart, windows: int) -> Chart:
+    """The same baseline, to count as no more than so many windows like the last: the next ones decide about it."""
+    most = windows / chart.last[-1].variance if chart.last else chart.weight
+    return begun(chart, chart.gap, min(chart.weight, most))
 
 
 def normal(student: float, freedom: float) -> float:

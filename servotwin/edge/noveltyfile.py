@@ -27,7 +27,7 @@ RULES: Mapping[str, Reader] = {
     **{f"{name}_deg": (name, _degrees) for name in _ANGLES},
     **{f"{name}_rad": (name, _number) for name in _ANGLES},
     **{name: (name, _number) for name in ("score_limit", "allowance", "cusum_limit", "period_s", "look_s")},
-    **{name: (name, Table.integer) for name in ("learn", "confirm", "patience")},
+    **{name: (name, Table.integer) for name in ("relearn", "learn", "confirm", "patience")},
 }
 
 

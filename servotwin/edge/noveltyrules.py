@@ -14,7 +14,7 @@ class NoveltyRules:
     Parameters
     ----------
     resolution : float
-        rad: changes of the gap far below it are no news; it is added to every window's own spread.
+        rad: no window is taken to be surer of the gap than that, so that far smaller changes are no news.
     worth : float
         rad: however sure it is, a change since the twin was last told that is smaller is not sent.
     score_limit : float
@@ -27,6 +27,8 @@ class NoveltyRules:
         rad: how far the screw must be pushed, both ways, for a window to say something.
     settle : float
         rad: how far the baseline may move with an update that stands on a window which was not looked at.
+    relearn : int
+        Windows that the baseline counts as at most after an accepted update.
     learn : int
         Windows that say something and are sent after each start, whatever they say.
     confirm : int
@@ -40,7 +42,7 @@ class NoveltyRules:
         s: where the reference does not change for so long, a window is cut and looked at; inf: never.
     """
 
-    resolution: float = radians(0.01)
+    resolution: float = radians(0.005)
     worth: float = 0.0
     score_limit: float = 4.5
     allowance: float = 0.5
@@ -48,6 +50,7 @@ class NoveltyRules:
     margin: float = radians(0.25)
     travel: float = radians(0.5)
     settle: float = radians(0.2)
+    relearn: int = 5
     learn: int = 2
     confirm: int = 1
     patience: int = 4
@@ -62,7 +65,7 @@ class NoveltyRules:
         for key in ("allowance", "worth"):
             if not 0.0 <= getattr(self, key) < inf:
                 raise InvalidInput(f"novelty {key} = {getattr(self, key)!r}: must be finite and at least 0")
-        for key in ("learn", "confirm", "patience"):
+        for key in ("relearn", "learn", "confirm", "patience"):
             if getattr(self, key) < 0:
                 raise InvalidInput(f"novelty {key} = {getattr(self, key)!r} windows: must be at least 0")
 
