@@ -38,7 +38,7 @@ class TriageSettings:
     """
 
     gap: float = math.radians(0.1)
-    deviations: float = 4.0
+    deviations: float = 3.0
     widest: float = math.radians(0.1)
     misfit: float = 3.0
     least_misfit: float = 1e-7

@@ -17,15 +17,17 @@ from servotwin.identify.core.projection import remove
 from servotwin.identify.core.response import response
 from servotwin.identify.whitened.misfit import Misfit, Point, Slopes
 from servotwin.identify.whitened.reduction import Prior, Reduction, factor_for
-from servotwin.identify.whitened.search import Fit, descend
+from servotwin.identify.whitened.search import GAP_ONLY, descend
 from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 PLACES = (-1.0, -0.6, -0.2, 0.2, 0.6, 1.0)
-STEPS = 12
-_FREE, _PRECISION, _GAIN = 2.0, 1e-6, 1e-6  # ranges of the motor; of the motor's range; of the cost
-_FLAT, _PLAIN = 1e-9, 1e-12  # of a derivative's square: below it nothing shows the gap, or the place
+STEPS = 16
+_FREE, _PRECISION, _GAIN = 2.0, 1e-5, 1e-7  # ranges of the motor; of the motor's range; of the cost
+_SETTLED, _CLOSE = 0.3, 1e-5  # standard deviations, or of the motor's range, that the gap would still move by
+_FLAT = 1e-9  # of the derivative's square: below it nothing shows the gap
+_ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 to 1
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Quick:
     misfit : float
         m, root mean square of what is left over.
     settled : bool
-        Whether the minimum was reached.
+        Whether the gap would move no more: along a valley in which only the screw's place changes, it need not end.
     """
 
     gap: float
@@ -66,10 +68,21 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
     misfit, span = reduction.coarse(), float(np.ptp(reduction.theta_m))
     costs = [misfit.cost(Point(gap, place)) for place in PLACES]
     start = Point(gap, PLACES[int(np.argmin(costs))])
-    fit = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
-    left = max(1, misfit.position.size - len(misfit.basis) - 2)
-    std = _std(reduction, misfit, fit, 0.0 if offset is None else offset[1])
-    return Quick(float(fit.point.gap), std, math.sqrt(fit.slopes.cost / left), fit.converged)
+    both = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
+    # Where noise hides the place, its steps are wild, and hold the gap's back.
+    fit = descend(misfit, both.point, _FREE * span, _PRECISION * span, STEPS, GAP_ONLY, gain=_GAIN)
+    count = max(1, misfit.position.size - len(misfit.basis) - 2)
+    rms, residual = math.sqrt(fit.slopes.cost / count), fit.slopes.residual
+    weights = _weights(fit.slopes, rms)
+    if weights is None:
+        return Quick(float(fit.point.gap), math.inf, rms, fit.converged)
+    by_place = float(weights @ fit.slopes.jacobian[1])
+    variance = _coloured(weights, residual) + _ANYWHERE * by_place**2
+    if offset is not None:
+        variance += (offset[1] * _by_offset(reduction, misfit, weights)) ** 2
+    std = math.sqrt(variance)
+    still = abs(float(weights @ residual))
+    return Quick(float(fit.point.gap), std, rms, still <= max(_SETTLED * std, _CLOSE * span))
 
 
 def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> Reduction:
@@ -87,26 +100,23 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> R
     return Reduction.of(rows[0], rows[1], model, known, skew=False)
 
 
-def _std(reduction: Reduction, misfit: Misfit, fit: Fit, offset_std: float) -> float:
-    """Standard deviation (rad) of the gap: of a weighted sum of coloured noise, and of what the offset moves it by."""
-    weights = _weights(fit.slopes)
-    if weights is None:
-        return math.inf
-    variance = _coloured(weights, fit.slopes.residual)
-    if offset_std > 0.0:
-        constant = np.full(weights.size, reduction.response.static_gain)
-        remove(misfit.basis, len(misfit.basis), constant)
-        variance += (offset_std * float(weights @ constant)) ** 2
-    return math.sqrt(variance)
+def _weights(slopes: Slopes, rms: float) -> Array | None:
+    """(m,) by how much the gap moves per change of each sample; None: nothing shows the gap.
 
-
-def _weights(slopes: Slopes) -> Array | None:
-    """(m,) by how much the gap moves per change of each sample; None: it is not told from the place."""
+    The place lies within the gap: where the noise (m rms) hides it, it is that which is known of it.
+    """
     by_gap, by_place = slopes.jacobian
-    whole, share = float(by_gap @ by_gap), float(by_place @ by_place)
-    left = by_gap - (float(by_gap @ by_place) / share) * by_place if share > _PLAIN * whole else by_gap
-    size = float(left @ left)
-    return left / size if size > _FLAT * whole else None
+    known = float(by_place @ by_place) + rms * rms / _ANYWHERE
+    left = by_gap - (float(by_gap @ by_place) / known) * by_place if known > 0.0 else by_gap
+    size = float(left @ by_gap)
+    return left / size if size > _FLAT * float(by_gap @ by_gap) else None
+
+
+def _by_offset(reduction: Reduction, misfit: Misfit, weights: Array) -> float:
+    """By how much the gap moves per change of the encoder's offset."""
+    constant = np.full(weights.size, reduction.response.static_gain)
+    remove(misfit.basis, len(misfit.basis), constant)
+    return float(weights @ constant)
 
 
 def _coloured(weights: Array, noise: Array) -> float:
