@@ -268,16 +268,29 @@ def test_samples_that_are_no_numbers_hold_the_voltage_then_make_it_safe(
     assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
 
 
-def test_missing_samples_begin_a_new_boot_and_the_law_goes_on(
+def test_a_few_missing_samples_cost_their_window_only(gateway: Gateway, machine: StubMachine, twin: FakeTwin) -> None:
+    machine.spoil = lambda n, *rest: (n if n < 300 else n + 7, *rest)
+    gateway.start()
+    until(lambda: len(twin.windows) >= 4)
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert sorted({*found, 1}) == list(range(len(found) + 1))  # cut from sample 250 on
+    assert gateway.status()["samples missed"] == 7
+    assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
+    assert twin.windows[next(reversed(twin.windows))].start * RATE % machine.every == 7
+
+
+def test_many_missing_samples_begin_a_new_boot_and_the_law_goes_on(
     gateway: Gateway, machine: StubMachine, twin: FakeTwin
 ) -> None:
-    machine.spoil = lambda n, *rest: (n if n < 300 else n + 7, *rest)
+    machine.spoil = lambda n, *rest: (n if n < 300 else n + 700, *rest)
     gateway.start()
     until(lambda: len(sequences(twin)) == 2)
     assert gateway.signal(signal.SIGTERM) == 0
     first, second = sequences(twin)
     assert second == f"{first}.1"
-    assert gateway.status()["samples missed"] == 7
+    assert gateway.status()["boot: samples missing"] == 1
+    assert machine.voltages[300] == pytest.approx(machine.voltages[299], rel=0.2)
 
 
 def test_a_wrong_configuration_ends_with_one_sentence(gateway: Gateway, machine: StubMachine) -> None:

@@ -142,6 +142,8 @@ class EdgeConfig:
         None: it runs without a twin, and keeps its windows.
     keeping : Keeping
     sensor : SensorGuard
+    priority : int
+        Of the control process among real-time ones (SCHED_FIFO), 1 to 99; 0: it is none.
     folder : path
         What paths are relative to.
     source : str
@@ -155,6 +157,7 @@ class EdgeConfig:
     twin: TwinLink | None = None
     keeping: Keeping = field(default_factory=Keeping)
     sensor: SensorGuard = field(default_factory=SensorGuard)
+    priority: int = 0
     folder: Path = field(default=Path(), compare=False)
     source: str = field(default="edge.toml", compare=False)
 
@@ -168,6 +171,8 @@ class EdgeConfig:
         if self.role == "control" and self.law_rate != self.agent.sample_rate:
             allowed = f"must be that of the samples, {self.agent.sample_rate!r} Hz"
             raise InvalidInput(f"controller sample_rate_hz = {self.law_rate!r} Hz: {allowed}")
+        if not 0 <= self.priority <= 99:
+            raise InvalidInput(f"realtime_priority = {self.priority!r}: must be 0 to 99")
         if "kind" not in self.drive:
             raise InvalidInput("key 'drive.kind' is missing")
 

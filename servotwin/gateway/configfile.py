@@ -84,6 +84,7 @@ def read(table: Table) -> EdgeConfig:
             twin=part(table, "twin", lambda t: TwinLink(**given(t, _TWIN))) if "twin" in table.values else None,
             keeping=part(table, "keep", lambda t: Keeping(**given(t, _KEEPING))),
             sensor=part(table, "sensor", lambda t: SensorGuard(**given(t, _SENSOR))),
+            priority=table.integer("realtime_priority", 0),
             source=table.source,
         )
     table.known("controller", "twin", "own", "start", "probe", "novelty")

@@ -43,6 +43,7 @@ def edge_toml(config: EdgeConfig) -> str:
         "model_version": agent.model_version,
         "reference_m": agent.reference,
         "update_gains": agent.controller is not None,
+        "realtime_priority": config.priority,
     }
     return "\n".join(_lines("", {**top, **_tables(config)})) + "\n"
 

@@ -29,7 +29,7 @@ class Law:
         self.law = law
         self.state: LawState | None = None
         self.bad = 0
-        self._hold, self._safe, self._voltage = hold, safe, safe
+        self._hold, self._safe, self.voltage = hold, safe, safe
 
     def change(self, law: LawParameters, reference: float, position: float) -> None:
         """Another law from the tick that is due on; the voltage stays."""
@@ -43,16 +43,16 @@ class Law:
             return self._without()
         state = tick(self.law, start(position) if self.state is None else self.state, reference, position)
         if not isfinite(state.voltage + state.integral + state.derivative):
-            self.state, self._voltage = None, self._safe
+            self.state, self.voltage = None, self._safe
             return self._safe
-        self.bad, self.state, self._voltage = 0, state, state.voltage
+        self.bad, self.state, self.voltage = 0, state, state.voltage
         return state.voltage
 
     def _without(self) -> float:
         self.bad += 1
         if self.bad > self._hold:
-            self.state, self._voltage = None, self._safe
-        return self._voltage
+            self.state, self.voltage = None, self._safe
+        return self.voltage
 
 
 class Controlling:
@@ -114,9 +114,11 @@ class Controlling:
         edge.send(agent.absorb(wanted, sample.theta_m, sample.position, voltage))
 
     def _jumped(self, number: int) -> None:
-        """Samples are missing, or are counted anew."""
-        if self._due is not None:
-            self._edge.counts["samples missed"] += max(0, number - self._due)
+        """Samples are missing, in which the voltage was held, or they are counted anew."""
+        if self._due is None:
+            return
+        wanted = self._reference + self._edge.agent.offset
+        if not self._edge.bridge(number - self._due, wanted, self.law.voltage):
             self._edge.begin("samples missing" if number > self._due else "machine counts anew")
             self._in_force = self._edge.agent.parameters
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from math import nan
 from typing import Protocol
 
 from servotwin.edge.agent import Agent, Outgoing
@@ -18,6 +20,8 @@ from servotwin.gateway.ticks import Counts
 
 Clock = Callable[[], float]
 CHILD_S, TOLD_S, PIECE_S = 0.1, 1.0, 0.005
+BRIDGED_S = 1.0
+"""Time without samples after which a new boot begins."""
 
 
 class Child(Protocol):
@@ -76,8 +80,26 @@ class Edge:
         self._child_due = self._told_due = clock()
         self.agent = self._begun(first)
 
+    def bridge(self, missing: int, wanted: float, voltage: float) -> bool:
+        """Let so many samples pass that nobody has seen, if they are few: no window with one of them is sent.
+
+        Parameters
+        ----------
+        missing : int
+            Samples.
+        wanted, voltage : float
+            m and V meanwhile, as far as known.
+        """
+        if not 0 < missing <= BRIDGED_S * self.config.agent.sample_rate:
+            return False
+        self.counts["samples missed"] += missing
+        unseen = array("d", [nan]) * missing
+        held, given = array("d", [wanted]) * missing, array("d", [voltage]) * missing
+        self.send(self.agent.absorb_block(held, unseen, unseen, given))
+        return True
+
     def begin(self, why: str) -> None:
-        """Samples are missing: a new boot, on the parameters in force."""
+        """Too many samples are missing, or they are counted anew: a new boot, on the parameters in force."""
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
         self.agent = self._begun(restored(kept(self.agent.parameters)))

@@ -105,6 +105,7 @@ def until(stop: Stop, edge: Edge, drive: Drive, role_of: Callable[[], Role]) -> 
     """Connect, run, connect again where the drive was lost."""
     role: Role | None = None
     calm()
+    hurry(edge.config.priority)
     while not stop.wanted:
         try:
             drive.connect()
@@ -135,6 +136,18 @@ def calm() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 50, 1000)
+
+
+def hurry(priority: int) -> bool:
+    """Ask the scheduler to run this process before others, not those it starts; whether it does."""
+    if priority == 0:
+        return False
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except (OSError, AttributeError) as error:
+        say("no real-time priority", error=str(error))
+        return False
+    return True
 
 
 def _wait(stop: Stop, edge: Edge) -> None:

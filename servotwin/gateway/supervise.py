@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import nan
+
 from servotwin.edge.drive import Block, DriveRefused, SupervisedDrive
 from servotwin.gateway.edge import Edge
 
@@ -24,7 +26,7 @@ class Supervising:
         self._most = max(1, round(LONGEST_BLOCK_S * edge.config.agent.sample_rate))
         self._due: int | None = None
         self._written: object = None
-        self._moved = 0.0
+        self._moved, self._reference = 0.0, edge.config.agent.reference
 
     def step(self) -> bool:
         """One block; whether the run goes on. Raises `DriveLost`."""
@@ -50,10 +52,10 @@ class Supervising:
             self._drive.move(0.0)
 
     def _absorb(self, block: Block) -> None:
-        if block.first != self._due and self._due is not None:
-            self._edge.counts["samples missed"] += max(0, block.first - self._due)
-            self._edge.begin("samples missing" if block.first > self._due else "machine counts anew")
-        self._due = block.last
+        due = block.first if self._due is None else self._due
+        if block.first != due and not self._edge.bridge(block.first - due, self._reference, nan):
+            self._edge.begin("samples missing" if block.first > due else "machine counts anew")
+        self._due, self._reference = block.last, block.reference[-1]
         self._edge.send(self._edge.agent.absorb_block(block.reference, block.theta_m, block.position, block.voltage))
 
     def _until(self) -> int:
