@@ -142,7 +142,7 @@ def bench(
     workloads: Annotated[
         list[str] | None,
         typer.Argument(
-            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies."
+            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies, tick."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
@@ -235,6 +235,24 @@ def map_(
     axes = (tolerance, amplitude, gap_deg, estimate_deg, k_dz, amplitude_mm)
     runs = (members, motion, seed, duration, window, still_um)
     stability_map(Request(servo, *axes, enter, leave, *runs), out, workers, scheduler)
+
+
+@app.command()
+def certify(
+    file: Annotated[Path, typer.Argument(help="A twin's file, or a scenario's TOML.")],
+    model: Annotated[str | None, typer.Option(help="One of its models; all that name a table without.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The table; the file that the key table names without.")] = None,
+    finest_deg: Annotated[float, typer.Option(help="Width of the narrowest cells of gaps.")] = 4.0,
+    bias_mv: Annotated[
+        str, typer.Option(help="Largest input bias beside the feedforward: VALUE,VALUE,...")
+    ] = "1,10,50",
+    noise_um: Annotated[str, typer.Option(help="Noise for which settings are ranked, rms: VALUE,...")] = "0,10",
+) -> None:
+    """Prove settings beforehand, for twins that look them up; goes on where it was interrupted."""
+    from servotwin.certification import certify as run
+    from servotwin.certification import grid_of
+
+    run(file, model, out, grid_of(finest_deg, bias_mv, noise_um))
 
 
 @app.command()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from time import perf_counter
@@ -64,7 +64,7 @@ def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:
 
 def build(
     path: Path, policy: CertifiedPolicy, grid: Grid, clock: Callable[[], float] = perf_counter
-) -> Iterator[tuple[int, int]]:
+) -> Generator[tuple[int, int], None, None]:
     """Prove a table cell by cell into a file, going on where an earlier run ended; gives (cells done, cells in all).
 
     What is done is on the disk every few seconds and when this is closed.
@@ -114,7 +114,9 @@ def _read(path: Path) -> TableFile:
             raise InvalidInput(f"{path}: is larger than {LARGEST} bytes, which no table is")
         return _decoder.decode(path.read_bytes())
     except OSError as error:
-        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise InvalidInput(
+            f"{path}: cannot be read ({error.strerror or error}); `servotwin certify` makes tables"
+        ) from None
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InvalidInput(f"{path}: is no table of proved settings ({error})") from None
 

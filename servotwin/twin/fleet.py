@@ -127,8 +127,7 @@ class Fleet:
             A key is unknown or missing, a value is not allowed, a file that it names cannot be read, a controller is
             unstable on its servo even without a gap.
         """
-        inner = table.table("models", required=True)
-        models = tuple(part(inner, name, partial(_model, name=name, folder=folder)) for name in inner.values)
+        models = models_of(table, folder)
         servos = table.table("servos", required=True)
         with named(table):
             return cls(models, tuple((servo, servos.text(servo)) for servo in servos.values))
@@ -165,12 +164,19 @@ class Fleet:
         return tuple((servo, model) for servo, model in self.servos if "*" in servo)
 
 
+def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[Model, ...]:
+    """[models] of a twin's file; unless they are `checked`, what their policies need may still be missing."""
+    inner = table.table("models", required=True)
+    make = partial(_model, folder=folder, checked=checked)
+    return tuple(part(inner, name, partial(make, name=name)) for name in inner.values)
+
+
 def _check_pattern(servo: str) -> None:
     if not re.match(NAME_PATTERN, servo.replace("*", "a")):
         raise InvalidInput(f"servos: {servo!r} names no servo: 1 to 64 of A-Z a-z 0-9 . _ - are allowed, and * for any")
 
 
-def _model(table: Table, name: str, folder: Path) -> Model:
+def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
     """One table of [models]."""
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
@@ -179,7 +185,8 @@ def _model(table: Table, name: str, folder: Path) -> Model:
     settings = part(table, "twin", partial(settingsfile.twin, folder=folder))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)
-    policy_of(servo.replace(controller=law), settings)
+    if checked:
+        policy_of(servo.replace(controller=law), settings)
     return Model(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
