@@ -166,6 +166,14 @@ def bench(
     run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))
 
 
+@app.command()
+def edge(file: Annotated[Path, typer.Argument(help="The servo's edge.toml.")]) -> None:
+    """Run one servo's edge until a signal ends it; where nothing but it is installed: python -m servotwin.gateway."""
+    from servotwin.gateway.run import run
+
+    run(file)
+
+
 @app.command("limit-cycle")
 def limit_cycle(
     servo: Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")] = "paper",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from servotwin.bench import accuracy, endurance
+from servotwin.bench import accuracy, endurance, tick
 from servotwin.bench.novelty import command as worth_sending
 from servotwin.bench.policies import command as side_by_side
 from servotwin.errors import InvalidInput
@@ -29,10 +29,15 @@ def _novelty(date: str, output: Path | None, quick: bool) -> None:
     worth_sending.novelty(date, output, worth_sending.QUICK if quick else None)
 
 
+def _tick(date: str, output: Path | None, quick: bool) -> None:
+    tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
+
+
 ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     accuracy.NAME: _estimator,
     endurance.NAME: _hostile,
     side_by_side.NAME: _policies,
+    tick.NAME: _tick,
     worth_sending.NAME: _novelty,
 }
 

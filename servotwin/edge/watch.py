@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, sqrt
 from operator import mul, sub
-from typing import NamedTuple
 
+from servotwin.edge.moves import Moves
 from servotwin.edge.turns import Turns
 from servotwin.edge.verdict import Verdict, judged_by
 from servotwin.errors import InvalidInput
@@ -71,14 +71,6 @@ class WatchSettings:
             raise InvalidInput(f"watch swings = {self.swings!r}: must be at least 2")
 
 
-class Move(NamedTuple):
-    """What the reference did (m), and the sample until which the loop may still follow it."""
-
-    until: int
-    low: float
-    high: float
-
-
 class Watch:
     """Takes samples, gives verdicts.
 
@@ -101,7 +93,7 @@ class Watch:
         self._certified = certified
         self._reference: float | None = None
         self._before = reference
-        self._moves: deque[Move] = deque()
+        self._moves = Moves()
         self.restart(None, 0)
 
     @property
@@ -162,13 +154,12 @@ class Watch:
         until = sample + len(reference) + self._settling
         if self._reference is None:
             self._reference = self._before
-            self._moves.append(Move(until, reference[0] - size, reference[0]))
+            self._moves.add(until, reference[0] - size, reference[0])
         low, high = min(reference), max(reference)
         if low != high or low != self._reference:
-            self._moves.append(Move(until, min(low, self._reference), max(high, self._reference)))
+            self._moves.add(until, min(low, self._reference), max(high, self._reference))
             self._reference = reference[-1]
-        while self._moves and self._moves[0].until <= sample:
-            self._moves.popleft()
+        self._moves.expire(sample)
 
     def _forget(self) -> None:
         window = max(1, round(self.settings.window_s * self.rate / self.slot))
@@ -183,8 +174,7 @@ class Watch:
             return None
         allowed = max(self.settings.margin * band.error, self.settings.error_floor)
         if self._moves:
-            travel = max(move.high for move in self._moves) - min(move.low for move in self._moves)
-            allowed += self.settings.overshoot * travel
+            allowed += self.settings.overshoot * self._moves.travel
         self._outside = self._outside + 1 if size > allowed else 0
         long = self._outside * self.slot >= self.settings.persist_s * self.rate
         return Verdict(Cause.ERROR, size, allowed) if long else None

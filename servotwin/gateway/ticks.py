@@ -25,12 +25,16 @@ class Counts:
 
 
 def summary(data: bytes, longest: float) -> dict[str, float]:
-    """Number, and median, p99, p99.9 and maximum in microseconds, of `Counts.dumps`."""
+    """Number, and median, p99, p99.9 and maximum in microseconds, of `Counts.dumps`.
+
+    What is longer than the bins reach is told as the longest.
+    """
     bins = array("L")
     bins.frombytes(data)
     total = sum(bins)
     shares = {"median_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
     found = {name: float(quantile(bins, total, share)) for name, share in shares.items()}
+    found = {name: value if value < BINS else round(longest * 1e6, 1) for name, value in found.items()}
     return {"number": total, **found, "max_us": round(longest * 1e6, 1)}
 
 
