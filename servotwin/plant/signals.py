@@ -139,6 +139,11 @@ class PiecewiseCubic:
         """The same shape, every value times `factor`."""
         return PiecewiseCubic(self.times, self.coeffs * factor)
 
+    def later(self, time: float) -> PiecewiseCubic:
+        """What it is from a time (s, at least 0) on, as a signal that begins there."""
+        first = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
+        return PiecewiseCubic(self.times[first:] - time, self.coeffs[first:])
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PiecewiseCubic):
             return NotImplemented

@@ -6,10 +6,13 @@ When it listens it says so in one line, "ready ADDRESS"; an interrupt or SIGTERM
 import os
 import signal
 import sys
+import time
 
 from servotwin.drives.simulated.control import ControlServer
+from servotwin.drives.simulated.diary import Diary
+from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
-from servotwin.drives.simulated.server import Server, address_in_use, listening, run, start_pace
+from servotwin.drives.simulated.server import Server, Tend, address_in_use, listening, run, start_pace, untended
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.simulated.supervise import SuperviseServer
 from servotwin.errors import InvalidInput
@@ -28,16 +31,21 @@ def main(path: str) -> None:
     compile_ahead(settings.scenario)
     plant = ControlledPlant(settings) if settings.role == "control" else SupervisedPlant(settings)
     with listening(settings.address) as listener:
-        server = _server(plant, settings)
+        pace = start_pace(settings)
+        diary = None if pace is None else Diary(settings, pace, time.monotonic())
+        server = _server(plant, pace, settings.slack, untended if diary is None else diary.look)
         print("ready", address_in_use(listener, settings.address), flush=True)
-        run(server, listener, settings, os.urandom(8))
+        try:
+            run(server, listener, settings, os.urandom(8))
+        finally:
+            if diary is not None:
+                diary.write(plant.index, time.monotonic())
 
 
-def _server(plant: ControlledPlant | SupervisedPlant, settings: MachineSettings) -> Server:
-    pace = start_pace(settings)
+def _server(plant: ControlledPlant | SupervisedPlant, pace: Pace | None, slack: float, tend: Tend) -> Server:
     if isinstance(plant, ControlledPlant):
-        return ControlServer(plant, pace, settings.slack)
-    return SuperviseServer(plant, pace)
+        return ControlServer(plant, pace, slack, tend)
+    return SuperviseServer(plant, pace, tend)
 
 
 def _ended(*_: object) -> None:

@@ -9,7 +9,7 @@ import time
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import ControlledPlant
-from servotwin.drives.simulated.server import ALONE
+from servotwin.drives.simulated.server import ALONE, Tend, untended
 
 
 class ControlServer:
@@ -22,10 +22,11 @@ class ControlServer:
         None: lock-step.
     patience : float
         s by the clock after which an unanswered tick counts as missed; lock-step waits for ever.
+    tend : Tend
     """
 
-    def __init__(self, plant: ControlledPlant, pace: Pace | None, patience: float) -> None:
-        self._plant, self._pace, self._patience = plant, pace, patience
+    def __init__(self, plant: ControlledPlant, pace: Pace | None, patience: float, tend: Tend = untended) -> None:
+        self._plant, self._pace, self._patience, self._tend = plant, pace, patience, tend
 
     @property
     def over(self) -> bool:
@@ -36,7 +37,9 @@ class ControlServer:
         """Without a client: everything that is due, the voltage left alone until the watchdog's time is over."""
         if self._pace is None:
             return None
-        self._pace.keep(self._plant.index, time.monotonic())
+        now = time.monotonic()
+        self._tend(self._plant.index, now)
+        self._pace.keep(self._plant.index, now)
         due = self._pace.reached(time.monotonic())
         while self._plant.index < due and not self._plant.over:
             self._plant.run_alone()
@@ -61,7 +64,9 @@ class ControlServer:
         left = pace.due(self._plant.index) - time.monotonic()
         if left > 0.0:
             time.sleep(left)
-        return pace.keep(self._plant.index, time.monotonic())
+        now = time.monotonic()
+        self._tend(self._plant.index, now)
+        return pace.keep(self._plant.index, now)
 
     def _miss(self, connection: socket.socket) -> bytes:
         """Go on as without a client until its answer comes: to an old sample, it holds from the present one on."""

@@ -20,8 +20,15 @@ class Pace:
     """
 
     def __init__(self, rate: float, speed: float, slack: float, now: float, first: int = 0) -> None:
-        self._every, self._speed, self._slack = 1.0 / (rate * speed), speed, slack
+        self._rate, self._slack = rate, slack
+        self._every, self._speed = 1.0 / (rate * speed), speed
         self._zero = now - first * self._every
+
+    def change(self, speed: float, now: float) -> None:
+        """Another speed from now on."""
+        passed = (now - self._zero) / self._every
+        self._every, self._speed = 1.0 / (self._rate * speed), speed
+        self._zero = now - passed * self._every
 
     def due(self, number: int) -> float:
         """When a sample is due."""

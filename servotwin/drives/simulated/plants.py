@@ -33,7 +33,7 @@ class ControlledPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._held = Held(machine.endless(settings.scenario, KEPT))
+        self._held = Held(machine.endless(settings.present, KEPT))
         self._end, self._patience = settings.end, settings.watchdog * settings.rate
         self._voltage, self._unattended = 0.0, 0
         self.sample: Callable[[], tuple[float, float, float]] = self._held.sample
@@ -90,7 +90,7 @@ class SupervisedPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._machine = machine.endless(settings.scenario, wire.MOST)
+        self._machine = machine.endless(settings.present, wire.MOST)
         self._law, self._end = settings.scenario.law, settings.end
         self._kept = round(settings.kept * settings.rate)
         self._stretches: deque[Stretch] = deque()

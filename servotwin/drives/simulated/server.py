@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -20,6 +20,13 @@ ALONE = 0.01
 
 GREETING = 1.0
 """s within which a new client must say what it wants."""
+
+Tend = Callable[[int, float], None]
+"""Told the present sample and the clock's time (s), now and then, where the clock drives the machine."""
+
+
+def untended(_sample: int, _now: float) -> None:
+    """Nothing has to be done between samples."""
 
 
 class Server(Protocol):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from servotwin.drives.simulated import wire
+from servotwin.drives.simulated.diary import read_speed, read_state
 from servotwin.errors import InvalidInput
+from servotwin.plant.signals import as_pieces
 from servotwin.scenario import PRESETS, Scenario
 from servotwin.tomltable import Table, named, read_toml
 
@@ -38,6 +40,12 @@ class MachineSettings:
         s of machine time in one block where the reader does not say; supervise only.
     kept : float
         s of machine time for which samples wait to be read; supervise only.
+    state_file : Path, optional
+        Where it keeps how long it has run; a start goes on wearing from there, from rest and with its reference anew.
+    speed_file : Path, optional
+        Holds a number that goes before `speed`, at the start and whenever it becomes another.
+    begin : float
+        s of machine time before this run.
     """
 
     scenario: Scenario
@@ -49,6 +57,9 @@ class MachineSettings:
     slack: float = 0.25
     block: float = 0.05
     kept: float = 10.0
+    state_file: Path | None = None
+    speed_file: Path | None = None
+    begin: float = 0.0
 
     def __post_init__(self) -> None:
         rate, law = self.rate, self.scenario.law.sample_rate
@@ -60,6 +71,8 @@ class MachineSettings:
             raise InvalidInput(f"block_s = {self.block!r} s: must hold 1 to {wire.MOST} samples at {rate!r} Hz")
         if self.kept < self.block:
             raise InvalidInput(f"keep_s = {self.kept!r} s: must be at least block_s = {self.block!r} s")
+        if (self.state_file or self.speed_file) and not (self.speed > 0.0 and self.endless):
+            raise InvalidInput("state_file and speed_file are for machines that run on: speed > 0 and endless = true")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> MachineSettings:
@@ -81,10 +94,37 @@ class MachineSettings:
             "slack": table.number("slack_s", cls.slack, positive=True),
             "block": table.number("block_s", cls.block, positive=True),
             "kept": table.number("keep_s", cls.kept, positive=True),
+            **{key: folder / table.text(key) for key in ("state_file", "speed_file") if key in table.values},
         }
         table.done()
         with named(table):
-            return cls(**settings)
+            return cls(**settings).resumed()
+
+    def resumed(self) -> MachineSettings:
+        """As its files say: from where it was, at the speed that is asked for.
+
+        Raises
+        ------
+        InvalidInput
+            What should be its state is none.
+        """
+        state = None if self.state_file is None else read_state(self.state_file)
+        speed = None if self.speed_file is None else read_speed(self.speed_file)
+        return replace(self, begin=0.0 if state is None else state.time_s, speed=speed or self.speed)
+
+    @property
+    def present(self) -> Scenario:
+        """The scenario from `begin` on, its noise not the same again."""
+        scenario = self.scenario
+        if self.begin == 0.0:
+            return scenario
+        gap = as_pieces(scenario.gap, scenario.duration).later(self.begin)
+        return scenario.replace(gap=gap, seed=scenario.seed + 1 + int(self.begin))
+
+    def gap_at(self, sample: int) -> float:
+        """Total gap (rad) at a sample of this run."""
+        time = self.begin + sample / self.rate
+        return float(as_pieces(self.scenario.gap, self.scenario.duration).value(time))
 
     @property
     def rate(self) -> float:

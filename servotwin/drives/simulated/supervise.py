@@ -10,6 +10,7 @@ from typing import NamedTuple
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import SupervisedPlant
+from servotwin.drives.simulated.server import Tend, untended
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 
@@ -36,10 +37,11 @@ class SuperviseServer:
     plant : SupervisedPlant
     pace : Pace, optional
         None: lock-step, where a request to read lets the plant go on.
+    tend : Tend
     """
 
-    def __init__(self, plant: SupervisedPlant, pace: Pace | None) -> None:
-        self._plant, self._pace, self._late = plant, pace, 0.0
+    def __init__(self, plant: SupervisedPlant, pace: Pace | None, tend: Tend = untended) -> None:
+        self._plant, self._pace, self._late, self._tend = plant, pace, 0.0, tend
 
     @property
     def over(self) -> bool:
@@ -51,7 +53,9 @@ class SuperviseServer:
         if self._pace is None:
             return None
         plant, pace = self._plant, self._pace
-        self._late = pace.keep(plant.index + plant.block, time.monotonic())
+        now = time.monotonic()
+        self._tend(plant.index, now)
+        self._late = pace.keep(plant.index + plant.block, now)
         while plant.index + plant.block <= pace.reached(time.monotonic()) and not plant.over:
             plant.advance(plant.block)
         return pace.due(plant.index + plant.block)
