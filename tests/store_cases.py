@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import postgres
 
 from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome
+from servotwin.store.store import Store, open_store
 
 SYSTEMS = ("sqlite", "postgresql")
 
@@ -47,3 +49,18 @@ def outcome(claim: Claim, *evidence: Evidence, outgoing: tuple[bytes, ...] = (),
     done = tuple(message.id for message in claim.messages)
     values = {"state": b"state", "wake": None} | other
     return Outcome(claim.servo, claim.serial, done=done, evidence=evidence, outgoing=outgoing, **values)
+
+
+def bodies_of(claim: Claim) -> list[bytes]:
+    return [message.body for message in claim.messages]
+
+
+def claim(store: Store, owner: str = "me", now: float = 200.0, **more: object) -> list[Claim]:
+    return store.claim(owner, more.pop("limit", 10), more.pop("lease_s", 30.0), now, **more)
+
+
+def filled(url: str, windows: int = 5) -> Store:
+    """A new store with some windows."""
+    store = open_store(url)
+    store.put([window(sequence=n, body=os.urandom(3000), received=100.0 + n) for n in range(windows)])
+    return store

@@ -5,29 +5,25 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
 import sqlalchemy as sa
 import store_process
-from store_cases import SYSTEMS, addresses, window
+from store_cases import window
+from store_fixtures import NewAddress
 
 from servotwin.store.engine import transaction
 from servotwin.store.rows import Put
 from servotwin.store.schema import evidence, messages
 from servotwin.store.store import Store, open_store
 
+pytest_plugins = ("store_fixtures",)
+
 PROGRAM = Path(store_process.__file__)
 FAR = 4e9
 """s since the epoch: every lease is over."""
-
-
-@pytest.fixture(scope="module", params=SYSTEMS)
-def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable]:
-    with addresses(request.param, tmp_path_factory.mktemp("stores")) as found:
-        yield found
 
 
 @contextmanager
@@ -87,7 +83,7 @@ def check_each_once(store: Store) -> None:
         assert serials == list(range(1, servo.posted + 1))
 
 
-def test_killed_in_the_middle_of_group_commits(new_address: Callable[[], str]) -> None:
+def test_killed_in_the_middle_of_group_commits(new_address: NewAddress) -> None:
     url = new_address()
     safe: set[tuple[str, int]] = set()
     open_store(url).close()
@@ -115,7 +111,7 @@ def no_process() -> Iterator[None]:
     yield None
 
 
-def test_a_worker_killed_in_the_middle_of_outcomes(new_address: Callable[[], str]) -> None:
+def test_a_worker_killed_in_the_middle_of_outcomes(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
     store.put([window(servo, n) for n in range(60) for servo in store_process.SERVOS])
@@ -127,7 +123,7 @@ def test_a_worker_killed_in_the_middle_of_outcomes(new_address: Callable[[], str
     store.close()
 
 
-def test_what_a_killed_process_had_borrowed_another_one_does(new_address: Callable[[], str]) -> None:
+def test_what_a_killed_process_had_borrowed_another_one_does(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
     store.put([window(servo, n) for n in range(12) for servo in store_process.SERVOS])
@@ -140,7 +136,7 @@ def test_what_a_killed_process_had_borrowed_another_one_does(new_address: Callab
     store.close()
 
 
-def test_two_processes_share_the_work_and_one_is_killed(new_address: Callable[[], str]) -> None:
+def test_two_processes_share_the_work_and_one_is_killed(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
     store.put([window(servo, n) for n in range(60) for servo in store_process.SERVOS])

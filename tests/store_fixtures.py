@@ -1,0 +1,62 @@
+"""Fixtures for tests of the store: every test on SQLite and on PostgreSQL."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from store_cases import SYSTEMS, addresses
+
+from servotwin.store import migrate as migrations
+from servotwin.store.engine import transaction
+from servotwin.store.schema import metadata
+from servotwin.store.store import Store, open_store
+
+NewAddress = Callable[[], str]
+"""URL of a new, empty database."""
+
+MORE = """
+import sqlalchemy as sa
+from alembic import op
+revision = "0002"
+down_revision = "0001"
+def upgrade():
+    op.add_column("twins", sa.Column("colour", sa.Text, nullable=False, server_default="grey"))
+"""
+
+
+@pytest.fixture(scope="module", params=SYSTEMS)
+def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NewAddress]:
+    with addresses(request.param, tmp_path_factory.mktemp("stores")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def opened(new_address: NewAddress) -> Iterator[Store]:
+    store = open_store(new_address())
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def store(opened: Store) -> Store:
+    """An empty one."""
+    with transaction(opened.engines.writer) as connection:
+        for table in reversed(metadata.sorted_tables):
+            connection.execute(sa.delete(table))
+    return opened
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path}/store.db"
+
+
+@pytest.fixture
+def later_scripts(tmp_path: Path) -> Path:
+    """The migrations of some later servotwin."""
+    folder = tmp_path / "migrations"
+    shutil.copytree(migrations.SCRIPTS, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "versions" / "0002_more.py").write_text(MORE)
+    return folder

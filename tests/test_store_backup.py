@@ -1,0 +1,201 @@
+"""Backup, restore and retention: what is kept stays whole, and nothing is written over."""
+
+import os
+import shutil
+import sqlite3
+import threading
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from store_cases import filled, letter, outcome, window
+from store_fixtures import NewAddress
+
+from servotwin.errors import InvalidInput
+from servotwin.store import migrate as migrations
+from servotwin.store.backup import Counts, backup, restore
+from servotwin.store.engine import transaction
+from servotwin.store.retention import Forgotten, forget
+from servotwin.store.rows import Evidence, Put
+from servotwin.store.schema import bodies
+from servotwin.store.store import open_store
+
+pytest_plugins = ("store_fixtures",)
+SECRET = "unspeakable"
+
+
+# Backup and restore
+
+
+def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
+    store = filled(url)
+    (claim,) = store.claim("me", 1, 30.0, 200.0)
+    store.commit([outcome(claim, Evidence("estimate", claim.messages[0].id, b"e"), outgoing=(b"u",))], 201.0)
+    pages: list[tuple[int, int]] = []
+    saved = tmp_path / "backup.db"
+    counts = backup(url, saved, lambda *of: pages.append(of))
+    assert counts == Counts(twins=1, messages=5, bodies=5, evidence=1, outgoing=1)
+    assert pages[-1][0] == 0
+    assert saved.stat().st_mode & 0o777 == 0o600
+    store.put([window(sequence=9)])
+
+    again = f"sqlite:///{tmp_path}/again.db"
+    assert restore(saved, again) == counts
+    restored = open_store(again)
+    assert restored.audit("a") == store.audit("a")[1:]
+    assert restored.outgoing("a", 0) == store.outgoing("a", 0)
+    assert restored.window("a", "boot", 3) == store.window("a", "boot", 3)
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(("backup", ".backup"))) == ["backup.db"]
+    restored.close()
+    store.close()
+
+
+def test_a_backup_while_it_is_written_to_is_of_one_moment(url: str, tmp_path: Path) -> None:
+    store = filled(url, 50)
+    stop = threading.Event()
+
+    def write() -> None:
+        sequence = 50
+        while not stop.is_set():
+            store.put([window(sequence=n, body=os.urandom(3000)) for n in (sequence, sequence + 1)])
+            sequence += 2
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for number in range(5):
+            counts = backup(url, tmp_path / f"backup-{number}.db")
+            assert counts.messages == counts.bodies
+            assert counts.messages % 2 == 0
+    finally:
+        stop.set()
+        writer.join()
+    store.close()
+
+
+def test_what_cannot_be_backed_up(url: str, tmp_path: Path) -> None:
+    to = tmp_path / "backup.db"
+    with pytest.raises(InvalidInput, match="there is no such file"):
+        backup(url, to)
+    with pytest.raises(InvalidInput, match=r"call pg_dump --format=custom --file=.*backup.db DATABASE$") as refused:
+        backup(f"postgresql://u:{SECRET}@h/d", to)
+    assert SECRET not in str(refused.value)
+    other = tmp_path / "other.db"
+    sqlite3.connect(other).close()
+    with pytest.raises(InvalidInput, match="is not one of servotwin's"):
+        backup(str(other), to)
+    store = filled(url)
+    with pytest.raises(InvalidInput, match="is the store itself"):
+        backup(url, tmp_path / "store.db")
+    with pytest.raises(InvalidInput, match="cannot be written"):
+        backup(url, tmp_path / "nowhere" / "backup.db")
+    assert not to.exists()
+    store.close()
+
+
+def test_a_restore_overwrites_nothing(url: str, tmp_path: Path) -> None:
+    store, saved = filled(url), tmp_path / "backup.db"
+    backup(url, saved)
+    with pytest.raises(InvalidInput, match="holds something already"):
+        restore(saved, url)
+    empty = tmp_path / "empty.db"
+    in_use = open_store(str(empty))
+    with pytest.raises(InvalidInput, match="is in use"):
+        restore(saved, str(empty))
+    in_use.close()
+    assert restore(saved, str(empty)).messages == 5
+    opened = open_store(str(empty))
+    assert opened.servo("a").windows == 5
+    opened.close()
+    left = tmp_path / "gone.db"
+    left.with_name("gone.db-wal").write_bytes(b"log")
+    with pytest.raises(InvalidInput, match=r"its log gone\.db-wal is there"):
+        restore(saved, str(left))
+    store.close()
+
+
+def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, later_scripts: Path) -> None:
+    store, saved, to = filled(url, 40), tmp_path / "backup.db", tmp_path / "restored.db"
+    backup(url, saved)
+    whole = saved.read_bytes()
+    middle = len(whole) // 2
+    saved.write_bytes(whole[:middle] + os.urandom(20_000) + whole[middle + 20_000 :])
+    with pytest.raises(InvalidInput):
+        restore(saved, str(to))
+    saved.write_bytes(whole[:middle])
+    with pytest.raises(InvalidInput):
+        restore(saved, str(to))
+    # A row and its index disagree: every page can be read, and the copy is as bad as its source.
+    places = [place for place in range(len(whole)) if whole.startswith(b"aboot/17", place)]
+    assert places
+    saved.write_bytes(b"".join((whole[: places[-1]], b"aboot/71", whole[places[-1] + 8 :])))
+    with pytest.raises(InvalidInput, match="is damaged"):
+        restore(saved, str(to))
+    migrations.migrate(store.engines.writer, "0002", later_scripts)
+    store.close()
+    shutil.copy(tmp_path / "store.db", saved)
+    with pytest.raises(InvalidInput, match="newer than 0001"):
+        restore(saved, str(to))
+    assert not to.exists()
+    with pytest.raises(InvalidInput, match="there is no such file"):
+        restore(tmp_path / "nothing.db", str(to))
+    with pytest.raises(InvalidInput, match="call pg_restore"):
+        restore(saved, "postgresql://u@h/d")
+
+
+# Retention
+
+
+def test_retention_empties_old_windows_but_those_that_matter(new_address: NewAddress) -> None:
+    store = open_store(new_address())
+    store.put([window(sequence=n, body=bytes(1000), received=100.0 + n) for n in range(10)])
+    store.put([letter(received=100.0)])
+    (claim,) = store.claim("me", 1, 30.0, 200.0, per_servo=8)
+    led = Evidence("update", claim.messages[2].id, b"", version=1)
+    every = [Evidence("estimate", message.id, b"e") for message in claim.messages]
+    store.commit([outcome(claim, led, *every)], 201.0)
+    pauses: list[None] = []
+    assert forget(store, 109.0, 3, lambda: pauses.append(None)) == Forgotten(emptied=7, bytes=7000, kept=2)
+    assert pauses
+    bodies = {n: store.window("a", "boot", n).body for n in range(10)}
+    assert [n for n, body in bodies.items() if body] == [2, 8, 9]
+    assert len([link for link in store.audit("a") if link.found or link.steps]) == 8
+    assert store.put([window(body=bytes(1000))]) == [Put.KNOWN]
+    (rest,) = store.claim("me", 1, 30.0, 300.0)
+    assert len(rest.messages) == 3
+    assert forget(store, 109.0) == Forgotten(0, 0, 2)
+    store.close()
+
+
+def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
+    store = open_store(url)
+    store.put([window(sequence=n, body=os.urandom(20_000), received=100.0) for n in range(100)])
+    while claims := store.claim("me", 1, 30.0, 200.0):
+        store.commit([outcome(claim) for claim in claims], 201.0)
+
+    def pages() -> int:
+        with transaction(store.engines.reader) as connection:
+            return connection.exec_driver_sql("PRAGMA page_count").scalar_one()
+
+    before = pages()
+    assert forget(store, 1000.0, 10).emptied == 100
+    assert pages() < before / 5
+    store.close()
+
+
+def test_retention_ended_early_goes_on_next_time(url: str) -> None:
+    store = open_store(url)
+    store.put([window(sequence=n, received=100.0) for n in range(10)])
+    store.commit([outcome(claim) for claim in store.claim("me", 1, 30.0, 200.0)], 201.0)
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        forget(store, 1000.0, 4, stop)
+    assert forget(store, 1000.0, 4).emptied == 6
+    with transaction(store.engines.reader) as connection:
+        assert connection.execute(sa.select(sa.func.count()).select_from(bodies)).scalar_one() == 0
+    with pytest.raises(InvalidInput, match="must be at least 1"):
+        forget(store, 1000.0, 0)
+    store.close()
