@@ -74,7 +74,7 @@ async def served(path: Path, workers: int = 0) -> AsyncIterator[tuple[System, ht
     system = System(twin, store, pool=pool)
     app = system.app
     try:
-        async with app.router.lifespan_context(app):
+        async with app.api.router.lifespan_context(app.api):
             transport = httpx.ASGITransport(app, raise_app_exceptions=True)
             async with httpx.AsyncClient(transport=transport, base_url="http://twin") as client:
                 yield system, client

@@ -31,7 +31,7 @@ async def working(path, url=None, workers=1, timeout=30.0):
     system = System(twin, store, pool=Pool(workers, twin.start, timeout, WORKER))
     app = system.app
     try:
-        async with app.router.lifespan_context(app):
+        async with app.api.router.lifespan_context(app.api):
             transport = httpx.ASGITransport(app)
             async with httpx.AsyncClient(transport=transport, base_url="http://twin") as client:
                 yield system, client

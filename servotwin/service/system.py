@@ -15,7 +15,7 @@ from fastapi import FastAPI
 
 from servotwin.errors import InvalidInput
 from servotwin.service import brokerdesk
-from servotwin.service.app import make_app
+from servotwin.service.app import make_app, refusal
 from servotwin.service.auth import Authority, TokenFile
 from servotwin.service.config import SQLITE
 from servotwin.service.dispatcher import Dispatcher, Parts
@@ -31,6 +31,7 @@ from servotwin.service.pool import Pool
 from servotwin.service.proofs import Allowance
 from servotwin.service.readapi import ReadApi
 from servotwin.service.shelf import Shelf
+from servotwin.service.shortcut import Shortcut
 from servotwin.service.stepapi import StepApi
 from servotwin.service.twinfile import TwinFile
 from servotwin.store.errors import StoreUnavailable
@@ -79,7 +80,7 @@ class System:
         self._watch()
 
     @property
-    def app(self) -> FastAPI:
+    def app(self) -> Shortcut:
         """The HTTP API; its lifespan begins and ends everything else."""
         gate, bodies = (
             Gate(self.authority, self._knows, self._buckets),
@@ -88,7 +89,9 @@ class System:
         edge = EdgeApi(gate, bodies, self.ingest, self.outgoing, self.dispatcher.poke)
         read = ReadApi(self.authority, self.store, self.shelf, self.health, self.metrics, self.clocks.wall)
         whole = gate, bodies, self.ingest, self._parts, self.dispatcher, self._owner
-        return make_app(edge, read, StepApi(*whole) if self.config.lockstep else None, self.metrics, self._lifespan)
+        step = StepApi(*whole) if self.config.lockstep else None
+        api = make_app(edge, read, step, self.metrics, self._lifespan)
+        return Shortcut(api, edge.put_window, partial(refusal, self.metrics))
 
     async def begin(self) -> None:
         """Take back what a crash left borrowed, start the workers, begin to work."""
