@@ -8,7 +8,7 @@ from random import Random
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from relay import Reader, Relay, Weather, Writer
+from relay import Reader, Relay, Weather, Writer, quietly
 
 LONGEST = 1 << 26
 
@@ -65,6 +65,14 @@ class HttpRelay(Relay):
         self.chances, self._seed = chances, seed
         self._late: set[asyncio.Task[None]] = set()
 
+    def clear(self) -> None:
+        """From now on nothing bad happens."""
+
+        async def clear() -> None:
+            self.chances, self._weather = Chances(), Weather()
+
+        self._do(clear())
+
     async def serve(self, reader: Reader, writer: Writer) -> None:
         """Take a request and do to it what its fate says."""
         head = await reader.readuntil(b"\r\n\r\n")
@@ -93,7 +101,7 @@ class HttpRelay(Relay):
     def _again(self, request: bytes, wait: float) -> None:
         async def later() -> None:
             await asyncio.sleep(wait)
-            await self._ask(request)
+            await quietly(self._ask(request))
 
         self.counts["twice"] += 1
         task = asyncio.create_task(later())

@@ -204,5 +204,5 @@ async def quietly(work: Awaitable[Any]) -> None:
     """Do it; a broken connection is no news here."""
     try:
         await work
-    except (OSError, TimeoutError):
+    except (OSError, EOFError):
         return
