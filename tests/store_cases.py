@@ -13,12 +13,23 @@ from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome
 from servotwin.store.store import Store, open_store
 
 SYSTEMS = ("sqlite", "postgresql")
+NewAddress = Callable[[], str]
+"""URL of a new, empty database."""
+
+MORE = """
+import sqlalchemy as sa
+from alembic import op
+revision = "0002"
+down_revision = "0001"
+def upgrade():
+    op.add_column("twins", sa.Column("colour", sa.Text, nullable=False, server_default="grey"))
+"""
 
 _numbers = itertools.count()
 
 
 @contextmanager
-def addresses(system: str, folder: Path) -> Iterator[Callable[[], str]]:
+def addresses(system: str, folder: Path) -> Iterator[NewAddress]:
     """URLs of new, empty databases."""
     if system == "sqlite":
         yield lambda: f"sqlite:///{folder}/store-{next(_numbers)}.db"

@@ -1,29 +1,17 @@
 """Fixtures for tests of the store: every test on SQLite and on PostgreSQL."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from store_cases import SYSTEMS, addresses
+from store_cases import MORE, SYSTEMS, NewAddress, addresses
 
 from servotwin.store import migrate as migrations
 from servotwin.store.engine import transaction
 from servotwin.store.schema import metadata
 from servotwin.store.store import Store, open_store
-
-NewAddress = Callable[[], str]
-"""URL of a new, empty database."""
-
-MORE = """
-import sqlalchemy as sa
-from alembic import op
-revision = "0002"
-down_revision = "0001"
-def upgrade():
-    op.add_column("twins", sa.Column("colour", sa.Text, nullable=False, server_default="grey"))
-"""
 
 
 @pytest.fixture(scope="module", params=SYSTEMS)

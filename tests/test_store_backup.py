@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from store_cases import filled, letter, outcome, window
-from store_fixtures import NewAddress
+from store_cases import NewAddress, filled, letter, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 import store_process
-from store_cases import window
-from store_fixtures import NewAddress
+from store_cases import NewAddress, window
 
 from servotwin.store.engine import transaction
 from servotwin.store.rows import Put

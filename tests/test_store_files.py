@@ -13,8 +13,7 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from store_cases import filled, outcome, window
-from store_fixtures import MORE, NewAddress
+from store_cases import MORE, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations

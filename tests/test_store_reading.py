@@ -1,8 +1,7 @@
 """What the store tells: letters to the edges, summaries, windows, and the evidence chain in one query."""
 
 import sqlalchemy as sa
-from store_cases import bodies_of, claim, letter, outcome, proof, window
-from store_fixtures import NewAddress
+from store_cases import NewAddress, bodies_of, claim, letter, outcome, proof, window
 
 from servotwin.store.rows import Evidence, Kind, Posted, Waiting
 from servotwin.store.store import Store, open_store
