@@ -72,7 +72,7 @@ class Edge:
         clock: Clock,
         pause: Callable[[float], None],
     ) -> None:
-        self.config, self.clock, self._pause = config, clock, pause
+        self.config, self.clock, self.pause = config, clock, pause
         self.counts: Counter[str] = Counter()
         self.ticks = Counts()
         self._boot, self._boots = boot, 0
@@ -141,7 +141,7 @@ class Edge:
                 told = True
             self.exchange()
             self._child.tend(self.clock())
-            self._pause(PIECE_S)
+            self.pause(PIECE_S)
 
     def _begun(self, first: Parameters | None) -> Agent:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot

@@ -156,7 +156,7 @@ def _wait(stop: Stop, edge: Edge) -> None:
     while not stop.wanted and edge.clock() < end:
         edge.exchange()
         edge.tend()
-        time.sleep(_PIECE_S)
+        edge.pause(_PIECE_S)
 
 
 def _role(edge: Edge, drive: Any) -> Role:

@@ -1,0 +1,494 @@
+"""The gateway's parts without processes: pipe, outlet, law guard, roles, keeper, boots, counts."""
+
+import math
+import socket
+from array import array
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.control.controller import Controller
+from servotwin.control.law import start, tick
+from servotwin.edge.cut import Cut
+from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
+from servotwin.edge.limits import Limits
+from servotwin.edge.packing import CHANNELS
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge.store import FileStore, kept
+from servotwin.errors import InvalidInput
+from servotwin.gateway import frames, outlet
+from servotwin.gateway.boots import next_boot
+from servotwin.gateway.config import UNBOOTED, EdgeConfig
+from servotwin.gateway.control import Controlling, Law
+from servotwin.gateway.edge import Edge
+from servotwin.gateway.keeping import Keeper
+from servotwin.gateway.outlet import BEHIND, PipeOutlet
+from servotwin.gateway.pipe import Pipe, send_whole
+from servotwin.gateway.run import Stop, first_parameters, until
+from servotwin.gateway.supervise import Supervising
+from servotwin.gateway.ticks import Counts, summary
+from servotwin.link.sqliteoutbox import SqliteOutbox
+from servotwin.messages import (
+    Acknowledge,
+    Answer,
+    Hello,
+    InvalidMessage,
+    Probe,
+    Receipt,
+    Request,
+    Update,
+    decode,
+    encode,
+)
+
+RATE = 100.0
+LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
+SETTINGS = AgentSettings("axis-1", UNBOOTED, RATE, 0.1, limits=Limits(maximum=1e-3), probe=ProbeLimits(1e-3, 0.0, 0.05))
+CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
+
+
+def cut(sequence: int = 0, samples: int = 10) -> Cut:
+    signals = {name: array("d", [1e-3 * k for k in range(samples)]) for name in CHANNELS}
+    return Cut(7, sequence, "reference", 3, 0.0, signals, 0.1, None)
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    yield ours, theirs
+    ours.close()
+    theirs.close()
+
+
+class Far:
+    """The link process's end of an outlet, spoken to by the test."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.pipe = Pipe(theirs)
+        self.near = Pipe(ours)
+
+    def heard(self) -> list[frames.ToLink]:
+        return [frames.to_link(data) for data in self.pipe.take()]
+
+    def say(self, *said: frames.ToControl) -> None:
+        for frame in said:
+            self.pipe.post(frames.encode(frame))
+        while self.pipe.backlog:
+            self.pipe.pump()
+
+    def close(self) -> None:
+        self.pipe.close()
+        self.near.close()
+
+
+@pytest.fixture
+def far() -> Iterator[Far]:
+    made = Far()
+    yield made
+    made.close()
+
+
+def pumped(box: PipeOutlet) -> None:
+    for _ in range(20):
+        box.exchange()
+
+
+@given(st.lists(st.binary(max_size=200_000), max_size=5), st.integers(1, 50_000))
+def test_frames_cross_a_pipe_whole_and_in_order(sent: list[bytes], piece: int) -> None:
+    ours, theirs = socket.socketpair()
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, piece)
+    near, far = Pipe(ours), Pipe(theirs)
+    for frame in sent:
+        near.post(frame)
+    came: list[bytes] = []
+    while near.backlog:
+        near.pump()
+        came += far.take()
+    for _ in range(3):
+        came += far.take()
+    assert came == sent
+    near.close()
+    far.close()
+
+
+def test_a_pipe_never_waits_and_knows_when_the_other_end_is_gone(ends: tuple[socket.socket, socket.socket]) -> None:
+    near = Pipe(ends[0])
+    assert near.take() == []
+    near.post(bytes(10_000_000))
+    for _ in range(1000):
+        near.pump()
+    assert near.backlog > 0
+    assert not near.broken
+    ends[1].close()
+    near.pump()
+    assert near.broken
+
+
+def test_a_frame_that_is_longer_than_any_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
+    ends[1].sendall(b"\xff\xff\xff\xff")
+    with pytest.raises(InvalidMessage, match="4294967295 bytes"):
+        Pipe(ends[0]).take()
+
+
+def test_a_blocking_end_speaks_the_same(ends: tuple[socket.socket, socket.socket]) -> None:
+    send_whole(ends[1], b"frame")
+    assert Pipe(ends[0]).take() == [b"frame"]
+
+
+def test_a_cut_crosses_as_it_is() -> None:
+    frame = frames.to_link(frames.encode(frames.framed(cut(), "b0", 5)))
+    assert isinstance(frame, frames.CutFrame)
+    assert (frame.cut, frame.boot, frame.serial) == (cut(), "b0", 5)
+    with pytest.raises(InvalidMessage):
+        frames.to_link(b"rubbish")
+    with pytest.raises(InvalidMessage):
+        frames.to_control(frames.encode(frame))
+
+
+def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.boot = "b0"
+    box.offer(cut(0), 0.0)
+    assert box.waiting
+    box.connect(far.near)
+    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, 0.0, ""))
+    box.save(Parameters(3, 1e-4))
+    pumped(box)
+    assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
+    far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
+    heard = box.exchange()
+    assert heard is not None
+    assert heard.standing
+    assert box.waiting
+    assert box.dropped == {"outbox full": 2}
+    again = Far()
+    box.connect(again.near)
+    pumped(box)
+    assert [type(frame).__name__ for frame in again.heard()] == ["SaveFrame"]
+    assert not box.settled
+    again.say(frames.DoneFrame(3), frames.StandingFrame(0, {}))
+    pumped(box)
+    assert box.settled
+    assert not box.waiting
+    again.close()
+
+
+def test_the_twins_messages_count_once_whoever_repeats_them(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    body = encode(Acknowledge("axis-1", "b0", 0))
+    far.say(frames.HeardFrame(4, body), frames.HeardFrame(0, body), frames.HeardFrame(4, body), frames.BackFrame())
+    heard = box.exchange()
+    assert heard is not None
+    assert len(heard.messages) == 2
+    assert heard.back
+    pumped(box)
+    assert far.heard() == [frames.HandledFrame(4), frames.HandledFrame(4)]
+
+
+def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
+    far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outlet, "MOST", 100_000)
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    for k in range(20):
+        box.offer(cut(k, 500), 0.0)
+    assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.framed(cut(0, 500), "", 1)))
+    assert not box.connected
+
+
+def test_without_a_twin_nobody_owes_an_answer() -> None:
+    box = PipeOutlet(False)
+    box.offer(cut(), 0.0)
+    assert not box.waiting
+
+
+def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    far.pipe.post(b"rubbish")
+    while far.pipe.backlog:
+        far.pipe.pump()
+    assert box.exchange() is None
+    assert not box.connected
+
+
+POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e308, -1e308])
+
+
+@given(st.lists(st.tuples(POSITIONS, POSITIONS), max_size=30), st.booleans())
+def test_the_law_never_gives_what_is_no_number_and_forgets_it(
+    samples: list[tuple[float, float]], limited: bool
+) -> None:
+    controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
+    guarded = Law(controller.law(1e-5), 2, 0.0)
+    for reference, position in samples:
+        assert math.isfinite(guarded.tick(reference, position))
+    for _ in range(4):
+        guarded.tick(0.0, math.nan)
+    assert guarded.tick(1e-3, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
+
+
+def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
+    law = LAW.replace(Ki=500.0).law()
+    guarded, plain = Law(law, 2, 0.5), start(0.0)
+    for k in range(5):
+        plain = tick(law, plain, 1e-3, 1e-4 * k)
+        assert guarded.tick(1e-3, 1e-4 * k) == plain.voltage
+    assert [guarded.tick(1e-3, math.nan) for _ in range(2)] == [plain.voltage] * 2
+    assert guarded.tick(1e-3, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
+    assert [guarded.tick(1e-3, math.nan) for _ in range(3)][-1] == 0.5
+
+
+class ScriptedDrive:
+    """Both drives: gives what it is told, notes what it is given."""
+
+    machine, lag, can_move, rate = "m", 0.0, True, RATE
+
+    def __init__(self, given: list[Sample | Block | Exception | None]) -> None:
+        self.given, self.voltages, self.log = given, [], []
+        self.connects = 0
+        self.refuse = False
+
+    def connect(self) -> None:
+        self.connects += 1
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def read(self, most: int = 0) -> Sample | Block | None:
+        self.log.append(most)
+        found = self.given.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def write(self, value: float | Parameters) -> None:
+        if self.refuse and isinstance(value, Parameters):
+            raise DriveRefused("no")
+        self.voltages.append(value)
+
+    def move(self, offset: float) -> None:
+        self.log.append(f"move {offset}")
+
+
+class Clock:
+    """Time that only passes when somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1e-4
+        return self.now
+
+    def pause(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class NoChild:
+    def tend(self, now: float) -> None:
+        """No link process."""
+
+
+def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> Edge:
+    clock = Clock()
+    return Edge(config, "b0", box, NoChild(), None, clock, clock.pause)
+
+
+def samples(first: int, count: int, reference: float = 1e-3) -> list[Sample]:
+    return [Sample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
+
+
+def letters(far: Far, kind: type) -> list[object]:
+    found = [decode(frame.body) for frame in far.heard() if isinstance(frame, frames.LetterFrame)]
+    return [message for message in found if isinstance(message, kind)]
+
+
+def update(version: int, tolerance: float, sequence: int = 0, boot: str = "b0") -> Update:
+    known = (None, None, (None, None))
+    return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", tolerance, 1e6)
+
+
+def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    drive = ScriptedDrive([*samples(0, 30)])
+    role = Controlling(edge, drive)
+    for _ in range(15):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 5e-3 / 10))))
+    for _ in range(10):
+        role.step()
+    assert edge.agent.parameters.version == 1
+    assert drive.voltages[16] == pytest.approx(drive.voltages[15], rel=1e-6)
+    pumped(box)
+    (receipt,) = letters(far, Receipt)
+    assert isinstance(receipt, Receipt)
+    assert receipt.applied
+
+
+def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    drive = ScriptedDrive([*samples(0, 15), *samples(1000, 15), *samples(0, 3)])
+    role = Controlling(edge, drive)
+    for _ in range(14):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(10):
+        role.step()
+    assert (edge.agent.settings.boot, edge.agent.parameters.version) == ("b0.1", 1)
+    while role.step() and drive.given:
+        pass
+    assert edge.agent.settings.boot == "b0.2"
+    assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
+
+
+def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge, stop = edge_of(box), Stop()
+    drive = ScriptedDrive([*samples(0, 5), DriveLost("gone"), *samples(5, 5), None])
+    roles = []
+
+    def role_of() -> Controlling:
+        roles.append(Controlling(edge, drive))
+        return roles[-1]
+
+    until(stop, edge, drive, role_of)
+    assert (drive.connects, len(roles), edge.counts["drive lost"]) == (2, 1, 1)
+    assert edge.agent.samples == 10
+    assert len(drive.voltages) == 10
+
+
+def test_a_drive_of_another_rate_is_refused() -> None:
+    drive = ScriptedDrive([])
+    drive.rate = 99.0
+    with pytest.raises(InvalidInput, match=r"sample_rate_hz = 100.0 Hz: the drive's rate is 99.0 Hz"):
+        until(Stop(), edge_of(PipeOutlet(False)), drive, lambda: Controlling(edge_of(PipeOutlet(False)), drive))
+
+
+def block(first: int, count: int, reference: float = 1e-3) -> Block:
+    return Block(first, 0, *(array("d", [value]) * count for value in (reference, 0.0, 0.0, 0.1)))
+
+
+SUPERVISED = replace(CONFIG, role="supervise")
+
+
+def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box, SUPERVISED)
+    drive = ScriptedDrive([block(5 * k, 5) for k in range(12)])
+    role = Supervising(edge, drive)
+    role.step()
+    assert [p.version for p in drive.voltages] == [0]
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(5):
+        role.step()
+    assert [p.version for p in drive.voltages] == [0, 1]
+    far.say(frames.HeardFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
+    for _ in range(2):
+        role.step()
+    assert "move 0.0005" in drive.log
+    pumped(box)
+    (answer,) = letters(far, Answer)
+    assert isinstance(answer, Answer)
+    assert answer.taken
+    role.stop()
+    assert drive.log[-1] == "move 0.0"
+
+
+def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:
+    box = PipeOutlet(True)
+    edge = edge_of(box, SUPERVISED)
+    drive = ScriptedDrive([block(0, 5), block(8, 5), block(13, 0), block(500, 5), None])
+    drive.refuse = True
+    role = Supervising(edge, drive)
+    while role.step():
+        pass
+    assert edge.counts["parameters refused by the drive"] >= 1
+    assert (edge.counts["samples missed"], edge.counts["boot: samples missing"]) == (3, 1)
+
+
+@pytest.fixture
+def keeper(tmp_path: Path) -> Iterator[Keeper]:
+    outbox = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1")
+    yield Keeper(replace(CONFIG, folder=tmp_path), outbox)
+    outbox.close()
+
+
+def test_a_cut_that_comes_again_is_kept_and_counted_once(keeper: Keeper, tmp_path: Path) -> None:
+    bad = cut(1)
+    bad.signals["position"][3] = math.nan
+    for serial, each in enumerate([cut(0), bad, cut(0), bad, cut(2)], 1):
+        assert keeper.take(frames.framed(each, "b1", serial)) == [serial]
+    outbox = keeper._outbox
+    assert outbox.pending() == [("b1", 0), ("b1", 2)]
+    assert outbox.dropped == {"sample not finite": 1}
+    assert outbox.get(("b1", 0)).boot == "b1"
+
+
+def test_proved_parameters_are_written_or_tried_again(keeper: Keeper, tmp_path: Path) -> None:
+    store = FileStore(tmp_path / "parameters.json")
+    (tmp_path / "parameters.json.new").mkdir()
+    assert keeper.take(frames.SaveFrame(1, kept(Parameters(1, 1e-4)))) == []
+    assert keeper.take(frames.SaveFrame(2, kept(Parameters(2, 2e-4)))) == [1]
+    assert keeper.faults["parameters not written"] == 2
+    (tmp_path / "parameters.json.new").rmdir()
+    assert keeper.tend() == [2]
+    assert keeper.tend() == []
+    found = store.load()
+    assert found is not None
+    assert found.version == 2
+
+
+def test_the_cursor_only_rises(keeper: Keeper) -> None:
+    for serial in (3, 7, 5):
+        keeper.take(frames.HandledFrame(serial))
+    assert keeper._outbox.recall("cursor") == 7
+
+
+def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
+    file = tmp_path / "boots"
+    assert [next_boot(file, bytes([k])) for k in range(3)] == ["b1-00", "b2-01", "b3-02"]
+    file.write_text("rubbish")
+    assert next_boot(file, b"\x07") == "b1-07"
+    assert next_boot(tmp_path / "absent" / "boots", b"\x08") == "b1-08"
+
+
+def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.json"
+    assert first_parameters(file) is None
+    FileStore(file).save(Parameters(4, 1e-4))
+    found = first_parameters(file)
+    assert found is not None
+    assert found.version == 4
+    file.write_text("rubbish")
+    assert first_parameters(file) is None
+    assert (tmp_path / "parameters.json.broken").read_text() == "rubbish"
+
+
+@given(st.lists(st.floats(0.0, 2e-3), min_size=1, max_size=300))
+def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float]) -> None:
+    counts = Counts()
+    for each in durations:
+        counts.add(each)
+    found = summary(counts.dumps(), counts.longest)
+    ordered = sorted(durations)
+    for name, share in (("median_us", 0.5), ("p99_us", 0.99)):
+        exact = ordered[max(0, math.ceil(share * len(ordered)) - 1)] * 1e6
+        assert found[name] == pytest.approx(exact, abs=1.001)
+    assert found["number"] == len(durations)
+    assert found["max_us"] == pytest.approx(ordered[-1] * 1e6, abs=0.06)
