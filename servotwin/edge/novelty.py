@@ -127,11 +127,12 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Judged:
     if found is None:
         return _silent(state, cut, settings)
     seen = look(state.chart, found.gap, found.std, rules)
+    far = abs(found.gap - state.chart.anchor) > rules.outlier
     news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
     state = structs.replace(_taught(state, cut, found, rules), chart=seen.chart)
     reason = _reason(state, cut, settings, news)
     if news:
-        state = structs.replace(state, owed=0 if news == CUSUM else rules.confirm)
+        state = structs.replace(state, owed=rules.confirm if far else 0)
     elif state.owed and reason:
         state = structs.replace(state, owed=state.owed - 1)
     return Judged(_sent(state, cut, settings, reason), Verdict(reason, found, seen.change, _range(state)))
@@ -233,7 +234,7 @@ def _range(state: NoveltyState) -> float:
 def _lost(state: NoveltyState, rules: NoveltyRules) -> bool:
     """Whether the lost motion exceeds what the twin knows."""
     known = state.told if state.told is not None else max(0.0, state.chart.gap)
-    return _range(state) > max(known, state.bound) + rules.margin
+    return _range(state) > max(known, state.bound) + max(rules.margin, rules.worth)
 
 
 def dumps(state: NoveltyState) -> bytes:

@@ -16,7 +16,7 @@ from msgspec import Struct, structs
 from servotwin.edge.noveltyrules import NoveltyRules
 
 _QUARTILE = 0.6744897501960817  # of a standard normal: the median of its size
-_PRIOR, _MOST = 5, 40  # second differences that the stated spread counts as; that are kept
+_PRIOR, _MOST = 5, 120  # second differences that the stated spread counts as; that are kept
 _TRUSTED, _EACH = 10.0, 0.2  # degrees of freedom of the stated spread, and of one second difference in a median
 
 
@@ -82,13 +82,17 @@ def look(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> Looked:
     change = up = down = 0.0
     if chart.weight > 0.0:
         change = normal((gap - chart.gap) / sqrt(variance + 1.0 / chart.weight), chart.freedom)
-        up = max(0.0, chart.up + change - rules.allowance)
-        down = max(0.0, chart.down - change - rules.allowance)
+        up, down = summed(chart.up, chart.down, change, rules.allowance)
     after = structs.replace(_bent(chart, Seen(gap, own)), up=up, down=down)
     sudden, slow = abs(change) > rules.score_limit, max(up, down) > rules.cusum_limit
     if (sudden or slow) and abs(gap - chart.anchor) >= rules.worth:
         return Looked(begun(after, gap, 1.0 / variance), change, sudden, slow)
     return Looked(_learnt(after, gap, variance), change, sudden=False, slow=False)
+
+
+def summed(up: float, down: float, change: float, allowance: float) -> tuple[float, float]:
+    """Page's two sums after one more standardised change."""
+    return max(0.0, up + change - allowance), max(0.0, down - change - allowance)
 
 
 def _bent(chart: Chart, new: Seen) -> Chart:

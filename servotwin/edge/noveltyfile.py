@@ -12,7 +12,7 @@ from servotwin.edge.noveltyrules import NoveltyRules, NoveltySettings
 from servotwin.tomltable import Reader, Table, given, part
 
 DEG = pi / 180.0
-_ANGLES = ("resolution", "worth", "margin", "travel", "settle")
+_ANGLES = ("resolution", "worth", "margin", "travel", "settle", "outlier")
 
 
 def _degrees(table: Table, key: str) -> float:

@@ -22,7 +22,7 @@ class NoveltyRules:
     allowance, cusum_limit : float
         Standard deviations: what the cumulative sum lets pass in each window, and from which sum on it is news.
     margin : float
-        rad: by how much the lost motion at rest may exceed the gap that the twin knows of.
+        rad: by how much, or by `worth` if that is more, the lost motion at rest may exceed what the twin knows of.
     travel : float
         rad: how far the screw must be pushed, both ways, for a window to say something.
     settle : float
@@ -31,8 +31,10 @@ class NoveltyRules:
         Windows that the baseline counts as at most after an accepted update.
     learn : int
         Windows that say something and are sent after each start, whatever they say.
+    outlier : float
+        rad: a change beyond may be an outlier to the twin, which takes none for granted until another window agrees.
     confirm : int
-        Windows sent after news in one: the twin takes no outlier for granted until another agrees.
+        Windows sent after such a change, whatever they say.
     patience : int
         Windows in a row that say nothing and are sent nevertheless, while some are still to be sent: the twin may ask
         for ones that tell more.
@@ -46,19 +48,30 @@ class NoveltyRules:
     worth: float = 0.0
     score_limit: float = 4.5
     allowance: float = 0.5
-    cusum_limit: float = 7.0
+    cusum_limit: float = 8.0
     margin: float = radians(0.25)
     travel: float = radians(0.5)
     settle: float = radians(0.2)
     relearn: int = 5
     learn: int = 2
+    outlier: float = radians(1.0)
     confirm: int = 1
     patience: int = 4
     period_s: float = 600.0
     look_s: float = 60.0
 
     def __post_init__(self) -> None:
-        for key in ("resolution", "score_limit", "cusum_limit", "margin", "travel", "settle", "period_s", "look_s"):
+        for key in (
+            "resolution",
+            "score_limit",
+            "cusum_limit",
+            "margin",
+            "travel",
+            "settle",
+            "outlier",
+            "period_s",
+            "look_s",
+        ):
             value = getattr(self, key)
             if not value > 0.0 or (value == inf and key in ("resolution", "travel", "settle")):
                 raise InvalidInput(f"novelty {key} = {value!r}: must be greater than 0")

@@ -19,7 +19,7 @@ from servotwin.plant.signals import Array, SCurve
 from servotwin.scenario import Scenario
 
 GROWTH = math.radians(20.0)
-_SAMPLES = 200.0  # Hz, at which errors are summed up
+_SAMPLES, _KNOWN = 200.0, 5.0  # Hz, at which errors of the loop and of the gap are summed up
 
 
 class Case(NamedTuple):
@@ -93,9 +93,9 @@ def scenario(case: Case) -> Scenario:
 
 def summary(loop: Loop) -> Account:
     """What it sent and how well it did."""
-    run, every = loop.run, max(1, round(loop.run.sample_rate / _SAMPLES))
-    time, gap = run.time[::every], run.gap[::every]
-    held, known = (values - gap for values in _knowledge(loop, time))
+    run = loop.run
+    every, seldom = (max(1, round(run.sample_rate / rate)) for rate in (_SAMPLES, _KNOWN))
+    held, known = (values - run.gap[::seldom] for values in _knowledge(loop, run.time[::seldom]))
     known_from = np.isfinite(held)
     error = (run.reference - run.position)[::every]
     sent = [m for m in loop.messages if m.direction == "up"]
