@@ -2,6 +2,7 @@
 
 import datetime
 import ipaddress
+import json
 import os
 import signal
 import socket
@@ -98,7 +99,10 @@ def test_a_window_goes_all_the_way_and_a_signal_ends_it_well(tmp_path):
         assert running.wait(PATIENCE) == 0
         until(lambda: not any(map(alive, workers)))
     log = (tmp_path / "log").read_text()
-    assert '"servo":"ax-1"' in log
+    told = [json.loads(line) for line in log.splitlines()]
+    [estimate] = [line for line in told if line["message"] == "estimate"]
+    assert (estimate["servo"], estimate["window"], estimate["version"]) == ("ax-1", "b/0", 0)
+    assert estimate["message_id"] == links[0]["window"]["id"]
     assert "Traceback" not in log
     for token in (TOKEN, OPERATOR):
         assert token not in log

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -237,13 +237,15 @@ class Dispatcher:
         for kind, number in kinds.items():
             metrics.evidence.add(kind, by=number)
         about = {"servo": claim.servo, "serial": claim.serial, "seconds": round(seconds, 6)}
+        windows = {message.id: message.key for message in claim.messages if message.kind is Kind.WINDOW}
         for found in outcome.evidence:
             level = logging.DEBUG if found.kind in QUIET else logging.INFO
             if log.isEnabledFor(level):
-                log.log(level, found.kind, extra={**about, **_ids(found)})
+                log.log(level, found.kind, extra={**about, **_ids(found, windows)})
 
 
-def _ids(found: Evidence) -> dict[str, object]:
-    """Of which window, under which version, in which context."""
-    known = {"message_id": found.message, "version": found.version, "status": found.status, "context": found.context}
+def _ids(found: Evidence, windows: Mapping[int, str]) -> dict[str, object]:
+    """Of which window, under which version, in which context. An estimate is known by the message it was made of."""
+    of = {"message_id": found.message, "window": windows.get(found.message)}
+    known = {**of, "version": found.version, "status": found.status, "context": found.context}
     return {key: value for key, value in known.items() if value not in (None, "")}

@@ -88,7 +88,7 @@ def _undone(
         wanted = of & set(kinds)
         if wanted:
             for row in connection.execute(_oldest(servos, queue, wanted, per_servo)):
-                found[row.servo].append(Stored(row.id, Kind(row.kind), row.body, row.encoding, row.received))
+                found[row.servo].append(Stored(row.id, Kind(row.kind), row.body, row.encoding, row.received, row.key))
     return found
 
 
@@ -100,6 +100,7 @@ def _oldest(
     if len(kinds) == 1 and Kind.PROOF not in kinds:
         waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
     first = waiting.subquery()
-    columns = messages.c.servo, messages.c.id, messages.c.kind, bodies.c.body, messages.c.encoding, messages.c.received
+    known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
+    columns = *known, bodies.c.body
     joined = first.join(messages, messages.c.id == first.c.id).join(bodies, bodies.c.message == messages.c.id)
     return sa.select(*columns).select_from(joined).where(first.c.place <= per_servo).order_by(messages.c.id)

@@ -57,13 +57,14 @@ class Put(StrEnum):
 
 
 class Stored(NamedTuple):
-    """A kept message."""
+    """A kept message; `key` as of `Incoming`."""
 
     id: int
     kind: Kind
     body: bytes
     encoding: str
     received: float
+    key: str = ""
 
 
 class Claim(NamedTuple):
