@@ -372,6 +372,23 @@ def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> No
     assert len(drive.voltages) == 10
 
 
+@pytest.mark.parametrize("role", [Controlling, Supervising])
+def test_another_machine_under_the_due_number_begins_a_new_boot(role: type) -> None:
+    supervised = role is Supervising
+    edge = edge_of(PipeOutlet(False), SUPERVISED if supervised else CONFIG)
+    given = [block(0, 5), block(5, 5), block(10, 5)] if supervised else samples(0, 3)
+    drive = ScriptedDrive(given)
+    running = role(edge, drive)
+    running.step()
+    running.lost()
+    running.step()
+    assert edge.agent.settings.boot == "b0"
+    running.lost()
+    drive.machine = "another"
+    running.step()
+    assert edge.agent.settings.boot == "b0.1"
+
+
 def test_a_drive_of_another_rate_is_refused() -> None:
     drive = ScriptedDrive([])
     drive.rate = 99.0

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -300,3 +301,23 @@ def test_a_wrong_configuration_ends_with_one_sentence(gateway: Gateway, machine:
     assert gateway.process.wait(60) == 2
     assert "mode 0600" in gateway.log()
     assert "Traceback" not in gateway.log()
+
+
+def test_a_full_disk_stops_neither_the_controller_nor_the_link(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    """A limit on the size of the link process's files stands for the disk; later there is room again."""
+    gateway.start()
+    until(lambda: gateway.status().get("link_process", 0) > 0)
+    link, count = gateway.status()["link_process"], len(twin.windows)
+    before = resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+    until(lambda: not gateway.status()["disk"]["safe"])
+    until(lambda: len(twin.windows) >= count + 4)
+    assert gateway.status()["disk"]["faults"]["disk not writable"] > 0
+    resource.prlimit(link, resource.RLIMIT_FSIZE, before)
+    until(lambda: gateway.status()["disk"]["safe"])
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert whole(found)
+    assert gateway.status()["windows"]["dropped"] == {}
+    assert gateway.status()["link_process"] == link

@@ -6,7 +6,8 @@ the last one, `write` the parameters it is to run on.
 
 Samples are numbered by the machine, from 0 when it starts. Whoever reads them compares: a number other than the one
 that is due means that samples are missing (the edge was too slow, or away for too long), another `machine` after
-`connect` that the count began anew. Windows are uniform in time, so in both cases the agent begins a new boot.
+`connect` that the count began anew. Windows are uniform in time: a few missing samples cost the windows they were in;
+where more than a second is missing, or the count began anew, the agent begins a new boot.
 
 A drive that cannot be reached raises `DriveLost`, and `connect` is to be tried again, at intervals of the caller's
 choice; a run that is over gives None. Nothing else ends a reading loop. All numbers are SI.

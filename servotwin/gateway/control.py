@@ -71,7 +71,7 @@ class Controlling:
         self._in_force = edge.agent.parameters
         self.law = Law(self._law(self._in_force), round(sensor.hold_s * rate), sensor.safe_voltage)
         self._safe = sensor.safe_voltage
-        self._due: int | None = None
+        self._machine, self._away = drive.machine, False
         self._reference = edge.config.agent.reference
 
     def step(self) -> bool:
@@ -80,9 +80,9 @@ class Controlling:
         began = self._edge.clock()
         if sample is None:
             return False
-        if sample.number != self._due:
+        if sample.number != self._edge.due or self._away:
             self._jumped(sample.number)
-        self._due = sample.number + 1
+        self._edge.due = sample.number + 1
         self._tick(sample)
         self._edge.exchange()
         ended = self._edge.clock()
@@ -92,7 +92,7 @@ class Controlling:
 
     def lost(self) -> None:
         """The drive is away: what it does meanwhile is not known."""
-        self.law.state = None
+        self.law.state, self._away = None, True
 
     def stop(self) -> None:
         """Leave the machine with the safe voltage; raises `DriveLost`."""
@@ -115,11 +115,14 @@ class Controlling:
 
     def _jumped(self, number: int) -> None:
         """Samples are missing, in which the voltage was held, or they are counted anew."""
-        if self._due is None:
+        if self._edge.due is None:
             return
-        wanted = self._reference + self._edge.agent.offset
-        if not self._edge.bridge(number - self._due, wanted, self.law.voltage):
-            self._edge.begin("samples missing" if number > self._due else "machine counts anew")
+        same, before = self._drive.machine == self._machine, self._edge.agent
+        self._machine, self._away = self._drive.machine, False
+        if not same or number != self._edge.due:
+            missing = number - self._edge.due if same else -1
+            self._edge.skip(missing, self._reference + before.offset, self.law.voltage)
+        if self._edge.agent is not before:
             self._in_force = self._edge.agent.parameters
 
     def _law(self, parameters: Parameters) -> LawParameters:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from math import nan
 from typing import Protocol
 
+from servotwin.control.controller import Controller
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import kept, restored
@@ -60,6 +61,11 @@ class Edge:
         Kept from an earlier start.
     clock, pause : callable
         Monotonic, s; wait for so long, s.
+
+    Attributes
+    ----------
+    due : int or None
+        The drive's number of the sample that comes next; None: none has come yet.
     """
 
     def __init__(
@@ -74,31 +80,32 @@ class Edge:
     ) -> None:
         self.config, self.clock, self.pause = config, clock, pause
         self.counts: Counter[str] = Counter()
+        self.due: int | None = None
         self.ticks = Counts()
         self._boot, self._boots = boot, 0
         self._outlet, self._child = outlet, child
         self._child_due = self._told_due = clock()
         self.agent = self._begun(first)
 
-    def bridge(self, missing: int, wanted: float, voltage: float) -> bool:
-        """Let so many samples pass that nobody has seen, if they are few: no window with one of them is sent.
+    def skip(self, missing: int, wanted: float, voltage: float) -> None:
+        """Other samples than those that were due: a few that are missing cost the windows that they were in.
 
         Parameters
         ----------
         missing : int
-            Samples.
+            Samples; negative: they are counted anew.
         wanted, voltage : float
             m and V meanwhile, as far as known.
         """
         if not 0 < missing <= BRIDGED_S * self.config.agent.sample_rate:
-            return False
+            self._begin("samples missing" if missing > 0 else "machine counts anew")
+            return
         self.counts["samples missed"] += missing
         unseen = array("d", [nan]) * missing
         held, given = array("d", [wanted]) * missing, array("d", [voltage]) * missing
         self.send(self.agent.absorb_block(held, unseen, unseen, given))
-        return True
 
-    def begin(self, why: str) -> None:
+    def _begin(self, why: str) -> None:
         """Too many samples are missing, or they are counted anew: a new boot, on the parameters in force."""
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
@@ -161,6 +168,20 @@ class Edge:
             "fallback": p.fallback,
             "windows_cut": agent.windows_cut,
             "longest_tick_s": self.ticks.longest,
+            "drive_sample": self.due,
+            **_gains(agent.controller or self.config.controller),
             **self.counts,
         }
         return TicksFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())
+
+
+def _gains(law: Controller | None) -> dict[str, Value]:
+    """Of the controller in force, as far as it is known here."""
+    if law is None:
+        return {}
+    return {
+        "kp_v_per_m": law.Kp,
+        "ki_v_per_m_s": law.Ki,
+        "kd_v_s_per_m": law.Kd,
+        "feedforward_v": law.feedforward,
+    }

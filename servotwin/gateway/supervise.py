@@ -24,7 +24,7 @@ class Supervising:
     def __init__(self, edge: Edge, drive: SupervisedDrive) -> None:
         self._edge, self._drive = edge, drive
         self._most = max(1, round(LONGEST_BLOCK_S * edge.config.agent.sample_rate))
-        self._due: int | None = None
+        self._machine = drive.machine
         self._written: object = None
         self._moved, self._reference = 0.0, edge.config.agent.reference
 
@@ -52,10 +52,11 @@ class Supervising:
             self._drive.move(0.0)
 
     def _absorb(self, block: Block) -> None:
-        due = block.first if self._due is None else self._due
-        if block.first != due and not self._edge.bridge(block.first - due, self._reference, nan):
-            self._edge.begin("samples missing" if block.first > due else "machine counts anew")
-        self._due, self._reference = block.last, block.reference[-1]
+        due = block.first if self._edge.due is None else self._edge.due
+        same, self._machine = self._drive.machine == self._machine, self._drive.machine
+        if not same or block.first != due:
+            self._edge.skip(block.first - due if same else -1, self._reference, nan)
+        self._edge.due, self._reference = block.last, block.reference[-1]
         self._edge.send(self._edge.agent.absorb_block(block.reference, block.theta_m, block.position, block.voltage))
 
     def _until(self) -> int:
