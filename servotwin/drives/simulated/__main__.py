@@ -39,7 +39,7 @@ def main(path: str) -> None:
             run(server, listener, settings, os.urandom(8))
         finally:
             if diary is not None:
-                diary.write(plant.index, time.monotonic())
+                diary.write(plant.index)
 
 
 def _server(plant: ControlledPlant | SupervisedPlant, pace: Pace | None, slack: float, tend: Tend) -> Server:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,14 +37,17 @@ class MachineState(msgspec.Struct, frozen=True, tag="servotwin-machine/1", tag_f
         Total gap.
     speed : float
         Seconds of machine time per second that it is told to keep.
-    reached : float
-        What it kept since the last look.
+    begun_s : float
+        Machine time at the beginning of this run: its sample 0.
+    written : float
+        s since the epoch.
     """
 
     time_s: float
     gap_deg: float
     speed: float
-    reached: float
+    begun_s: float
+    written: float
 
 
 class Diary:
@@ -61,7 +65,7 @@ class Diary:
     def __init__(self, settings: MachineSettings, pace: Pace, now: float) -> None:
         self._settings, self._pace = settings, pace
         self._speed = settings.speed
-        self._due, self._last = now, (0, now)
+        self._due = now
 
     def look(self, sample: int, now: float) -> None:
         """Write the state and read the speed, if it is time."""
@@ -69,21 +73,20 @@ class Diary:
             return
         self._due = now + LOOK_S
         self._follow(now)
-        self.write(sample, now)
+        self.write(sample)
 
-    def write(self, sample: int, now: float) -> None:
+    def write(self, sample: int) -> None:
         """Write the state, where one is kept."""
-        settings, (before, then) = self._settings, self._last
+        settings = self._settings
         if settings.state_file is None:
             return
-        passed = (sample - before) / settings.rate
         state = MachineState(
             time_s=settings.begin + sample / settings.rate,
             gap_deg=math.degrees(settings.gap_at(sample)),
             speed=self._speed,
-            reached=passed / (now - then) if now > then else 0.0,
+            begun_s=settings.begin,
+            written=time.time(),
         )
-        self._last = sample, now
         with suppress(OSError):
             write_state(settings.state_file, state)
 

@@ -123,7 +123,10 @@ class MachineSettings:
 
     def gap_at(self, sample: int) -> float:
         """Total gap (rad) at a sample of this run."""
-        time = self.begin + sample / self.rate
+        return self.gap_when(self.begin + sample / self.rate)
+
+    def gap_when(self, time: float) -> float:
+        """Total gap (rad) at a machine time (s), all its runs together."""
         return float(as_pieces(self.scenario.gap, self.scenario.duration).value(time))
 
     @property
