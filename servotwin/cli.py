@@ -315,6 +315,22 @@ def audit(
 
 
 @app.command()
+def replay(
+    servo: Annotated[str, typer.Argument(help="The servo's name.")],
+    config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),
+    window: Annotated[str | None, typer.Option(help="Only this one: BOOT/NUMBER.")] = None,
+    present: Annotated[
+        bool, typer.Option("--present", help="With model and settings as the twin's file has them now.")
+    ] = False,
+) -> None:
+    """Make stored estimates again: the same bit for bit, or what differs since then; exit code 1 if any is not."""
+    from servotwin.service.replaytext import tell
+
+    if not tell(servo, config, window, present):
+        raise typer.Exit(1)
+
+
+@app.command()
 def backup(
     to: Annotated[Path, typer.Argument(help="The file to be written.")],
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),

@@ -20,6 +20,7 @@ from servotwin.service.config import ServiceConfig
 from servotwin.service.protocol import Protocol
 from servotwin.service.system import System
 from servotwin.service.twinfile import TwinFile, read_twin
+from servotwin.store.address import address_of, file_of
 from servotwin.store.store import Store, open_store
 
 log = logging.getLogger(__name__)
@@ -63,6 +64,20 @@ def store_of(config: ServiceConfig) -> Store:
     if config.store_password is not None:
         address = sa.make_url(address).set(password=config.store_password).render_as_string(hide_password=False)
     return open_store(address)
+
+
+def present_store(config: ServiceConfig) -> Store:
+    """The store of a twin that has run, open: whoever only reads makes none.
+
+    Raises
+    ------
+    InvalidInput
+        There is none, or it cannot be opened.
+    """
+    file = file_of(address_of(config.store))
+    if file is not None and not file.is_file():
+        raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
+    return store_of(config)
 
 
 def listening(config: ServiceConfig, port: int | None = None) -> socket.socket:
