@@ -203,7 +203,7 @@ def test_polls_ask_the_store_only_when_something_may_be_there():
     async def body():
         outgoing = Outgoing(read, 10)
         for _ in range(5):
-            assert await outgoing.after("a", 0, 0.0) == ()
+            assert list(await outgoing.after("a", 0, 0.0)) == []
         assert len(asked) == 1
         waiting = [asyncio.create_task(outgoing.after("a", 0, 60.0)) for _ in range(3)]
         await asyncio.sleep(0.01)
@@ -320,3 +320,28 @@ def test_a_whole_file_knows_its_service_and_its_fleet(tmp_path):
     assert verifier_of("token-of-ax-1") in read_tokens(found.service.tokens).servos.values()
     with pytest.raises(InvalidInput, match="unknown key 'servo'"):
         read_twin(twin_file(tmp_path, servos="[servo]\nx = 1\n" + SERVO))
+
+
+def test_what_others_posted_ends_the_polls_that_it_is_for():
+    posted = []
+
+    async def read(_servo, serial):
+        return [each for each in posted if each.serial > serial]
+
+    async def body():
+        outgoing = Outgoing(read, 10, shared=True)
+        early, late = (asyncio.create_task(outgoing.after("a", serial, 60.0)) for serial in (0, 1))
+        while outgoing.polls < 2 or outgoing.waiting != ["a"]:
+            await asyncio.sleep(0.01)
+        outgoing.posted({"a": 0, "b": 7})
+        await asyncio.sleep(0.01)
+        assert not early.done()
+        posted.append(Posted(1, b"x"))
+        outgoing.posted({"a": 1})
+        assert await early == posted
+        assert not late.done()
+        posted.append(Posted(2, b"y"))
+        outgoing.posted({"a": 2})
+        assert await late == posted[1:]
+
+    asyncio.run(body())

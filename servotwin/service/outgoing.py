@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 
 from servotwin.link.seal import TO_EDGE, key_of, seal
 from servotwin.messages import Refusal
@@ -27,13 +27,13 @@ class Outgoing:
         Asks the store, without blocking the event loop.
     most : int
         Polls that may wait at once.
-    again : float or None
-        s after which the store is asked again although nobody said a word: other processes post too. None: they do not.
+    shared : bool
+        Other processes post too: somebody has to ask the store now and then what is `posted`, for those `waiting`.
     """
 
-    def __init__(self, read: Read, most: int, again: float | None = None) -> None:
-        self._read, self._most, self._again = read, most, again
-        self._waiting: dict[str, set[asyncio.Future[None]]] = {}
+    def __init__(self, read: Read, most: int, shared: bool = False) -> None:
+        self._read, self._most, self._shared = read, most, shared
+        self._waiting: dict[str, dict[asyncio.Future[None], int]] = {}
         self._posts: Counter[str] = Counter()
         self._silent: dict[str, int] = {}
         self._closed = False
@@ -46,6 +46,17 @@ class Outgoing:
         for waiting in self._waiting.pop(servo, ()):
             if not waiting.done():
                 waiting.set_result(None)
+
+    @property
+    def waiting(self) -> list[str]:
+        """Servos whose edges wait for a message."""
+        return list(self._waiting)
+
+    def posted(self, newest: Mapping[str, int]) -> None:
+        """The newest serial of some servos, whoever posted it."""
+        for servo, serial in newest.items():
+            if any(after < serial for after in self._waiting.get(servo, {}).values()):
+                self.post(servo)
 
     def close(self) -> None:
         """Let every poll end now."""
@@ -79,22 +90,22 @@ class Outgoing:
             if found or left <= 0.0 or self._closed:
                 return found
             if posts == self._posts[servo]:
-                await self._sleep(servo, left if self._again is None else min(left, self._again))
+                await self._sleep(servo, serial, left)
 
     async def _look(self, servo: str, serial: int) -> Sequence[Posted]:
         """Ask the store, unless it is known to hold nothing newer."""
         posts = self._posts[servo]
-        if self._again is None and serial >= self._silent.get(servo, NEVER):
+        if not self._shared and serial >= self._silent.get(servo, NEVER):
             return ()
         found = await self._read(servo, serial)
         if not found and posts == self._posts[servo]:
             self._silent[servo] = serial
         return found
 
-    async def _sleep(self, servo: str, seconds: float) -> None:
+    async def _sleep(self, servo: str, serial: int, seconds: float) -> None:
         """Until something is posted, `seconds` at most."""
         waiting: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(servo, set()).add(waiting)
+        self._waiting.setdefault(servo, {})[waiting] = serial
         try:
             async with asyncio.timeout(seconds):
                 await waiting
@@ -106,7 +117,7 @@ class Outgoing:
     def _forget(self, servo: str, waiting: asyncio.Future[None]) -> None:
         others = self._waiting.get(servo)
         if others is not None:
-            others.discard(waiting)
+            others.pop(waiting, None)
             if not others:
                 del self._waiting[servo]
 

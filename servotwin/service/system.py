@@ -69,7 +69,7 @@ class System:
         self.authority = Authority(None) if self.tokens is None else self.tokens.authority
         alone, self._knows = self.config.store.startswith(SQLITE), knowing(twin.fleet)
         self._owner = ALONE if alone else uuid4().hex
-        self.outgoing = Outgoing(self._posted, self.config.long_polls, None if alone else REFRESH_S)
+        self.outgoing = Outgoing(self._posted, self.config.long_polls, shared=not alone)
         self.commits = GroupCommit(store, Bounds(waiting=self.config.queue), self.clocks.wall)
         self.ingest = self._ingest()
         self._parts = Parts(store, self.shelf, self.pool, self._commit, self.outgoing.post, self.metrics, self.clocks)
@@ -99,6 +99,8 @@ class System:
             await self.shelf.ask(partial(self.store.release, self._owner))
         await self.pool.begin()
         self._spawn(self._refresh())
+        if self._owner != ALONE:
+            self._spawn(self._hear())
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
         if not math.isinf(self.config.retention_days):
@@ -156,6 +158,13 @@ class System:
             await asyncio.sleep(REFRESH_S)
             self.tokens.refresh()
         await asyncio.Event().wait()
+
+    async def _hear(self) -> None:
+        """Let edges know what other processes posted."""
+        while True:
+            await asyncio.sleep(REFRESH_S)
+            with suppress(StoreUnavailable):
+                self.outgoing.posted(await self.shelf.ask(partial(self.store.posted, self.outgoing.waiting)))
 
     async def _forget(self) -> None:
         """Empty windows that are too old."""

@@ -13,6 +13,7 @@ from servotwin.store.schema import PROOFS, WINDOWS, WORK, bodies, messages, twin
 from servotwin.store.schema import contexts as texts
 from servotwin.store.schema import outgoing as posts
 
+_NAMES = 5000
 HELD = tuple(messages.c[name] for name in Held._fields)
 
 
@@ -20,6 +21,15 @@ def outgoing(connection: sa.Connection, servo: str, after: int, limit: int) -> l
     """Messages to the edge after a serial."""
     query = sa.select(posts.c.serial, posts.c.body).where(posts.c.servo == servo, posts.c.serial > after)
     return [Posted(row.serial, row.body) for row in connection.execute(query.order_by(posts.c.serial).limit(limit))]
+
+
+def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
+    """The newest serials; asked in parts, as no database takes any number of names at once."""
+    names, found = list(servos), dict[str, int]()
+    for begin in range(0, len(names), _NAMES):
+        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(names[begin : begin + _NAMES]))
+        found.update((servo, serial) for servo, serial in connection.execute(query))
+    return found
 
 
 def waiting(connection: sa.Connection, now: float) -> Waiting:

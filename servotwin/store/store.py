@@ -114,6 +114,10 @@ class Store:
         """Messages to the edge of a serial above `after`, lowest first."""
         return self._read(lambda connection: reading.outgoing(connection, servo, after, limit))
 
+    def posted(self, servos: Collection[str]) -> dict[str, int]:
+        """Serial of the newest message to the edge of each of these servos that was heard of."""
+        return self._read(lambda connection: reading.posted(connection, servos))
+
     def waiting(self, now: float) -> Waiting:
         """How much is not yet processed, and for how long."""
         return self._read(lambda connection: reading.waiting(connection, now))
