@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from servotwin.bench import accuracy, endurance, tick
+from servotwin.bench.fleet import command as whole
+from servotwin.bench.fleet.setting import QUICK, Scale
 from servotwin.bench.novelty import command as worth_sending
 from servotwin.bench.policies import command as side_by_side
 from servotwin.errors import InvalidInput
@@ -29,6 +31,10 @@ def _novelty(date: str, output: Path | None, quick: bool) -> None:
     worth_sending.novelty(date, output, worth_sending.QUICK if quick else None)
 
 
+def _fleet(date: str, output: Path | None, quick: bool) -> None:
+    whole.fleet(date, output, QUICK if quick else Scale())
+
+
 def _tick(date: str, output: Path | None, quick: bool) -> None:
     tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
 
@@ -36,14 +42,19 @@ def _tick(date: str, output: Path | None, quick: bool) -> None:
 ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     accuracy.NAME: _estimator,
     endurance.NAME: _hostile,
+    whole.NAME: _fleet,
     side_by_side.NAME: _policies,
     tick.NAME: _tick,
     worth_sending.NAME: _novelty,
 }
 
 
-def run_alone(names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool) -> bool:
+def run_alone(
+    names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool, full: bool = False
+) -> bool:
     """Run the one that is named, if one is; `others`: whether options were given that only the speeds take.
+
+    `full` is for the fleet alone: as long as the figures that are stated of it took.
 
     Raises
     ------
@@ -51,9 +62,14 @@ def run_alone(names: Sequence[str], date: str, output: Path | None, quick: bool,
         It is not alone.
     """
     name = next((name for name in names if name in ALONE), None)
+    if full and (tuple(names) != (whole.NAME,) or quick):
+        raise InvalidInput(f"--full: only bench {whole.NAME} takes it, and not with --quick")
     if name is None:
         return False
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
-    ALONE[name](date, output, quick)
+    if full:
+        whole.fleet(date, output, Scale().full())
+    else:
+        ALONE[name](date, output, quick)
     return True

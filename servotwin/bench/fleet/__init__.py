@@ -1,0 +1,1 @@
+"""`servotwin bench fleet`: ten thousand servos, one twin, real processes."""

@@ -1,0 +1,74 @@
+"""One connection to the twin: a request at a time, raw, so that the load costs little beside what it loads."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+Answered = Callable[[int, bytes], None]
+"""Told status and body."""
+_HEAD_END = b"\r\n\r\n"
+_LENGTH = b"content-length:"
+
+
+class Line(asyncio.Protocol):
+    """Sends a request, and tells who sent it what the answer is.
+
+    Parameters
+    ----------
+    broken : callable
+        Told why, when the connection ends while something is expected of it.
+    """
+
+    def __init__(self, broken: Callable[[str], None]) -> None:
+        self._broken = broken
+        self._transport: asyncio.Transport | None = None
+        self._answered: Answered | None = None
+        self._got = bytearray()
+        self._wanted = -1
+
+    def ask(self, head: bytes, body: bytes, answered: Answered) -> None:
+        """Send a request; `head` lacks its length and the empty line."""
+        assert self._transport is not None
+        self._answered = answered
+        self._transport.write(b"%bContent-Length: %d\r\n\r\n%b" % (head, len(body), body))
+
+    def close(self) -> None:
+        """No more requests."""
+        self._answered = None
+        if self._transport is not None:
+            self._transport.close()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._answered is not None:
+            self._broken(f"the twin closed a connection ({exc or 'at its end'})")
+
+    def data_received(self, data: bytes) -> None:
+        self._got += data
+        if self._wanted < 0:
+            end = self._got.find(_HEAD_END)
+            if end < 0:
+                return
+            self._wanted = end + len(_HEAD_END) + _length(bytes(self._got[:end]).lower())
+        if len(self._got) >= self._wanted:
+            self._finish()
+
+    def _finish(self) -> None:
+        whole, answered = bytes(self._got[: self._wanted]), self._answered
+        del self._got[: self._wanted]
+        self._wanted, self._answered = -1, None
+        if answered is not None:
+            answered(int(whole[9:12]), whole[whole.find(_HEAD_END) + len(_HEAD_END) :])
+
+
+def _length(head: bytes) -> int:
+    """Of the body that a response announces."""
+    begin = head.find(_LENGTH)
+    if begin < 0:
+        return 0
+    end = head.find(b"\r\n", begin)
+    return int(head[begin + len(_LENGTH) : end if end >= 0 else None])

@@ -1,0 +1,106 @@
+"""What the bench asks of its edges, as it is handed to their process, and what that says of itself."""
+
+from __future__ import annotations
+
+import msgspec
+from msgspec import Struct
+
+
+class Plan(Struct, frozen=True):
+    """One run of the edges.
+
+    Attributes
+    ----------
+    port : int
+        Of the twin, on this machine.
+    servos : int
+    boot : str
+    connections : int
+        Kept open, with one request on its way on each.
+    duration : float
+        s.
+    rate : float
+        Windows/s that fall due, the servos taking turns; 0: each connection sends the next as soon as it may.
+    news : float
+        Share of windows with which the gap has moved to the next place.
+    polls : bool
+        Whether each servo asks for messages when its turn comes, and answers them.
+    version, sequence, start : int, int, float
+        Of parameters, of the next window, and its sample time, of every servo at first.
+    outage : (float, float)
+        s from the beginning: from when on and until when no request gets through; windows are kept meanwhile.
+    seed : int
+    """
+
+    port: int
+    servos: int
+    boot: str
+    connections: int
+    duration: float
+    rate: float = 0.0
+    news: float = 0.0
+    polls: bool = False
+    version: int = 0
+    sequence: int = 0
+    start: float = 0.0
+    outage: tuple[float, float] = (0.0, 0.0)
+    seed: int = 0
+
+
+class Report(Struct, frozen=True):
+    """What edges did.
+
+    Attributes
+    ----------
+    seconds : float
+        Until the last answer.
+    windows, news, polls, updates, later : int
+        Windows that were taken, those with news among them, polls, updates answered, and requests that had to be made
+        once more because the twin said so.
+    bytes : int
+        Of the windows.
+    cpu : float
+        s of processor time, all threads.
+    latency : tuple of float
+        s from a window's request to its answer: median, 99 % and largest.
+    late : tuple of float
+        s from when a window was due until its request, without those of the outage: median, 99 % and largest.
+    waited : int
+        Most windows that were kept at once.
+    """
+
+    seconds: float
+    windows: int
+    news: int
+    polls: int
+    updates: int
+    later: int
+    bytes: int
+    cpu: float
+    latency: tuple[float, float, float]
+    late: tuple[float, float, float]
+    waited: int
+
+
+class Load(Struct, frozen=True):
+    """What the edges' process reads first: the plan and the windows, place by place."""
+
+    plan: Plan
+    places: tuple[tuple[bytes, ...], ...]
+
+
+def encode_load(load: Load) -> bytes:
+    """As a file."""
+    return msgspec.msgpack.encode(load)
+
+
+def decode_load(data: bytes) -> Load:
+    """From a file."""
+    return msgspec.msgpack.decode(data, type=Load)
+
+
+def shares(values: list[float]) -> tuple[float, float, float]:
+    """Median, 99 % and largest of some values; 0 of none."""
+    ordered = sorted(values) or [0.0]
+    last = len(ordered) - 1
+    return ordered[last // 2], ordered[round(0.99 * last)], ordered[-1]

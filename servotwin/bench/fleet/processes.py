@@ -1,0 +1,123 @@
+"""The twin as a process of its own, and what each process costs, as the system counts it: time and memory."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from servotwin.errors import InvalidInput
+
+_BEGIN_S, _END_S = 180.0, 60.0
+_ADDRESS = re.compile(r"listening on http://127\.0\.0\.1:(\d+)")
+_TICK = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
+
+
+class Used(NamedTuple):
+    """Processor time (s) and resident memory (bytes) of a process."""
+
+    cpu: float
+    memory: int
+
+
+class Service(NamedTuple):
+    """A twin that runs.
+
+    Attributes
+    ----------
+    process : Popen
+    port : int
+    """
+
+    process: subprocess.Popen[str]
+    port: int
+
+
+def check_system() -> None:
+    """Refuse where processes cannot be looked at.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    if not Path("/proc/self/stat").exists():
+        raise InvalidInput("bench fleet reads processor times from /proc, which this system has not: run it on Linux")
+
+
+@contextmanager
+def service(folder: Path) -> Iterator[Service]:
+    """The twin of `twin.toml` in a folder, on a port of its own; its log goes to twin.log there.
+
+    Raises
+    ------
+    RuntimeError
+        It does not start.
+    """
+    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(folder / "twin.toml"), "--port", "0"]
+    with (folder / "twin.log").open("wb") as log:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True, env=_environment()
+        )
+    try:
+        yield Service(process, _port(process, folder))
+    finally:
+        _end(process)
+
+
+def used(pid: int) -> Used | None:
+    """What a process has used by now; None: it is gone."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        resident = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError):
+        return None
+    return Used((int(stat[11]) + int(stat[12])) / _TICK, resident * os.sysconf("SC_PAGE_SIZE"))
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started and that run."""
+    try:
+        tasks = Path(f"/proc/{pid}/task").iterdir()
+        return [int(each) for task in tasks for each in (task / "children").read_text(encoding="ascii").split()]
+    except OSError:
+        return []
+
+
+def _port(process: subprocess.Popen[str], folder: Path) -> int:
+    """Where it listens, once it says so."""
+    assert process.stdout is not None
+    end = time.monotonic() + _BEGIN_S
+    while time.monotonic() < end:
+        found = _ADDRESS.search(process.stdout.readline())
+        if found:
+            return int(found[1])
+        if process.poll() is not None:
+            break
+    said = (folder / "twin.log").read_text(encoding="utf-8", errors="replace")[-2000:]
+    raise RuntimeError(f"the twin did not start: {said}")
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Ask it to end; its whole group is ended where it does not."""
+    process.terminate()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
