@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from pathlib import Path
+from typing import Any, NamedTuple
 
 _SCHEMA = """
 PRAGMA journal_mode = WAL;
@@ -18,8 +19,21 @@ CREATE TABLE IF NOT EXISTS letters (
 CREATE TABLE IF NOT EXISTS notes (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS counts (what TEXT PRIMARY KEY, number INTEGER NOT NULL) WITHOUT ROWID;
 """
+INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
+DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
+POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
+TAKE = "DELETE FROM letters WHERE digest = ?"
+COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
+NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _BESIDE = ("-wal", "-shm")
+
+
+class Statement(NamedTuple):
+    """What is to be written."""
+
+    text: str
+    values: tuple[Any, ...]
 
 
 def is_broken(error: sqlite3.Error) -> bool:

@@ -15,12 +15,12 @@ from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from threading import RLock
-from typing import Any, NamedTuple
+from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.link.eviction import Kept, excess, is_plain
 from servotwin.link.outbox import FULL, Dropped, Key
-from servotwin.link.sqlitefile import connect, is_broken, put_aside
+from servotwin.link.sqlitefile import COUNT, DELETE, INSERT, NOTE, POST, TAKE, Statement, connect, is_broken, put_aside
 from servotwin.link.transport import DEFLATE, Parcel, squeezed
 from servotwin.messages import Window, decode, encode
 
@@ -29,20 +29,7 @@ MOST_OWED = 16_000_000
 """Bytes of windows that are held in memory while the disk cannot be written."""
 MOST_LETTERS = 10_000
 
-_INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
-_DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
-_POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
-_TAKE = "DELETE FROM letters WHERE digest = ?"
-_COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
-_NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
 _DROPPED = "dropped: "
-
-
-class Statement(NamedTuple):
-    """What is to be written."""
-
-    text: str
-    values: tuple[Any, ...]
 
 
 class SqliteOutbox:
@@ -78,9 +65,8 @@ class SqliteOutbox:
     @property
     def dropped(self) -> Mapping[str, int]:
         """Windows given up since the file was made, by reason."""
-        with self._lock:
-            names = [name for name in self._counts if name.startswith(_DROPPED)]
-            return {name.removeprefix(_DROPPED): self._counts[name] for name in names}
+        counts = dict(self._counts).items()
+        return {name.removeprefix(_DROPPED): number for name, number in counts if name.startswith(_DROPPED)}
 
     @property
     def safe(self) -> bool:
@@ -96,7 +82,7 @@ class SqliteOutbox:
             if key in self._index:
                 return []
             self._index[key] = Kept(len(body), is_plain(window.reason))
-            self._owed["window", key] = Statement(_INSERT, (*key, window.reason, encoding, body))
+            self._owed["window", key] = Statement(INSERT, (*key, window.reason, encoding, body))
             drops = [Dropped(each, FULL) for each in excess(self._index, self._windows, self._size)]
             for drop in drops:
                 self._forget(drop.key, drop.reason)
@@ -154,7 +140,7 @@ class SqliteOutbox:
         digest = blake2b(body, digest_size=16).digest()
         with self._lock:
             self._letters[digest] = None
-            self._owed["letter", digest] = Statement(_POST, (digest, body))
+            self._owed["letter", digest] = Statement(POST, (digest, body))
             if len(self._letters) > MOST_LETTERS:
                 self._count(_DROPPED + LETTERS)
                 self.taken(next(iter(self._letters)))
@@ -162,8 +148,7 @@ class SqliteOutbox:
 
     def letters(self) -> list[bytes]:
         """Digests of the letters kept, oldest first."""
-        with self._lock:
-            return list(self._letters)
+        return list(self._letters)
 
     def letter(self, digest: bytes) -> Parcel:
         """A letter as it is sent; KeyError when it is not kept."""
@@ -178,7 +163,7 @@ class SqliteOutbox:
         """Forget a letter."""
         with self._lock:
             self._letters.pop(digest, None)
-            self._owed["letter", digest] = Statement(_TAKE, (digest,))
+            self._owed["letter", digest] = Statement(TAKE, (digest,))
             self.settle()
 
     def recall(self, what: str) -> int:
@@ -189,14 +174,14 @@ class SqliteOutbox:
         """Keep a number."""
         with self._lock:
             self._counts[what] = number
-            self._owed["count", what] = Statement(_COUNT, (what, number))
+            self._owed["count", what] = Statement(COUNT, (what, number))
             self.settle()
 
     def note(self, name: str, value: bytes) -> None:
         """Keep some bytes."""
         with self._lock:
             self._notes[name] = value
-            self._owed["note", name] = Statement(_NOTE, (name, value))
+            self._owed["note", name] = Statement(NOTE, (name, value))
             self.settle()
 
     def noted(self, name: str) -> bytes | None:
@@ -263,7 +248,7 @@ class SqliteOutbox:
         self.faults[UNWRITABLE] += 1
         if self._connection is not None and self._connection.in_transaction:
             self._rolled_back(self._connection)
-        held = [(key, owed) for key, owed in self._owed.items() if owed.text == _INSERT]
+        held = [(key, owed) for key, owed in self._owed.items() if owed.text == INSERT]
         size = sum(len(owed.values[4]) for _, owed in held)
         while size > MOST_OWED:
             key, owed = held.pop(0)
@@ -286,8 +271,8 @@ class SqliteOutbox:
             self._count(_DROPPED + BROKEN)
         self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._owed}
         self._count(BROKEN)
-        self._owed |= {("count", what): Statement(_COUNT, (what, n)) for what, n in self._counts.items()}
-        self._owed |= {("note", name): Statement(_NOTE, (name, value)) for name, value in self._notes.items()}
+        self._owed |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
+        self._owed |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
         try:
             put_aside(self._path)
         except OSError as error:
@@ -304,10 +289,10 @@ class SqliteOutbox:
 
     def _forget(self, key: Key, reason: str | None = None) -> None:
         self._index.pop(key, None)
-        self._owed["window", key] = Statement(_DELETE, key)
+        self._owed["window", key] = Statement(DELETE, key)
         if reason is not None:
             self._count(_DROPPED + reason)
 
     def _count(self, what: str) -> None:
         self._counts[what] += 1
-        self._owed["count", what] = Statement(_COUNT, (what, self._counts[what]))
+        self._owed["count", what] = Statement(COUNT, (what, self._counts[what]))
