@@ -69,8 +69,9 @@ class HttpRelay(Relay):
         """From now on nothing bad happens."""
 
         async def clear() -> None:
-            self.chances, self._weather = Chances(), Weather()
+            self.chances = Chances()
 
+        super().clear()
         self._do(clear())
 
     async def serve(self, reader: Reader, writer: Writer) -> None:

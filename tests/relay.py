@@ -86,6 +86,14 @@ class Relay:
 
         self._do(change())
 
+    def clear(self) -> None:
+        """From now on nothing bad happens by chance."""
+
+        async def clear() -> None:
+            self._weather = Weather()
+
+        self._do(clear())
+
     def cut(self) -> int:
         """Cut all connections; returns how many halves there were."""
 
@@ -122,7 +130,8 @@ class Relay:
     async def _cut_by_chance(self) -> None:
         while self._weather.cut_s is not None:
             await asyncio.sleep(self._random.uniform(*self._weather.cut_s))
-            self._abort()
+            if self._weather.cut_s is not None:
+                self._abort()
 
     async def _accept(self, reader: Reader, writer: Writer) -> None:
         self.counts["connection"] += 1

@@ -233,7 +233,7 @@ def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store:
 def test_a_twin_that_begins_late_gets_all(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with edge(at, timeout_s=0.5) as here:
-        with pytest.raises(Unreachable, match="no answer of a twin"):
+        with pytest.raises(Unreachable, match="no twin listens"):
             here.deliver(parcel(0))
         with twin(at, store):
             insist(lambda: here.deliver(parcel(0)))
@@ -337,8 +337,19 @@ def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -
     with edge(Broker(server.url), timeout_s=1.0) as here:
         for payload in forged:
             raw(server, exchange.down("axis-1"), payload)
-        with pytest.raises(Unreachable, match="no answer"):
+        with pytest.raises(Unreachable, match="no twin listens"):
             here.deliver(parcel(0))
+
+
+def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitto) -> None:
+    wanted = Wanted("deaf", (exchange.UP,), 0)
+    ready = threading.Event()
+    deaf = Connection(Broker(server.url), wanted, Events(lambda *_: None, lambda _: ready.set(), lambda _: None))
+    with edge(Broker(server.url), timeout_s=0.3) as here:
+        assert ready.wait(PATIENCE)
+        with pytest.raises(Unreachable, match=r"no answer of a twin within 0\.3 s"):
+            here.deliver(parcel(0))
+    deaf.close()
 
 
 def test_an_answer_belongs_to_its_question() -> None:
@@ -403,7 +414,7 @@ def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
     connection = Connection(Broker(server.url), wanted, events)
     try:
         assert ready.wait(PATIENCE)
-        assert connection.publish(topic, payload, 60.0)
+        assert connection.publish(topic, payload, 60.0) is not None
         assert arrived.wait(PATIENCE)
     finally:
         connection.close()

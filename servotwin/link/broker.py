@@ -86,7 +86,7 @@ class Wanted(NamedTuple):
     topics : tuple of str
         Subscribed to, at least once each.
     session_s : int
-        How long the broker keeps a session whose connection broke.
+        How long the broker keeps a session, and what comes for it, when its connection broke.
     receive : int
         Messages under way to this end that are not acknowledged yet.
     will : str
@@ -111,11 +111,14 @@ class Events(NamedTuple):
         Subscribed; whether the broker has forgotten the session.
     lost : callable
         The connection broke or was refused, and why.
+    unheard : callable
+        The broker took the message of that number, but nobody has subscribed to its topic.
     """
 
     message: Callable[[str, bytes, Callable[[], None]], None]
     ready: Callable[[bool], None]
     lost: Callable[[str], None]
+    unheard: Callable[[int], None] = lambda _: None
 
 
 class Connection:
@@ -135,16 +138,18 @@ class Connection:
         self._client.on_socket_open = _no_delay
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_subscribe, self._client.on_message = self._subscribed, self._message
+        self._client.on_publish = self._published
         self._client.on_connect_fail = self._failed
         self._client.connect_async(
             *broker.address, keepalive=KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(wanted)
         )
         self._client.loop_start()
 
-    def publish(self, topic: str, payload: bytes, expiry_s: float) -> bool:
-        """Send at least once, while anybody may still want it; False where too much waits already."""
+    def publish(self, topic: str, payload: bytes, expiry_s: float) -> int | None:
+        """Send at least once, while anybody may still want it; its number, None where too much waits already."""
         properties = _properties("PUBLISH", MessageExpiryInterval=max(1, round(expiry_s)))
-        return self._client.publish(topic, payload, qos=1, properties=properties).rc in (0, _NO_CONNECTION)
+        info = self._client.publish(topic, payload, qos=1, properties=properties)
+        return info.mid if info.rc in (0, _NO_CONNECTION) else None
 
     def close(self) -> None:
         """Say good-bye and let go; a broker that does not listen is waited for no longer than a moment."""
@@ -181,6 +186,10 @@ class Connection:
         """Called while the exception is being handled, which paho does not pass on."""
         self._events.lost(f"the broker cannot be reached ({sys.exc_info()[1]})")
 
+    def _published(self, _client: Client, _user: Any, mid: int, reason: Any, _properties: Any) -> None:
+        if reason.value == _NO_SUBSCRIBERS:
+            self._events.unheard(mid)
+
     def _message(self, _client: Client, _user: Any, message: MQTTMessage) -> None:
         number, mid, qos = self._number, message.mid, message.qos
 
@@ -191,6 +200,8 @@ class Connection:
         self._events.message(message.topic, bytes(message.payload), acknowledge)
 
 
+_NO_SUBSCRIBERS = 0x10
+"""MQTT's reason code of a message that nobody gets."""
 _NO_CONNECTION = 4
 """paho's code: the message is kept and sent when there is a connection."""
 
@@ -204,13 +215,13 @@ def _client(broker: Broker, wanted: Wanted) -> Client:
     client = Client(CallbackAPIVersion.VERSION2, wanted.client_id, protocol=MQTTv5, manual_ack=True)
     client.max_queued_messages_set(QUEUED)
     client.max_inflight_messages_set(wanted.receive)
-    client.reconnect_delay_set(1, 8)
+    client.reconnect_delay_set(1, 4)
     if broker.user is not None:
         client.username_pw_set(broker.user, broker.password)
     if broker.tls:
         client.tls_set_context(_context(broker.ca_file))
     if wanted.will:
-        client.will_set(wanted.will, b"", qos=1, properties=_properties("WILLMESSAGE", WillDelayInterval=1))
+        client.will_set(wanted.will, b"", qos=1)
     return client
 
 

@@ -34,6 +34,7 @@ from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
 
 SESSION_S = 3600
+ALONE = "no twin listens at the broker"
 
 
 class MqttTransport:
@@ -56,9 +57,11 @@ class MqttTransport:
         # Beginning anywhere, so that no answer to an earlier process is taken for one to this.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
         self._waiting: dict[int, Future[Answer | Stranger]] = {}
+        self._sent: dict[int, Future[Answer | Stranger]] = {}
+        self._unheard: set[int] = set()
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         wanted = Wanted(f"servotwin-edge-{servo}", (down(servo), GONE), SESSION_S)
-        self._connection = Connection(broker, wanted, Events(self._message, self._connected, self._lost))
+        self._connection = Connection(broker, wanted, Events(self._message, self._connected, self._lost, self._alone))
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when a twin has the message safe; see `Transport`."""
@@ -87,16 +90,16 @@ class MqttTransport:
         if not self._ready.wait(self._timeout):
             raise Unreachable(self._why)
         serial, future = self._expect()
+        number = 0
         try:
-            data = ask(self._key, self._servo, serial, question)
-            if self._closed or not self._connection.publish(up(self._servo), data, patience):
-                raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
+            number = self._send(ask(self._key, self._servo, serial, question), patience, future)
             said = future.result(patience)
         except TimeoutError:
             raise Unreachable(f"no answer of a twin within {patience:g} s") from None
         finally:
             with self._lock:
                 del self._waiting[serial]
+                self._sent.pop(number, None)
         if isinstance(said, Stranger):
             raise Refused(Refusal.BAD_TOKEN, "the twin knows the servo by another token")
         if isinstance(said, NotTaken):
@@ -108,6 +111,27 @@ class MqttTransport:
         with self._lock:
             self._waiting[serial] = future
         return serial, future
+
+    def _send(self, data: bytes, patience: float, future: Future[Answer | Stranger]) -> int:
+        """Publish a question; the broker may have said that nobody hears it before its number is known here."""
+        number = None if self._closed else self._connection.publish(up(self._servo), data, patience)
+        if number is None:
+            raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
+        with self._lock:
+            self._sent[number] = future
+            alone = number in self._unheard
+            self._unheard.discard(number)
+        if alone:
+            _settle(future, Unreachable(ALONE))
+        return number
+
+    def _alone(self, number: int) -> None:
+        with self._lock:
+            future = self._sent.get(number)
+            if future is None:
+                self._unheard.add(number)
+        if future is not None:
+            _settle(future, Unreachable(ALONE))
 
     def _message(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         """Something came: an answer, or word that a twin is gone; what cannot be used is as if it had not come."""

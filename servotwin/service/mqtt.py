@@ -13,8 +13,8 @@ from servotwin.service.brokerdesk import Desk
 
 log = logging.getLogger(__name__)
 
-SESSION_S = 30
-"""A broken connection may come back; what a twin that is gone was given is soon nobody's, and edges ask again."""
+SESSION_S = 0
+"""Otherwise the broker would go on giving its share to a twin that is gone; now edges hear of it and ask again."""
 RECEIVE = 1000
 """Questions under way to one twin."""
 ANSWER_S = 60.0
@@ -77,7 +77,7 @@ class Bridge:
             said = None
         if not polls:
             acknowledge()
-        if said is not None and not connection.publish(down(servo), said, ANSWER_S):
+        if said is not None and connection.publish(down(servo), said, ANSWER_S) is None:
             log.warning("answer not sent: too much waits for the broker", extra={"servo": servo})
 
     def _ready(self, _forgotten: bool) -> None:
