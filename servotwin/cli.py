@@ -266,6 +266,20 @@ def certify(
 
 
 @app.command()
+def up(
+    folder: Annotated[Path, typer.Option(help="Where all is kept; made at the first start.")] = Path("servotwin-up"),
+    speed: Annotated[
+        float | None, typer.Option(help="Times real time; as fast as 60 % of two cores allow by default.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option("--for", help="End by itself after so many s.")] = None,
+) -> None:
+    """Everything at once on this machine: a twin, and three simulated servos that wear; Ctrl-C ends it."""
+    from servotwin.up.command import up as run
+
+    run(folder, speed, seconds)
+
+
+@app.command()
 def twin(
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Instead of the file's; 0: any free one.")] = None,
@@ -308,12 +322,14 @@ def audit(
     token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
     ca: Annotated[Path | None, typer.Option(help="Certificates that the service's is checked against.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Windows at most.")] = 20,
-    json: Annotated[bool, typer.Option("--json", help="One JSON array instead of a table.")] = False,
+    changes: Annotated[bool, typer.Option("--changes", help="Only windows from which something followed.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="One JSON array of the windows instead of lines.")] = False,
 ) -> None:
     """The evidence chain of a servo: window, estimate, version, receipt, effect."""
-    from servotwin.service.audittable import audit as run
+    from servotwin.service.auditing import Source
+    from servotwin.service.auditing import audit as run
 
-    run(servo, config, url, token, ca, limit, json)
+    run(servo, Source(config, url, token, ca), limit, changes, json)
 
 
 @app.command()

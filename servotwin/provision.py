@@ -15,6 +15,7 @@ from servotwin.gateway.configfile import edge_toml, load
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN
 from servotwin.outputs import make_directory, write_text
+from servotwin.plant.noise import Noise
 from servotwin.scenario import Scenario
 from servotwin.scenariofile import Recording
 from servotwin.service.config import ServiceConfig
@@ -46,6 +47,8 @@ class Enrolment:
         Where the edge reaches the twin; None: where the twin's file says that it listens.
     again : bool
         A servo that has a token gets another one; the former counts no more.
+    noise : float
+        m rms on the measured position, which the edge's watch has to put up with.
     """
 
     servo: str
@@ -55,6 +58,7 @@ class Enrolment:
     drive: Mapping[str, object] = field(default_factory=lambda: SIMULATED)
     url: str | None = None
     again: bool = False
+    noise: float = 0.0
 
 
 def enroll(path: Path, wanted: Enrolment) -> list[Path]:
@@ -107,7 +111,8 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
         The servo has no model, or nothing is proved for its stated range.
     """
     model = twin.fleet.model_of(wanted.servo)
-    law = model.servo.controller.replace(sample_rate=wanted.sample_rate if wanted.role == "control" else None)
+    sampled = wanted.role == "control" or wanted.noise > 0.0
+    law = model.servo.controller.replace(sample_rate=wanted.sample_rate if sampled else None)
     recording = Recording(sample_rate=wanted.sample_rate)
     scenario = Scenario(
         servo=model.servo.replace(controller=law),
@@ -115,6 +120,7 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
         name=wanted.servo,
         recording=recording,
         twin=model.settings,
+        noise=Noise(wanted.noise) if wanted.noise > 0.0 else None,
     )
     agent = replace(scenario.agent_settings(), boot=UNBOOTED)
     certificate = None if twin.service.tls_certificate is None else CERTIFICATE

@@ -1,0 +1,187 @@
+"""The folder of `servotwin up`: made whole or not at all, used by one at a time, gone on with at the next start."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from servotwin import provision
+from servotwin.drives.simulated.diary import MachineState, read_state
+from servotwin.errors import InvalidInput
+from servotwin.gateway.configfile import edge_toml, load
+from servotwin.link.session import Retry
+from servotwin.outputs import write_text
+from servotwin.service.tokens import Verifiers, write_tokens
+from servotwin.up.pacing import FASTEST
+from servotwin.up.plan import RATE, SERVOS, ServoPlan, machine_toml, twin_toml
+
+MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operator.token"
+EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
+LONGEST = 100
+"""Bytes of a socket's path that every system takes."""
+ENDING_S = 25.0
+"""s that what an earlier start left behind may take to end."""
+_PLACEHOLDER = "http://127.0.0.1:1"
+_RETRY = Retry(0.5, 2.0, 2.0)
+
+
+class Marker(msgspec.Struct, frozen=True, tag="servotwin-up/1", tag_field="schema"):
+    """That a folder is one of these; servos by name."""
+
+    servos: list[str]
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder that is in order, and locked.
+
+    Attributes
+    ----------
+    path : Path
+        Absolute.
+    lock : int
+        Descriptor of the lock, which every process that works in the folder keeps open.
+    new : bool
+        Whether it was made by this start.
+    """
+
+    path: Path
+    lock: int
+    new: bool
+
+    def servo(self, servo: ServoPlan) -> Path:
+        """A servo's own."""
+        return self.path / servo.name
+
+    def machine(self, servo: ServoPlan) -> MachineState | None:
+        """Where a machine was last; None: it is new."""
+        return read_state(self.servo(servo) / "state.json")
+
+    def connect(self, servo: ServoPlan, url: str) -> None:
+        """Tell a servo's edge where the twin is."""
+        file = self.servo(servo) / EDGE
+        config = load(file)
+        if config.twin is not None and config.twin.url != url:
+            write_text(file, edge_toml(replace(config, twin=replace(config.twin, url=url))))
+
+    def operator(self) -> str:
+        """The token with which the twin is asked."""
+        return (self.path / OPERATOR).read_text(encoding="utf-8").strip()
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Folder]:
+    """The folder, made at the first start, and nobody else's meanwhile.
+
+    Raises
+    ------
+    InvalidInput
+        It holds something else, is in use, or cannot be written.
+    """
+    path = path.absolute()
+    _check_length(path)
+    try:
+        new = not path.exists() or not any(path.iterdir())
+        if new:
+            _make(path)
+        _check(path)
+        with _locked(path) as lock:
+            yield Folder(path, lock, new)
+    except OSError as error:
+        raise InvalidInput(f"{error.filename or path}: {(error.strerror or str(error)).lower()}") from None
+
+
+def _check_length(path: Path) -> None:
+    longest = max(len(os.fsencode(path / servo.name / DRIVE)) for servo in SERVOS)
+    if longest > LONGEST:
+        told = f"its path is {longest - LONGEST} bytes too long for the sockets in it"
+        raise InvalidInput(f"folder {path}: {told}; choose a shorter one with --folder")
+
+
+def _check(path: Path) -> None:
+    try:
+        found = msgspec.json.decode((path / MARKER).read_bytes(), type=Marker).servos
+    except (OSError, msgspec.MsgspecError):
+        allowed = "choose another with --folder, or one that is empty or not there yet"
+        raise InvalidInput(f"folder {path}: was not made by servotwin up; {allowed}") from None
+    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in found for file in (EDGE, MACHINE, provision.TOKEN))]
+    missing = [name for name in needed if not (path / name).is_file()]
+    if found != [servo.name for servo in SERVOS] or missing:
+        what = f"{missing[0]} is missing" if missing else f"its servos are {', '.join(found)}"
+        raise InvalidInput(f"folder {path}: {what}; remove the folder to begin anew, or choose another with --folder")
+
+
+def _make(path: Path) -> None:
+    """All in a folder beside it, which then takes its name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    try:
+        _fill(beside)
+        with suppress(FileExistsError):  # another start was quicker
+            beside.replace(path)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def _fill(path: Path) -> None:
+    write_tokens(path / "tokens.toml", Verifiers())
+    write_text(path / TWIN, twin_toml(SERVOS, FASTEST))
+    provision.enroll_operator(path / TWIN, "up", path / OPERATOR)
+    for servo in SERVOS:
+        folder, drive = path / servo.name, {"kind": "simulated", "address": f"unix:{DRIVE}"}
+        wanted = provision.Enrolment(
+            servo.name, folder, servo.role, RATE, drive, _PLACEHOLDER, noise=servo.noise_mm * 1e-3
+        )
+        provision.enroll(path / TWIN, wanted)
+        config = load(folder / EDGE)
+        write_text(folder / EDGE, edge_toml(replace(config, agent=replace(config.agent, retry=_RETRY))))
+        write_text(folder / MACHINE, machine_toml(servo))
+    write_text(path / MARKER, msgspec.json.encode(Marker([servo.name for servo in SERVOS])).decode() + "\n")
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    """The lock; what a killed start left behind keeps it until it has ended, which it does by itself."""
+    descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        end = time.monotonic() + ENDING_S
+        while not _taken(descriptor):
+            holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
+            if _alive(holder) or time.monotonic() > end:
+                raise InvalidInput(f"folder {path}: is in use by another servotwin up (process {holder or 'unknown'})")
+            time.sleep(0.1)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        yield descriptor
+        os.ftruncate(descriptor, 0)
+    finally:
+        os.close(descriptor)
+
+
+def _taken(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _alive(holder: str) -> bool:
+    if not holder.isdecimal():
+        return True
+    try:
+        os.kill(int(holder), 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

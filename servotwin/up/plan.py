@@ -1,0 +1,130 @@
+"""What runs: three servos that wear at different rates, and what is written of them at the first start."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+RATE = 1000.0
+"""Hz. Estimates of the gap are as good as at 5 kHz, to a thousandth of a degree, and a tick costs what a tick costs."""
+NEW_GAP, WORN_GAP = 0.0, 40.0
+"""deg"""
+HOUR = 3600.0
+POLICIES = {"certified": "certified", "dead-zone": "hysteresis"}
+"""Of each model."""
+
+
+class ServoPlan(NamedTuple):
+    """One servo and its machine.
+
+    Attributes
+    ----------
+    name : str
+    trait : str
+        What is special about it.
+    role : str
+        "control": the edge ticks the law at every sample, which costs most of the processor's time, so that one does.
+        "supervise": the machine has a controller of its own, and its samples come in blocks.
+    model : str
+        One of `POLICIES`.
+    wears_h, age_h : float
+        h of machine time from new to worn out, and how many of them have passed at the first start.
+    noise_mm : float
+        rms, of the position's encoder.
+    bias_v : float
+        On the motor's input, as of an amplifier.
+    outages : bool
+        Whether its link is cut now and then.
+    """
+
+    name: str
+    trait: str
+    role: str
+    model: str
+    wears_h: float
+    age_h: float
+    noise_mm: float = 0.0
+    bias_v: float = 0.0
+    outages: bool = False
+
+
+SERVOS = (
+    ServoPlan("quick", "wears quickest", "control", "certified", 4.0, 1.0, bias_v=0.05),
+    ServoPlan("noisy", "noisy encoder", "supervise", "certified", 8.0, 2.0, noise_mm=0.05, bias_v=-0.03),
+    ServoPlan("remote", "outages", "supervise", "dead-zone", 12.0, 2.5, outages=True),
+)
+
+
+def twin_toml(servos: tuple[ServoPlan, ...], most_speed: float) -> str:
+    """The twin's file."""
+    named = "".join(f'"{servo.name}" = "{servo.model}"\n' for servo in servos)
+    return _SERVICE.format(speed=most_speed) + "".join(map(_model, POLICIES)) + f"\n[servos]\n{named}"
+
+
+def machine_toml(servo: ServoPlan) -> str:
+    """The machine's file."""
+    values = {**servo._asdict(), "rate": RATE, "new": NEW_GAP, "worn": WORN_GAP, "over": servo.wears_h * HOUR}
+    noise = f"\n[scenario.noise]\nstd_mm = {servo.noise_mm}\n" if servo.noise_mm else ""
+    return _MACHINE.format(**values, begin=-servo.age_h * HOUR) + noise
+
+
+def _model(name: str) -> str:
+    return _MODEL.format(name=name, policy=POLICIES[name])
+
+
+_SERVICE = """\
+[service]
+port = 0                      # servotwin up takes any free one
+tokens = "tokens.toml"
+workers = 1
+speed = {speed:.1f}                 # machine time passes that much faster than the clock, at most
+retention_days = 2
+log_level = "warning"
+"""
+_MODEL = """
+[models.{name}]
+servo = "paper"
+[models.{name}.twin]
+policy = "{policy}"
+gap_limit_deg = 50.0
+validity_s = 1800.0           # machine time: half a minute at sixty times real time
+[models.{name}.twin.trend]
+wear_deg = 10.0
+over_s = 3600.0
+[models.{name}.twin.triage]   # a window at which the gap has hardly moved is only glanced at
+every = 10
+"""
+_MACHINE = """\
+role = "{role}"
+listen = "unix:drive.sock"
+speed = 5.0
+state_file = "state.json"     # how long it has run; without this file it is new again
+speed_file = "speed"          # goes before speed; servotwin up writes it
+
+[scenario]
+servo = "paper"
+name = "{name}"
+duration_s = {over}
+
+[scenario.reference]
+kind = "square"
+amplitude_mm = 1.0
+period_s = 40.0
+
+[scenario.gap]                # total gap
+from_deg = {new}
+to_deg = {worn}
+over_s = {over}
+begin_s = {begin}
+
+[scenario.disturbances]
+input_bias_v = {bias_v}
+
+[scenario.recording]
+sample_rate_hz = {rate}
+
+[scenario.controller]
+sample_rate_hz = {rate}
+
+[scenario.twin]               # of no account here: gains and dead zone come from the edge
+policy = "paper"
+"""
