@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -157,8 +158,13 @@ def _spread(drive: Array) -> float:
     left = groups - groups.mean() - slope * (np.arange(count) - 0.5 * (count - 1))
     by_chance = math.sqrt(float(left @ left) / (count - 2) * 12.0 / (count * (count * count - 1.0)))
     drift = 0.5 * abs(slope) * (count - 1) if abs(slope) > _DRIFTS * by_chance else 0.0
-    few = float(student.ppf(0.975, count - 2)) / NORMAL_95
-    return math.hypot(few * math.sqrt(float(left @ left) / (count - 2) / count), drift)
+    return math.hypot(_few(count - 2) * math.sqrt(float(left @ left) / (count - 2) / count), drift)
+
+
+@lru_cache(maxsize=16)
+def _few(freedom: int) -> float:
+    """By how much more standard deviations 95 % take where few values made them."""
+    return float(student.ppf(0.975, freedom)) / NORMAL_95
 
 
 def _noise(position: Array, size: int) -> float:

@@ -68,7 +68,8 @@ def _of_outage(scale: Scale, whole: Ran) -> Iterator[Line]:
         yield Line("... worked off within", "drains", "not: more comes than can be worked on")
         return
     yield Line("... worked off within", "drains", f"{whole.drained:.0f} s")
-    rate = whole.behind / max(whole.drained, 1.0) + scale.rate
+    came = scale.rate * min(whole.drained, scale.after)
+    rate = (whole.behind + came) / max(whole.drained, 1.0)
     yield Line("... windows/s worked on meanwhile", f"> {scale.rate:g}", f"{rate:.0f}")
 
 

@@ -122,6 +122,7 @@ def _by_offset(reduction: Reduction, misfit: Misfit, weights: Array) -> float:
 def _coloured(weights: Array, noise: Array) -> float:
     """Variance of the weighted sum (n,) of noise with the spectrum of one series (n,) of it."""
     count = weights.size
-    gains, powers = (np.abs(np.fft.rfft(series, 2 * count)) ** 2 for series in (weights, noise))
+    size = 1 << (2 * count - 1).bit_length()  # at least twice as long, so that no end meets the other
+    gains, powers = (np.abs(np.fft.rfft(series, size)) ** 2 for series in (weights, noise))
     both = gains * powers
-    return (2.0 * float(both.sum()) - float(both[0] + both[-1])) / (2.0 * count * count)
+    return (2.0 * float(both.sum()) - float(both[0] + both[-1])) / (count * size)
