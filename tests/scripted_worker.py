@@ -18,7 +18,7 @@ def work(claim: Claim, now: float) -> Outcome:
     for message in messages:
         wanted = decode(message.body).reason
         if claim.attempts >= GIVEN_UP:
-            evidence.append(Evidence("redesign", message.id, b"\xc0", status="given up"))
+            evidence.append(Evidence("estimate", message.id, b"\xc0", status="failed: given up"))
             continue
         if wanted == "die":
             os._exit(9)

@@ -1,6 +1,7 @@
 """Enrolling servos and operators, reading the evidence chain, backup and restore: the commands."""
 
 import json
+import re
 import stat
 
 import httpx
@@ -113,6 +114,7 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
                 pass
         asked = run("audit", "ax-1", "--url", url, "--token", token, "--json")
         assert asked.exit_code == 0, asked.output
+        told = run("audit", "ax-1", "--url", url, "--token", token)
         refused = run("audit", "ax-1", "--url", url)
         assert refused.exit_code == 2
         assert "token" in refused.stderr
@@ -121,8 +123,13 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
     [link] = json.loads(read.stdout)
     assert (link["window"]["boot"], link["window"]["sequence"]) == ("b", 0)
     table = run("audit", "ax-1", "--config", twin)
-    assert "b/0" in table.stdout
-    assert "estimate" in table.stdout
+    assert told.stdout == table.stdout
+    assert "boot b\n" in table.stdout
+    line = r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d +0 .*(unidentifiable|mismatch|bound): .*\S$"
+    assert re.search(line, table.stdout, re.MULTILINE), table.stdout
+    gone = run("audit", "ax-1", "--url", url, "--token", token)
+    assert gone.exit_code == 2
+    assert gone.stderr.count("\n") == 1
     unknown = run("audit", "ax-9", "--config", twin)
     assert unknown.exit_code == 2
     assert "ax-9" in unknown.stderr

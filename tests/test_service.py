@@ -117,7 +117,7 @@ def test_who_may_do_what(serving):
         assert code(await put(client, window(), OTHER)) == (403, "bad_token")
         assert code(await put(client, window(), OPERATOR)) == (403, "bad_token")
         assert code(await put(client, window(), "x" * 5000)) == (401, "bad_token")
-        for reading in ("/v1/servos", "/v1/servos/ax-1", "/v1/servos/ax-1/audit", path):
+        for reading in ("/v1/servos", "/v1/servos/ax-1", "/v1/servos/ax-1/audit", "/v1/servos/ax-1/events", path):
             assert code(await client.get(reading)) == (401, "bad_token")
             assert code(await client.get(reading, headers=bearer(TOKEN))) == (403, "bad_token")
         assert code(await client.get("/v1/servos/ax-1/outgoing", headers=bearer(OTHER))) == (403, "bad_token")

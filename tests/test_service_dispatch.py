@@ -63,7 +63,7 @@ def statuses(system, servo="ax-1"):
 
 
 @pytest.mark.parametrize("fault", ["die", "hang", "raise"])
-def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_once(tmp_path, fault):
+def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_once(tmp_path, fault, caplog):
     async def body():
         async with working(twin_file(tmp_path), timeout=5.0 if fault == "hang" else 30.0) as (system, client):
             for sequence in range(6):
@@ -71,7 +71,7 @@ def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_
                 await put(client, sequence, servo="ax-2", token="token-of-ax-2")
             await until(lambda: done(system) and done(system, "ax-2"))
             found = statuses(system)
-            assert found.pop(3) == ["given up"]
+            assert found.pop(3) == ["failed: "]
             assert all(len(each) == 1 and each[0].startswith("at ") for each in found.values())
             assert len(found) == 5
             assert [len(each) for each in statuses(system, "ax-2").values()] == [1] * 6
@@ -80,6 +80,11 @@ def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_
             assert posted == 6
             assert system.pool.lost >= (2 if fault != "raise" else 0)
             assert system.pool.alive == 1
+            counted = (await client.get("/metrics")).text
+            assert 'servotwin_evidence_total{kind="failed"} 1\n' in counted
+            assert 'servotwin_evidence_total{kind="estimate"} 11\n' in counted
+            [alarm] = [record for record in caplog.records if record.message == "failed"]
+            assert (alarm.levelname, alarm.servo, alarm.window) == ("WARNING", "ax-1", "b/3")
 
     asyncio.run(body())
 

@@ -19,7 +19,19 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from service_system import MSGPACK, OPERATOR, TOKEN, bearer, place, process, trusting, twin_file, unpacked, window
+from service_system import (
+    MSGPACK,
+    OPERATOR,
+    TOKEN,
+    bearer,
+    hello,
+    place,
+    process,
+    trusting,
+    twin_file,
+    unpacked,
+    window,
+)
 
 from servotwin.messages import encode
 from servotwin.store.store import open_store
@@ -88,10 +100,14 @@ def test_a_window_goes_all_the_way_and_a_signal_ends_it_well(tmp_path):
             assert {found["kind"] for found in links[0]["found"]} >= {"estimate"}
             summary = client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()
             assert (summary["windows"], summary["waiting"], summary["serial"]) == (1, 0, 1)
+            assert client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json() == []
             assert client.get("/healthz").json()["ok"] is True
             metrics = client.get("/metrics").text
             assert 'servotwin_messages_total{kind="window",put="new"} 1' in metrics
             assert 'servotwin_outcomes_total{result="committed"} 1' in metrics
+            client.post("/v1/servos/ax-1/letters", content=hello(boot="next"), headers=bearer())
+            [greeting] = until(lambda: client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json())
+            assert (greeting["kind"], greeting["status"], greeting["body"]["boot"]) == ("hello", "next", "next")
             assert client.get("/openapi.json").json()["paths"]["/v1/servos/{servo}/windows/{boot}/{sequence}"]["put"]
         workers = children(running.pid)
         assert len(workers) == 1

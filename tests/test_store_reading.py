@@ -142,3 +142,23 @@ def test_opened_again_everything_is_there(new_address: NewAddress) -> None:
     store = open_store(address)
     assert bodies_of(claim(store)[0]) == [b"samples"]
     store.close()
+
+
+def test_what_belongs_to_no_window(store: Store) -> None:
+    """Starts, fallbacks, answers, and what the twin itself could not do; newest first, of one servo."""
+    store.put([letter(), window(), letter("b")])
+    first, second = claim(store, servo="a")[0], claim(store, servo="b")[0]
+    word, cut = first.messages[0].id, first.messages[1].id
+    found = (
+        Evidence("hello", word, b"h", version=0, status="boot"),
+        Evidence("receipt", word, b"r", version=1, status="applied"),
+        Evidence("estimate", cut, b"e", status="ok"),
+        Evidence("fallback", word, b"f", version=1, status="limit cycle"),
+        Evidence("estimate", 0, b"s", status="failed: no state"),
+    )
+    assert store.commit([outcome(first, *found), outcome(second, Evidence("hello", 0, b"other"))], 201.0) == [True] * 2
+    assert [(one.kind, one.status, one.made) for one in store.events("a")] == [
+        ("estimate", "failed: no state", 201.0), ("fallback", "limit cycle", 201.0), ("hello", "boot", 201.0)
+    ]  # fmt: skip
+    assert [one.kind for one in store.events("a", limit=1)] == ["estimate"]
+    assert store.events("a", since=202.0) == store.events("nobody") == []

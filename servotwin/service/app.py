@@ -55,6 +55,7 @@ def _routes(edge: EdgeApi, read: ReadApi, step: StepApi | None) -> list[tuple[st
         ("GET", "/v1/servos", read.servos, openapi.GET_SERVOS),
         ("GET", SERVO, read.servo, openapi.GET_SERVO),
         ("GET", SERVO + "/audit", read.audit, openapi.GET_AUDIT),
+        ("GET", SERVO + "/events", read.events, openapi.GET_EVENTS),
         ("GET", window, read.window, openapi.GET_WINDOW),
         ("GET", "/healthz", read.health, openapi.GET_HEALTH),
         ("GET", "/metrics", read.metrics, openapi.GET_METRICS),

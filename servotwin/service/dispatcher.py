@@ -30,6 +30,8 @@ SERVOS, MESSAGES = 16, 16
 """Servos in one job, and messages of each."""
 QUIET = ("glance", "trend", "disturbance", "excitation")
 """Evidence that comes with every window."""
+ALARMS = ("failed", "fallback", "withdrawn")
+"""What somebody should look at."""
 
 
 class Parts(NamedTuple):
@@ -233,15 +235,21 @@ class Dispatcher:
         metrics = self._parts.metrics
         for message in claim.messages:
             metrics.age.observe(max(0.0, now - message.received))
-        kinds = Counter(found.kind for found in outcome.evidence)
+        kinds = Counter(map(_what, outcome.evidence))
         for kind, number in kinds.items():
             metrics.evidence.add(kind, by=number)
         about = {"servo": claim.servo, "serial": claim.serial, "seconds": round(seconds, 6)}
         windows = {message.id: message.key for message in claim.messages if message.kind is Kind.WINDOW}
         for found in outcome.evidence:
-            level = logging.DEBUG if found.kind in QUIET else logging.INFO
+            what = _what(found)
+            level = logging.WARNING if what in ALARMS else logging.DEBUG if what in QUIET else logging.INFO
             if log.isEnabledFor(level):
-                log.log(level, found.kind, extra={**about, **_ids(found, windows)})
+                log.log(level, what, extra={**about, **_ids(found, windows)})
+
+
+def _what(found: Evidence) -> str:
+    """Its kind; where nothing could be made of a message, whatever its kind, that."""
+    return "failed" if found.status.startswith("failed") else found.kind
 
 
 def _ids(found: Evidence, windows: Mapping[int, str]) -> dict[str, object]:

@@ -94,6 +94,13 @@ GET_AUDIT = _operation(
     _argument("before", _WHOLE, "Only windows of a lower id: the next page."),
     errors=_ASKED,
 )  # fmt: skip
+GET_EVENTS = _operation(
+    "What belongs to no window: starts of the edge, fallbacks, answers, faults of the twin itself",
+    {200: ("Newest first.", JSON)},
+    SERVO, LIMIT,
+    _argument("since", {"type": "number", "minimum": 0}, "Only what was noted then or later, s since the epoch."),
+    errors=_ASKED,
+)  # fmt: skip
 GET_WINDOW = _operation("A window as it came", {200: ("window/1.", MSGPACK)}, SERVO, BOOT, SEQUENCE, errors=_ASKED)
 GET_HEALTH = _operation(
     "Whether all is well", {200: ("It is.", JSON), 503: ("It is not; the answer says what.", JSON)}, errors=""

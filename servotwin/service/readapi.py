@@ -76,6 +76,13 @@ class ReadApi:
         found = await self._ask(partial(self._store.audit, servo, since, _limit(request), None, before))
         return as_json([told(link) for link in found])
 
+    async def events(self, request: Request) -> Response:
+        """What belongs to no window of it, newest first."""
+        servo = self._named(request)
+        since = seconds(request, "since", 0.0)
+        found = await self._ask(partial(self._store.events, servo, since, _limit(request)))
+        return as_json([shown(each) for each in found])
+
     async def window(self, request: Request) -> Response:
         """A window as it came, and what it was compressed with."""
         servo = self._named(request)
@@ -126,17 +133,17 @@ def told(link: Link) -> dict[str, Any]:
     """A link of the evidence chain, what lies in it as MessagePack opened."""
     return {
         "window": link.window._asdict(),
-        "found": [_found(each) for each in link.found],
+        "found": [shown(each) for each in link.found],
         "steps": [
             {
-                "update": _found(step.update),
-                "answers": [_found(each) for each in step.answers],
+                "update": shown(step.update),
+                "answers": [shown(each) for each in step.answers],
                 "effect": None
                 if step.effect is None
                 else {
                     "window": step.effect.window._asdict(),
-                    "before": None if step.effect.before is None else _found(step.effect.before),
-                    "after": _found(step.effect.after),
+                    "before": None if step.effect.before is None else shown(step.effect.before),
+                    "after": shown(step.effect.after),
                 },
             }
             for step in link.steps
@@ -144,7 +151,8 @@ def told(link: Link) -> dict[str, Any]:
     }
 
 
-def _found(found: Found) -> dict[str, Any]:
+def shown(found: Found) -> dict[str, Any]:
+    """A piece of evidence, its body opened."""
     return {**found._asdict(), "body": _opened(found.body)}
 
 

@@ -12,6 +12,8 @@ from servotwin.store.schema import WINDOWS, evidence, messages
 
 ESTIMATES = ("glance", "estimate")
 ANSWERS = ("receipt", "fallback")
+EVENTS = ("hello", "fallback", "answer")
+"""What an edge says by itself, of no window."""
 
 
 def audit(
@@ -29,6 +31,15 @@ def audit(
     for row in rows:
         links.setdefault(row[0], []).append(row)
     return [_link(of) for of in links.values()]
+
+
+def events(connection: sa.Connection, servo: str, since: float, limit: int) -> list[Found]:
+    """What was not found of a window, newest first."""
+    columns = [evidence.c[name] for name in Found._fields]
+    apart = sa.or_(evidence.c.kind.in_(EVENTS), evidence.c.message.is_(None))
+    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.made >= since)
+    rows = connection.execute(query.order_by(evidence.c.id.desc()).limit(limit)).all()
+    return [found for row in rows if (found := _found(row, 0)) is not None]
 
 
 def _chosen(servo: str, since: float | None, limit: int, window: tuple[str, int] | None, before: int | None) -> sa.CTE:

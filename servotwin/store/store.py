@@ -12,7 +12,7 @@ from servotwin.store import audit, lending, outcomes, putting, reading
 from servotwin.store.address import address_of, shown
 from servotwin.store.engine import Engines, engines_of, lost_race, transaction
 from servotwin.store.errors import StoreUnavailable
-from servotwin.store.links import Held, Link
+from servotwin.store.links import Found, Held, Link
 from servotwin.store.migrate import migrate
 from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Posted, Put, Stored, Summary, Waiting
 
@@ -156,6 +156,16 @@ class Store:
             Only windows of a lower id than this: the next page after the last one's.
         """
         return self._read(lambda connection: audit.audit(connection, servo, since, limit, window, before))
+
+    def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[Found]:
+        """What belongs to no window, newest first: starts of the edge, fallbacks, answers, faults of the twin itself.
+
+        Parameters
+        ----------
+        since : float
+            s since the epoch: only what was noted then or later.
+        """
+        return self._read(lambda connection: audit.events(connection, servo, since, limit))
 
     def windows(self, servo: str, limit: int = 100, before: int | None = None) -> list[Held]:
         """Windows without bodies, newest first."""

@@ -1,0 +1,147 @@
+"""`servotwin audit`: the evidence chain of a servo, asked of a twin's store or of its service."""
+
+from __future__ import annotations
+
+import json as jsons
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.error import HTTPError, URLError
+from urllib.parse import quote
+from urllib.request import Request, urlopen
+
+import msgspec
+
+from servotwin.errors import InvalidInput
+from servotwin.service.audittext import Told, lines_of
+from servotwin.service.command import present_store
+from servotwin.service.readapi import MOST, shown, told
+from servotwin.service.secretfile import read_secret
+from servotwin.service.twinfile import service_of
+
+TIMEOUT_S = 30.0
+BEFORE_S = 60.0
+"""Of what belongs to no window, so much is shown from before the first one."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Whom to ask: the store of a twin's file, or, where there is a URL, a service.
+
+    Attributes
+    ----------
+    config : Path
+        The twin's file.
+    url : str or None
+        https://twin:8765
+    token, ca : Path or None
+        A file with an operator's token; certificates that the service's is checked against.
+    """
+
+    config: Path
+    url: str | None = None
+    token: Path | None = None
+    ca: Path | None = None
+
+
+class Story(NamedTuple):
+    """What is known of a servo, as the API tells it: as it stands, its windows, what belongs to none."""
+
+    servo: Told
+    links: list[Told]
+    events: list[Told]
+
+
+def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> None:
+    """Print a servo's newest windows and what followed from them.
+
+    Parameters
+    ----------
+    servo : str
+    source : Source
+    limit : int
+        Windows at most.
+    changes : bool
+        Leave out windows from which nothing followed.
+    json : bool
+        The links of the chain as JSON, as the API tells them.
+
+    Raises
+    ------
+    InvalidInput
+        Nothing is known of the servo, or whoever should know cannot be asked.
+    """
+    story = _of_store(servo, source.config, limit) if source.url is None else _of_service(servo, source, limit)
+    if not story.links:
+        raise InvalidInput(f"servo {servo!r}: no window of it was ever stored")
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(story.links)).decode())
+        return
+    for line in lines_of(*story, changes=changes):
+        print(line)
+
+
+def _of_store(servo: str, config: Path, limit: int) -> Story:
+    store = present_store(service_of(config))
+    try:
+        links, found = store.audit(servo, limit=limit), store.servo(servo)
+        if found is None or not links:
+            return Story({}, [], [])
+        events = store.events(servo, _since(links[-1].window.received), MOST)
+        return Story(found._asdict(), [told(link) for link in links], [shown(each) for each in events])
+    finally:
+        store.close()
+
+
+def _of_service(servo: str, source: Source, limit: int) -> Story:
+    ask, name = _asking(source), quote(servo, safe="")
+    links = ask(f"/v1/servos/{name}/audit?limit={limit}")
+    if not links:
+        return Story({}, [], [])
+    since = _since(links[-1]["window"]["received"])
+    return Story(ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MOST}"))
+
+
+def _since(oldest: float) -> float:
+    """A start comes before its first window."""
+    return max(0.0, oldest - BEFORE_S)
+
+
+def _asking(source: Source) -> Callable[[str], Any]:
+    """Asks the service for JSON; raises InvalidInput."""
+    url, headers = str(source.url).rstrip("/"), {}
+    if not url.startswith(("http://", "https://")):
+        raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
+    if source.token is not None:
+        headers["Authorization"] = f"Bearer {read_secret(source.token)}"
+    context = _context(source.ca) if url.startswith("https") else None
+
+    def ask(path: str) -> Any:
+        try:
+            with urlopen(Request(url + path, headers=headers), timeout=TIMEOUT_S, context=context) as answer:
+                return jsons.load(answer)
+        except HTTPError as error:
+            raise InvalidInput(f"{url}: {_refusal(error)}") from None
+        except (URLError, HTTPException, OSError, ValueError) as error:
+            raise InvalidInput(f"{url}: cannot be asked ({getattr(error, 'reason', error)})") from None
+
+    return ask
+
+
+def _context(ca: Path | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=None if ca is None else str(ca))
+    except (OSError, ssl.SSLError) as error:
+        raise InvalidInput(f"{ca}: holds no certificates that can be read ({error})") from None
+
+
+def _refusal(error: HTTPError) -> str:
+    """What a refusal says."""
+    with error:
+        try:
+            return str(jsons.load(error)["detail"])
+        except (ValueError, KeyError, TypeError):
+            return f"answers {error.code}"
