@@ -261,3 +261,23 @@ def test_bytes_that_are_no_request_do_no_harm(tmp_path):
                     pass
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
     assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        b"GET /healthz HTTP/1.1\r\nX: ",
+        b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer token-of-ax-1\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: ",
+    ],
+    ids=["header", "trailer"],
+)
+def test_one_endless_header_is_cut_before_it_fills_the_memory(tmp_path, begun):
+    piece, most = b"y" * 65536, 64 * 1024 * 1024
+    with process(twin_file(tmp_path)) as (_running, url):
+        address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
+        with socket.create_connection(address, timeout=10.0) as line, pytest.raises(ConnectionError):
+            line.sendall(begun)
+            for _ in range(most // len(piece)):
+                line.sendall(piece)
+        assert httpx.get(f"{url}/healthz").json()["ok"] is True

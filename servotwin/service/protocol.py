@@ -13,10 +13,11 @@ HEAD_BYTES, HEAD_S = 32 * 1024, 20.0
 class Protocol(HttpToolsProtocol):
     """One connection.
 
-    A head that is endless, or never comes to its end, would otherwise keep memory or a descriptor for ever.
+    A head that is endless, or never comes to its end, would otherwise keep memory or a descriptor for ever. So would a
+    single header or trailer: the parser keeps it to itself, and tells nothing of it, until it is whole.
     """
 
-    _head = 0
+    _head = _untold = 0
     _due: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -27,7 +28,18 @@ class Protocol(HttpToolsProtocol):
         self._head_is_whole()
         super().connection_lost(exc)
 
+    def data_received(self, data: bytes) -> None:
+        untold = self._untold = self._untold + len(data)
+        super().data_received(data)
+        if self._untold == untold > HEAD_BYTES:
+            self.transport.abort()
+
+    def on_body(self, body: bytes) -> None:
+        self._untold = 0
+        super().on_body(body)
+
     def on_message_begin(self) -> None:
+        self._untold = 0
         super().on_message_begin()
         self._head = 0
         self._expect_head()
@@ -41,10 +53,16 @@ class Protocol(HttpToolsProtocol):
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
+        self._untold = 0
         self._head_is_whole()
         super().on_headers_complete()
 
+    def on_message_complete(self) -> None:
+        self._untold = 0
+        super().on_message_complete()
+
     def _count(self, size: int) -> None:
+        self._untold = 0
         self._head += size
         if self._head > HEAD_BYTES:
             self.transport.abort()
