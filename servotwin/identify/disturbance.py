@@ -9,9 +9,11 @@ voltage up to its own, and is not told from a bias.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -84,7 +86,7 @@ def disturbance(window: Window, servo: Servo) -> Disturbance:
     if missing:
         return nothing_known(effort, f"the window has no {' and no '.join(missing)}")
     size = max(1, round(_BATCH_S * window.sample_rate))
-    rests = [rest for first, last in _constant(window, size) if (rest := _rest(window, servo, size, first, last))]
+    rests = list(_rests(window, servo, size, _constant(window, size)))
     if not rests:
         return nothing_known(effort, _no_rest(window, size))
     bias, std, first, last = _longest_good(rests)
@@ -101,8 +103,8 @@ def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
         return math.nan, math.inf
     size = max(1, round(_BATCH_S * window.sample_rate))
     ends = {last: first for first, last in reversed(_constant(window, size))}
-    rests = (_rest(window, servo, size, first, last) for last, first in reversed(ends.items()))
-    bias, std, _, _ = next((rest for rest in rests if rest is not None), (math.nan, math.inf, 0, 0))
+    shortest = [(first, last) for last, first in reversed(ends.items())]
+    bias, std, _, _ = next(_rests(window, servo, size, shortest), (math.nan, math.inf, 0, 0))
     return bias, std
 
 
@@ -121,24 +123,52 @@ def _constant(window: Window, size: int) -> list[tuple[int, int]]:
     return [(int(b) - k * size, int(b)) for a, b in pairs for k in range(shortest, (b - a) // size + 1)]
 
 
-def _rest(window: Window, servo: Servo, size: int, first: int, last: int) -> tuple[float, float, int, int] | None:
-    """(bias, std, first, last) of a stretch at rest; None where something moves."""
+def _rests(
+    window: Window, servo: Servo, size: int, stretches: Sequence[tuple[int, int]]
+) -> Iterator[tuple[float, float, int, int]]:
+    """(bias, std, first, last) of those stretches in which nothing moves."""
+    begins: dict[int, int] = {}
+    for first, last in stretches:
+        begins[last] = min(first, begins.get(last, first))
+    batches = {last: _batches(window, size, first, last) for last, first in begins.items()}
+    for first, last in stretches:
+        rest = _rest(window, servo, size, (last - first) // size, batches[last])
+        if rest is not None:
+            yield *rest, first, last
+
+
+class _Batches(NamedTuple):
+    """Means of batches that end with a constant reference, and the motor's angle at the ends of each (rad)."""
+
+    angle: Array
+    position: Array
+    voltage: Array
+    ends: Array
+
+
+def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
     assert window.voltage is not None
     assert window.theta_m is not None
-    angle, position = window.theta_m[first:last], window.position[first:last]
+    angle = window.theta_m[first:last]
+    position, voltage = _means(window.position[first:last], size), _means(window.voltage[first:last], size)
+    ends = np.append(angle[::size], angle[-1] + (angle[-1] - angle[-2]))
+    return _Batches(_means(angle, size), position, voltage, ends)
+
+
+def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
+    """(bias, std) of the last `count` batches; None where something moves in them."""
     per_sample = servo.k_B * window.sample_rate
+    angle, position = batches.angle[-count:], batches.position[-count:]
     if not (_still(angle, size, per_sample) and _still(position, size, per_sample / servo.p)):
         return None
-    ends = np.append(angle[::size], angle[-1] + (angle[-1] - angle[-2]))
-    speed = per_sample * np.diff(ends) / size
-    drive = _means(window.voltage[first:last], size) - speed
+    speed = per_sample * np.diff(batches.ends[-count - 1 :]) / size
+    drive = batches.voltage[-count:] - speed
     wrong = _BACK_EMF_SHARE * abs(float(np.mean(speed)))
-    return -float(np.mean(drive)), math.hypot(_spread(drive), wrong), first, last
+    return -float(np.mean(drive)), math.hypot(_spread(drive), wrong)
 
 
-def _still(samples: Array, size: int, volts: float) -> bool:
+def _still(means: Array, size: int, volts: float) -> bool:
     """Whether a signal rests but for noise; `volts` is the back EMF (V) of one unit per sample."""
-    means = _means(samples, size)
     if volts * float(np.max(np.abs(np.diff(means)))) / size <= _CREEP:
         return True
     return means.size >= _FEWEST and _roughness(means) >= _SMOOTH
