@@ -12,15 +12,15 @@ from servotwin.drives.simulated.control import ControlServer
 from servotwin.drives.simulated.diary import Diary
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
-from servotwin.drives.simulated.server import Server, Tend, address_in_use, listening, run, start_pace, untended
+from servotwin.drives.simulated.server import Ending, Server, Tend, address_in_use, listening, run, start_pace, untended
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.simulated.supervise import SuperviseServer
 from servotwin.errors import InvalidInput
 from servotwin.machine import compile_ahead
 
 
-def main(path: str) -> None:
-    """Simulate the machine of a TOML file until its run is over.
+def main(path: str, ending: Ending) -> None:
+    """Simulate the machine of a TOML file until its run is over, or `ending` is called.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def main(path: str) -> None:
         server = _server(plant, pace, settings.slack, untended if diary is None else diary.look)
         print("ready", address_in_use(listener, settings.address), flush=True)
         try:
-            run(server, listener, settings, os.urandom(8))
+            run(server, listener, settings, os.urandom(8), ending)
         finally:
             if diary is not None:
                 diary.write(plant.index)
@@ -48,17 +48,16 @@ def _server(plant: ControlledPlant | SupervisedPlant, pace: Pace | None, slack: 
     return SuperviseServer(plant, pace, tend)
 
 
-def _ended(*_: object) -> None:
-    sys.exit(0)
-
-
 if __name__ == "__main__":
+    asked = Ending()
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _ended)
+        signal.signal(number, asked)
     try:
         if len(sys.argv) != 2:
             raise InvalidInput("give one file: python -m servotwin.drives.simulated PLANT.toml")
-        main(sys.argv[1])
+        main(sys.argv[1], asked)
     except InvalidInput as error:
         print(error, file=sys.stderr)
         sys.exit(2)
+    finally:
+        asked.close()

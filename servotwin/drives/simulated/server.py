@@ -6,7 +6,7 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -29,6 +29,52 @@ def untended(_sample: int, _now: float) -> None:
     """Nothing has to be done between samples."""
 
 
+class Ending:
+    """Lets a machine end between two samples.
+
+    As a signal's handler it only closes what is waited for: an exception raised in a handler may come out in the
+    middle of a call of compiled code, which does not survive it (a machine at 20 kHz fell every other time).
+
+    Attributes
+    ----------
+    wanted : bool
+    woken : socket
+        Becomes readable.
+    """
+
+    def __init__(self) -> None:
+        self.wanted = False
+        self._wake, self.woken = socket.socketpair()
+        self._connection: socket.socket | None = None
+
+    def __call__(self, *_: object) -> None:
+        self.wanted = True
+        with suppress(OSError):
+            self._wake.send(b"e")
+        self._hang_up()
+
+    def close(self) -> None:
+        """Let go of its sockets."""
+        self._wake.close()
+        self.woken.close()
+
+    @contextmanager
+    def hanging_up(self, connection: socket.socket) -> Iterator[None]:
+        """A client's connection ends with the machine."""
+        self._connection = connection
+        try:
+            if self.wanted:
+                self._hang_up()
+            yield
+        finally:
+            self._connection = None
+
+    def _hang_up(self) -> None:
+        if self._connection is not None:
+            with suppress(OSError):
+                self._connection.shutdown(socket.SHUT_RDWR)
+
+
 class Server(Protocol):
     """One role of a machine."""
 
@@ -43,16 +89,27 @@ class Server(Protocol):
         """Whether the run has ended."""
 
 
-def run(server: Server, listener: socket.socket, settings: MachineSettings, name: bytes) -> None:
+def run(
+    server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, ending: Ending | None = None
+) -> None:
     """Serve one client after the other, the plant running on between them, until a client knows that the run is over.
 
     Parameters
     ----------
     name : bytes
         8 bytes that name this run of the machine.
+    ending : Ending, optional
+        Ends it before.
     """
-    while True:
-        with _client(server, listener) as connection:
+    with nullcontext(ending) if ending is not None else closing(Ending()) as asked:
+        _serve(server, listener, settings, name, asked)
+
+
+def _serve(server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, ending: Ending) -> None:
+    while not ending.wanted:
+        with _client(server, listener, ending) as connection:
+            if connection is None:
+                return
             try:
                 _greet(connection, settings, name)
                 server.serve(connection)
@@ -103,15 +160,17 @@ def start_pace(settings: MachineSettings) -> Pace | None:
 
 
 @contextmanager
-def _client(server: Server, listener: socket.socket) -> Iterator[socket.socket]:
-    """The next client; the plant runs on until it comes."""
-    while True:
+def _client(server: Server, listener: socket.socket, ending: Ending) -> Iterator[socket.socket | None]:
+    """The next client, the plant running on until it comes; None: it is time to end."""
+    came: list[socket.socket] = []
+    while not came:
         again = server.run_alone()
         waited = None if again is None else max(0.0, again - time.monotonic())
-        if select.select([listener], [], [], waited)[0]:
-            break
-    connection = listener.accept()[0]
-    with connection:
+        came = select.select([listener, ending.woken], [], [], waited)[0]
+    if ending.wanted:
+        yield None
+        return
+    with listener.accept()[0] as connection, ending.hanging_up(connection):
         wire.at_once(connection)
         yield connection
 
