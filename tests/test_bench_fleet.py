@@ -251,8 +251,8 @@ def test_a_small_fleet_with_real_processes(tmp_path: Path, monkeypatch) -> None:
     sent = round(QUICK.rate * (QUICK.steady + QUICK.outage + QUICK.after))
     assert whole.report.windows == sent
     assert whole.made["glance"] == sent
-    # Every window with news is estimated, and hardly another; none of the others was due.
-    assert whole.report.news <= whole.made.get("estimate", 0) <= whole.report.news + 2
+    # Every window with news is estimated, and of the others those that are due.
+    assert whole.report.news <= whole.made.get("estimate", 0) <= whole.report.news + 0.1 * sent
     assert whole.steady.undone == 0
     assert not math.isnan(whole.drained)
     assert {role for role in (EDGES, TWIN, WORKERS) if whole.watch.memory(role)[2] > 0} == {EDGES, TWIN, WORKERS}

@@ -175,14 +175,16 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet,
     assert not outcome.enqueue
 
 
-def test_a_failed_proof_of_what_is_no_longer_in_force_withdraws_nothing(fleet: Fleet, monkeypatch) -> None:
+def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: Fleet, monkeypatch) -> None:
     queue, _, asked = begun(fleet)
     question = decode_question(asked.body)
     law = question.setting.controller.replace(Kp=2.0 * question.setting.controller.Kp)
     other = msgspec.structs.replace(question, setting=replace(question.setting, controller=law))
     failing(monkeypatch)
     before = queue.state
-    assert kinds(queue.give(asked._replace(body=msgspec.msgpack.encode(other)))) == ["proof"]
+    outcome = queue.give(asked._replace(body=msgspec.msgpack.encode(other)))
+    assert kinds(outcome) == ["proof"]
+    assert outcome.evidence[0].status == "not proved: another setting is in force by now"
     assert queue.state == before
 
 

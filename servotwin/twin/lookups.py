@@ -92,12 +92,15 @@ class Lookups:
         ----------
         question : Question
         running : sequence of InForce
-            What is in force, or on its way: another setting needs no withdrawal.
+            What is in force, or on its way: another setting is neither proved any more nor withdrawn.
         store : Store
         """
+        if not any(one.has(question.setting) for one in running):
+            store.add_proof(question, Refusal("not proved: another setting is in force by now"))
+            return ""
         found = self.policy.policy.confirm(question.region, question.setting)
         store.add_proof(question, found)
-        if not isinstance(found, Refusal) or not any(one.has(question.setting) for one in running):
+        if not isinstance(found, Refusal):
             return ""
         why = f"the proof of version {question.version} failed: {found.reason}"
         self.memory = Memory(why, misled=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from servotwin.store.store import Store, open_store
 from servotwin.tomltable import parse_toml
 from servotwin.twin.fleet import Fleet, models_of
 from servotwin.twin.policies import certified
+from servotwin.twin.state import TwinState
 
 STORE, TABLE = "fleet.db", "axis.table"
 GRID = Grid(math.radians(4.0), (1e-3, 1e-2), (0.0,))
@@ -123,23 +125,24 @@ def commission(folder: Path, fleet: Fleet, scale: Scale, places: Sequence[Place]
     store = open_store(f"sqlite:///{folder / STORE}")
     try:
         for first in range(0, scale.servos, _TOGETHER):
-            _introduce(store, range(first, min(first + _TOGETHER, scale.servos)), known)
+            _introduce(store, range(first, min(first + _TOGETHER, scale.servos)), scale, known)
     finally:
         store.close()
     return version
 
 
-def _introduce(store: Store, numbers: range, known: Sequence[Known]) -> None:
+def _introduce(store: Store, numbers: range, scale: Scale, known: Sequence[Known]) -> None:
     """Some servos say hello, and their twins know them."""
     now = time.time()
     states = {f"ax-{n:05d}": known[n % len(known)].state for n in numbers}
+    ages = _ages(scale, numbers)
     store.put([_hello(servo, now) for servo in states])
     claims = store.claim("bench", len(states), 60.0, now)
     made = [
         Outcome(
             claim.servo,
             claim.serial,
-            msgspec.msgpack.encode(msgspec.structs.replace(states[claim.servo], servo=claim.servo)),
+            _named(states[claim.servo], claim.servo, ages[claim.servo]),
             None,
             tuple(message.id for message in claim.messages),
         )
@@ -147,6 +150,20 @@ def _introduce(store: Store, numbers: range, known: Sequence[Known]) -> None:
     ]
     if not all(store.commit(made, now)) or len(made) < len(states):
         raise RuntimeError("servos could not be commissioned")
+
+
+def _ages(scale: Scale, numbers: range) -> dict[str, int]:
+    """How many windows each has been glanced at since its last estimate, as if the bench had run for hours."""
+    chance, since = random.Random(numbers.start), range(scale.every - 1)
+    likely = [(1.0 - scale.news) ** count for count in since]
+    return {f"ax-{n:05d}": chance.choices(since, likely)[0] for n in numbers}
+
+
+def _named(state: TwinState, servo: str, glances: int) -> bytes:
+    """A twin's state as another servo's."""
+    assert state.watch is not None
+    watch = msgspec.structs.replace(state.watch, glances=glances)
+    return msgspec.msgpack.encode(msgspec.structs.replace(state, servo=servo, watch=watch))
 
 
 def _hello(servo: str, now: float) -> Incoming:
