@@ -354,3 +354,19 @@ def test_health_says_what_is_not_well(serving):
         assert (await client.get("/healthz")).status_code == 503
 
     serving(body)
+
+
+def test_a_store_that_takes_no_writes_is_not_well_though_it_can_be_read(serving):
+    async def body(system, client):
+        write, system.store.write = system.store.write, full
+        assert code(await put(client, window(0))) == (503, "unavailable")
+        assert (await client.get("/healthz")).json()["store"] is False
+        assert "servotwin_store_ok 0\n" in (await client.get("/metrics")).text
+        system.store.write = write
+        assert (await put(client, window(0))).status_code == 201
+        assert (await client.get("/healthz")).json()["store"] is True
+
+    def full(*_args):
+        raise StoreUnavailable("store: not available now (database or disk is full)")
+
+    serving(body)

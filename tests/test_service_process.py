@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import httpx
@@ -34,6 +35,10 @@ from service_system import (
 )
 
 from servotwin.messages import encode
+from servotwin.service import command as service
+from servotwin.service.pool import Pool
+from servotwin.service.system import System
+from servotwin.service.twinfile import read_twin
 from servotwin.store.store import open_store
 
 PATIENCE = 60.0
@@ -273,11 +278,37 @@ def test_bytes_that_are_no_request_do_no_harm(tmp_path):
     ids=["header", "trailer"],
 )
 def test_one_endless_header_is_cut_before_it_fills_the_memory(tmp_path, begun):
-    piece, most = b"y" * 65536, 64 * 1024 * 1024
     with process(twin_file(tmp_path)) as (_running, url):
         address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
-        with socket.create_connection(address, timeout=10.0) as line, pytest.raises(ConnectionError):
+        with socket.create_connection(address, timeout=10.0) as line:
             line.sendall(begun)
-            for _ in range(most // len(piece)):
-                line.sendall(piece)
+            with pytest.raises(ConnectionError):
+                line.sendall(b"y" * 64 * 1024 * 1024)
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
+
+
+def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_path):
+    path = twin_file(tmp_path)
+    with process(path) as (running, url):
+        second = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
+        found = subprocess.run(second, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        assert found.returncode == 2
+        assert "another twin works on it" in found.stderr
+        assert httpx.get(f"{url}/healthz").json()["ok"] is True
+        running.kill()
+        running.wait(timeout=PATIENCE)
+        with process(path) as (_next, again):
+            assert httpx.get(f"{again}/healthz").json()["ok"] is True
+
+
+def test_a_service_that_cannot_begin_does_not_end_well(tmp_path, monkeypatch):
+    twin = read_twin(twin_file(tmp_path))
+    pool = Pool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
+    monkeypatch.setattr(service, "System", lambda twin, store: System(twin, store, pool=pool))
+    with (
+        closing(open_store(twin.service.store)) as store,
+        service.listening(twin.service) as listener,
+        pytest.raises(SystemExit) as ended,
+    ):
+        service.serve(twin, store, listener)
+    assert ended.value.code not in (None, 0)

@@ -7,8 +7,9 @@ import logging
 import resource
 import signal
 import socket
+import ssl
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -16,6 +17,7 @@ import uvicorn
 
 from servotwin.errors import InvalidInput
 from servotwin.service import logs
+from servotwin.service.alone import alone
 from servotwin.service.config import ServiceConfig
 from servotwin.service.protocol import Protocol
 from servotwin.service.system import System
@@ -27,6 +29,8 @@ log = logging.getLogger(__name__)
 BACKLOG = 2048
 GRACE_S = 20
 """s that requests may take to their end when the service is told to stop."""
+CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
+"""Of TLS 1.2; those of 1.3 are all good. Older uvicorns would name some without any encryption."""
 IDLE_S = 75
 """s after which a connection that says nothing is closed."""
 
@@ -37,20 +41,21 @@ def run(path: Path, port: int | None = None) -> None:
     Raises
     ------
     InvalidInput
-        The file, the tokens, the store or the address are not usable.
+        The file, the tokens, the store or the address are not usable, or another process has the store.
     """
     twin = read_twin(path)
+    check_tls(twin.service)
     logs.configure(twin.service.log_level)
-    store = store_of(twin.service)
-    try:
-        with listening(twin.service, port) as listener:
-            serve(twin, store, listener)
-    finally:
-        store.close()
+    with (
+        alone(twin.service.store),
+        closing(store_of(twin.service)) as store,
+        listening(twin.service, port) as listener,
+    ):
+        serve(twin, store, listener)
 
 
 def serve(twin: TwinFile, store: Store, listener: socket.socket) -> None:
-    """Serve on a socket that listens."""
+    """Serve on a socket that listens; SystemExit where it cannot begin."""
     if twin.service.tokens is None:
         log.warning("no tokens: whoever reaches this machine itself may do everything")
     _raise_file_limit()
@@ -102,6 +107,26 @@ def listening(config: ServiceConfig, port: int | None = None) -> socket.socket:
         raise InvalidInput(f"bind = {where[0]!r}, port = {where[1]}: cannot listen there ({error.strerror})") from None
 
 
+def check_tls(config: ServiceConfig) -> None:
+    """Refuse a certificate and a key that are none, or do not belong together, before anything listens.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    certificate, key = config.tls_certificate, config.tls_key
+    if certificate is None or key is None:
+        return
+    try:
+        # A password is not asked for: nobody sits before a service.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except (OSError, ValueError) as error:
+        raise InvalidInput(
+            f"tls_certificate {certificate}, tls_key {key}: are no certificate with its own key, in PEM and without a "
+            f"password ({getattr(error, 'reason', None) or error})"
+        ) from None
+
+
 def config_of(config: ServiceConfig, system: System) -> uvicorn.Config:
     """How uvicorn serves it."""
     return uvicorn.Config(
@@ -119,6 +144,7 @@ def config_of(config: ServiceConfig, system: System) -> uvicorn.Config:
         timeout_graceful_shutdown=GRACE_S,
         ssl_certfile=config.tls_certificate,
         ssl_keyfile=config.tls_key,
+        ssl_ciphers=CIPHERS,
     )
 
 

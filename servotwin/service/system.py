@@ -5,15 +5,18 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import re
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from concurrent.futures import Future
 from contextlib import asynccontextmanager, suppress
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from fastapi import FastAPI
 
 from servotwin.errors import InvalidInput
+from servotwin.messages import NAME_PATTERN
 from servotwin.service import brokerdesk
 from servotwin.service.app import make_app, refusal
 from servotwin.service.auth import Authority, TokenFile
@@ -42,8 +45,12 @@ from servotwin.store.store import Store
 from servotwin.twin.fleet import Fleet
 
 log = logging.getLogger(__name__)
+_What = TypeVar("_What")
+_Result = TypeVar("_Result")
 
 REFRESH_S, RETENTION_S, DAY = 1.0, 600.0, 86400.0
+DOUBT_S = 60.0
+"""After a write that failed, so long the store is not called well unless another one succeeds."""
 ALONE = "twin"
 """Borrows everything where one process has the store to itself: after a crash its loans are its own."""
 
@@ -75,6 +82,7 @@ class System:
         self._parts = Parts(store, self.shelf, self.pool, self._commit, self.outgoing.post, self.metrics, self.clocks)
         self.dispatcher = Dispatcher(self._parts, self._owner, Allowance(self.config.proofs_per_minute))
         self._tasks: list[asyncio.Task[None]] = []
+        self._failed_at = -math.inf
         self._buckets = Buckets(self.config.rate_limit_per_s, self.config.rate_burst, self.clocks.monotonic)
         self._bridge = self._over_mqtt()
         self._watch()
@@ -123,7 +131,7 @@ class System:
 
     def health(self) -> dict[str, Any]:
         """What is well."""
-        store, workers = not self.shelf.fault, self.pool.alive
+        store, workers = self._storing(), self.pool.alive
         working = all(not task.done() for task in self._tasks)
         return {"ok": store and workers > 0 and working, "store": store, "workers": workers, "dispatching": working}
 
@@ -141,16 +149,32 @@ class System:
         return Bridge(self.config.mqtt.broker, brokerdesk.Desk(parts), self.config.mqtt.group)
 
     async def _put(self, incoming: Incoming) -> Put:
-        return await self._landing(self.commits.put(incoming))
+        return await self._written(self.commits.put, incoming)
 
     async def _commit(self, outcome: Outcome) -> bool:
-        return await self._landing(self.commits.commit(outcome))
+        return await self._written(self.commits.commit, outcome)
+
+    async def _written(self, write: Callable[[_What], Future[_Result]], what: _What) -> _Result:
+        """What a write gives; that it failed is remembered until one succeeds again."""
+        try:
+            found = await self._landing(write(what))
+        except StoreUnavailable:
+            self._failed_at = self.clocks.monotonic()
+            raise
+        self._failed_at = -math.inf
+        return found
+
+    def _storing(self) -> bool:
+        """Whether the last call and the last write succeeded, or it failed long ago: nobody may have tried since."""
+        return not self.shelf.fault and self.clocks.monotonic() - self._failed_at >= DOUBT_S
 
     async def _posted(self, servo: str, serial: int) -> Sequence[Posted]:
         return await self.shelf.ask(lambda: self.store.outgoing(servo, serial))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        self._tasks.append(asyncio.create_task(work))
+        task = asyncio.create_task(work)
+        task.add_done_callback(_told)
+        self._tasks.append(task)
 
     async def _refresh(self) -> None:
         """Read the tokens again when their file is another one."""
@@ -189,26 +213,34 @@ class System:
         bridge = self._bridge
         if bridge is not None:
             watch("servotwin_broker_connected", "Whether the MQTT broker is there.", lambda: bridge.connected)
-        watch("servotwin_store_ok", "Whether the store could do what it was asked last.", lambda: not self.shelf.fault)
+        watch(
+            "servotwin_store_ok", "Whether the store could do what it was asked last.", lambda: self.health()["store"]
+        )
 
     @asynccontextmanager
     async def _lifespan(self, _app: FastAPI) -> AsyncIterator[None]:
-        await self.begin()
         try:
+            await self.begin()
             yield
         finally:
             await self.end()
 
 
+def _told(task: asyncio.Task[None]) -> None:
+    """Nobody waits for such a task before the end: what ended it is told at once."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        log.error("a task of the service ended", exc_info=error)
+
+
 def knowing(fleet: Fleet) -> Callable[[str], bool]:
-    """Whether a fleet has a servo of that name."""
+    """Whether a fleet has a servo of that name; what is no name at all, however long, is not remembered."""
 
     @lru_cache(maxsize=REMEMBERED)
-    def knows(servo: str) -> bool:
+    def has(servo: str) -> bool:
         try:
             fleet.model_of(servo)
         except InvalidInput:
             return False
         return True
 
-    return knows
+    return lambda servo: re.match(NAME_PATTERN, servo) is not None and has(servo)
