@@ -140,6 +140,27 @@ FAULTS = st.lists(
 )
 
 
+def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_without_a_pause(
+    courier: Courier, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outbox.put(window(0))
+    outbox.put(window(1))
+    parcel, tries = outbox.parcel, 0
+
+    def read(key: tuple[str, int]) -> Parcel:
+        nonlocal tries
+        tries += key == ("b0", 0)
+        if key == ("b0", 0) and tries < 3:
+            raise KeyError(key)
+        return parcel(key)
+
+    monkeypatch.setattr(outbox, "parcel", read)
+    assert courier.step(0.0).window is None
+    assert courier.step(0.0).window == ("b0", 1)
+    assert [courier.step(0.0).wait_s, courier.step(1.0).wait_s, courier.step(1.0).wait_s] == [1.0, 0.0, 2.0]
+    assert courier.step(3.0).window == ("b0", 0)
+
+
 @settings(max_examples=40, deadline=None)
 @given(FAULTS)
 def test_every_window_is_delivered_once_or_counted(

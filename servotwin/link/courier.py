@@ -36,7 +36,7 @@ class Sent:
 
 @dataclass(slots=True)
 class Held:
-    """A message that the twin may take later."""
+    """A message that may be sent later."""
 
     due: float
     pauses: Backoff
@@ -81,7 +81,8 @@ class Courier:
             return Sent(min((held.due for held in self._held.values()), default=inf) - now)
         try:
             self.transport.deliver(self._parcel(item))
-        except KeyError:  # dropped meanwhile, or its file has broken
+        except KeyError:  # dropped meanwhile, or its file cannot be read just now
+            self._hold(item, now, 0.0)
             return Sent()
         except Unreachable as error:
             return self._pause(now, "unreachable", str(error), 0.0)
@@ -121,10 +122,14 @@ class Courier:
                 self.outbox.drop(item, error.reason.value)
             return Sent()
         if error.reason is Refusal.FUTURE:
-            held = self._held.setdefault(item, Held(now, self._fresh()))
-            held.due = now + max(error.after_s, held.pauses.failed(self.chance()))
+            self._hold(item, now, error.after_s)
             return Sent()
         return self._pause(now, "refused", str(error), error.after_s)
+
+    def _hold(self, item: Item, now: float, after_s: float) -> None:
+        """Let others go first for a while."""
+        held = self._held.setdefault(item, Held(now, self._fresh()))
+        held.due = now + max(after_s, held.pauses.failed(self.chance()))
 
     def _pause(self, now: float, what: str, trouble: str, after_s: float) -> Sent:
         self.counts[what] += 1
