@@ -195,6 +195,17 @@ def test_without_a_twin_it_controls_and_keeps(gateway: Gateway, machine: StubMac
     assert "up" not in gateway.status()
 
 
+def test_a_terminal_that_is_closed_leaves_the_safe_voltage(gateway: Gateway, machine: StubMachine) -> None:
+    gateway.start()
+    until(lambda: gateway.status().get("samples", 0) > 0)
+    assert gateway.process is not None
+    os.killpg(gateway.process.pid, signal.SIGHUP)
+    assert gateway.process.wait(60) == 0
+    assert machine.voltages[-1] == 0.0
+    assert gateway.outbox() == []
+    assert "link process gone" not in gateway.log()
+
+
 def update(window: Window, version: int) -> Update:
     known = (None, None, (None, None))
     identity, values = (window.boot, window.sequence), (1e-5 * version, window.start + 1000.0)

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from servotwin.edge.cut import Cut
 from servotwin.edge.novelty import Novelty
-from servotwin.edge.packing import pack
+from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Sender
@@ -83,7 +83,7 @@ class PackingOutlet:
 
     def offer(self, cut: Cut, now: float) -> None:
         """Judge, pack and keep; one that holds a sample which is not finite is counted only."""
-        wanted = cut if self.judge is None else self.judge(cut)
+        wanted = cut if self.judge is None or not is_finite(cut) else self.judge(cut)
         if wanted is None:
             self._lost[WITHHELD] += 1
             return

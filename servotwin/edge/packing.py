@@ -6,6 +6,7 @@ from itertools import chain, pairwise
 from servotwin.edge.cut import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.messages import Channel, Window, checksum, pack_channel, pack_finely
+from servotwin.messages.checks import all_finite
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
 """What is recorded, in this order, with units."""
@@ -37,6 +38,11 @@ def pack(cut: Cut, settings: AgentSettings) -> Window:
         reason=cut.reason,
         crc=checksum(channels),
     )
+
+
+def is_finite(cut: Cut) -> bool:
+    """Whether no sample is missing: only then can anything be said of it, or it be sent."""
+    return all(map(all_finite, cut.signals.values()))
 
 
 def _packed(name: str, values: "array[float]", fine_angle: bool) -> tuple[Channel, ...]:

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import NamedTuple
 
 import msgspec
 
+from servotwin.edge.cut import Cut
 from servotwin.edge.novelty import Novelty, dumps, loads
 from servotwin.edge.outlet import NOT_FINITE, WITHHELD
-from servotwin.edge.packing import pack
+from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.store import FileStore, restored
 from servotwin.errors import InvalidInput
 from servotwin.gateway.config import EdgeConfig
 from servotwin.gateway.frames import CutFrame, HandledFrame, LetterFrame, SaveFrame, TicksFrame, ToLink
 from servotwin.gateway.twinlink import CURSOR
-from servotwin.link.sqliteoutbox import SqliteOutbox
+from servotwin.link.outbox import Key
+from servotwin.link.sqliteoutbox import MOST_OWED, SqliteOutbox
 from servotwin.messages import InvalidMessage
 
 _LAST, _NOVELTY = "last cut", "novelty"
+UNJUDGED = "window not judged"
+
+
+class Owed(NamedTuple):
+    """What the disk does not have yet: a window's key (None: a letter's), and bytes as they came."""
+
+    window: Key | None
+    size: int
 
 
 class Keeper:
@@ -35,6 +46,7 @@ class Keeper:
         self._unsaved: SaveFrame | None = None
         self._novelty: Novelty | None = None
         self._boot = ""
+        self._owed: dict[int, Owed] = {}
         self.faults: Counter[str] = Counter()
 
     def take(self, frame: ToLink) -> list[int]:
@@ -42,10 +54,12 @@ class Keeper:
         if isinstance(frame, CutFrame):
             with self._outbox.together():
                 self._cut(frame)
-            return [frame.serial]
+            self._owed[frame.serial] = Owed((frame.boot, frame.sequence), sum(map(len, frame.signals.values())))
+            return self._written()
         if isinstance(frame, LetterFrame):
             self._outbox.post(frame.body)
-            return [frame.serial]
+            self._owed[frame.serial] = Owed(None, len(frame.body))
+            return self._written()
         if isinstance(frame, SaveFrame):
             before, self._unsaved = self._unsaved, frame
             return ([] if before is None else [before.serial]) + self._save()
@@ -57,7 +71,19 @@ class Keeper:
     def tend(self) -> list[int]:
         """Try again what could not be done."""
         self._outbox.settle()
-        return self._save()
+        return self._written() + self._save()
+
+    def _written(self) -> list[int]:
+        """What the control process need not keep any more: it is on the disk, or gone, or too much to wait with."""
+        safe, waiting = self._outbox.safe, set(self._outbox.pending())
+        over, done = sum(owed.size for owed in self._owed.values()) - MOST_OWED, []
+        for serial, owed in self._owed.items():
+            if safe or over > 0 or (owed.window is not None and owed.window not in waiting):
+                done.append(serial)
+                over -= owed.size
+        for serial in done:
+            del self._owed[serial]
+        return done
 
     def _cut(self, frame: CutFrame) -> None:
         """Once: a frame that comes again, since nobody said that it was taken, is known by its place in its boot."""
@@ -67,10 +93,7 @@ class Keeper:
         if boot == frame.boot and frame.sequence <= sequence:
             return
         self._outbox.note(_LAST, here)
-        judge = self._judge(frame.boot)
-        wanted = frame.cut if judge is None else judge(frame.cut)
-        if judge is not None:
-            self._outbox.note(_NOVELTY, dumps(judge.state))
+        wanted = self._wanted(frame.cut, self._judge(frame.boot))
         if wanted is None:
             self._outbox.lost(WITHHELD)
             return
@@ -80,6 +103,18 @@ class Keeper:
             self._outbox.lost(NOT_FINITE)
         else:
             self._outbox.put(window)
+
+    def _wanted(self, cut: Cut, judge: Novelty | None) -> Cut | None:
+        """The window, if it is worth sending; one that cannot be judged is."""
+        if judge is None or not is_finite(cut):
+            return cut
+        try:
+            found = judge(cut)
+        except Exception:
+            self.faults[UNJUDGED] += 1
+            return cut
+        self._outbox.note(_NOVELTY, dumps(judge.state))
+        return found
 
     def _judge(self, boot: str) -> Novelty | None:
         """Of this boot, with what was known before."""

@@ -14,14 +14,16 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from threading import Event, Thread
 from typing import Any
 
+from servotwin.edge.outlet import WITHHELD
 from servotwin.gateway import frames
 from servotwin.gateway.config import EdgeConfig
 from servotwin.gateway.configfile import load
 from servotwin.gateway.keeping import Keeper
-from servotwin.gateway.log import say
+from servotwin.gateway.log import Troubles, say
 from servotwin.gateway.pipe import Pipe
 from servotwin.gateway.status import write_status
 from servotwin.gateway.ticks import summary
@@ -54,11 +56,13 @@ class LinkProcess:
         self._listener = listener_of(config, self.outbox, self._transport, random.random)
         self._news, self._stopping = Event(), Event()
         self._wake, self._woken = socket.socketpair()
+        self._wake.setblocking(False)
         self._outgoing: list[bytes] = []
         self._broken: list[BaseException] = []
         self._ticks: frames.TicksFrame | None = None
         self._told = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
+        self._troubles, self._given_up = Troubles(), dict[str, int]()
 
     def run(self) -> None:
         """Until the control process is gone."""
@@ -119,10 +123,23 @@ class LinkProcess:
     def _tend(self) -> None:
         for serial in self._keeper.tend():
             self._pipe.post(frames.encode(frames.DoneFrame(serial)))
+        self._look()
         try:
             write_status(self._config.path(self._config.keeping.status), self._status())
         except OSError:
             self._faults["status not written"] += 1
+
+    def _look(self) -> None:
+        """Let whoever reads the log know what has gone wrong since, and what is well again."""
+        look = self._troubles.look
+        look("disk", "" if self.outbox.safe else self.outbox.trouble)
+        if self._courier is not None and self._listener is not None:
+            look("to the twin", self._courier.trouble)
+            look("from the twin", self._listener.trouble)
+        dropped = {why: number for why, number in self.outbox.dropped.items() if why != WITHHELD}
+        if dropped != self._given_up:
+            self._given_up = dropped
+            say("windows dropped", **dropped)
 
     def _stand(self) -> None:
         """Tell the control process what waits, when that has changed: before it hears of an acknowledgement."""
@@ -156,7 +173,8 @@ class LinkProcess:
         """From another thread: let the main one send it."""
         if frame:
             self._outgoing.append(frame)
-        self._wake.send(b"w")
+        with suppress(BlockingIOError):  # as many as fit are enough to wake it
+            self._wake.send(b"w")
 
     def _end_all(self, threads: list[Thread]) -> None:
         self._stopping.set()
@@ -196,8 +214,8 @@ class LinkProcess:
 
 def main(arguments: list[str]) -> int:
     """Run as a child."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     os.nice(NICE)
     path, descriptor = arguments
     end = socket.socket(fileno=int(descriptor))

@@ -136,6 +136,7 @@ class PipeOutlet:
         for data in came:
             frame = frames.to_control(data)
             if isinstance(frame, DoneFrame):
+                heard.standing |= frame.serial in self._cuts  # perhaps nothing is owed now, and nobody else says so
                 self._done(frame.serial)
             elif isinstance(frame, HeardFrame):
                 self._message(frame, heard)

@@ -7,25 +7,29 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from servotwin.edge.drive import Drive, DriveLost
 from servotwin.edge.parameters import Parameters
+from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileStore
+from servotwin.edge.switch import Rules
 from servotwin.errors import InvalidInput
 from servotwin.gateway.boots import next_boot
+from servotwin.gateway.checks import check
 from servotwin.gateway.child import LinkChild, starter
-from servotwin.gateway.config import EdgeConfig, token_of
+from servotwin.gateway.config import EdgeConfig
 from servotwin.gateway.configfile import load
 from servotwin.gateway.control import Controlling
 from servotwin.gateway.drives import control_drive, supervised_drive
 from servotwin.gateway.edge import Edge
-from servotwin.gateway.log import say
+from servotwin.gateway.log import Troubles, say
 from servotwin.gateway.outlet import PipeOutlet
 from servotwin.gateway.supervise import Supervising
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _RECONNECT_S, _PIECE_S, _FINISH_S = 1.0, 0.02, 3.0
 
 
@@ -64,15 +68,14 @@ def run(path: str | os.PathLike[str]) -> None:
         The configuration, the token or the drive is not as it must be.
     """
     config = load(path)
-    if config.twin is not None:
-        token_of(config.twin, config.folder)
+    check(config)
     drive = control_drive(config) if config.role == "control" else supervised_drive(config)
-    first = first_parameters(config.path(config.keeping.parameters))
+    first = permitted(first_parameters(config.path(config.keeping.parameters)), config.agent)
     boot = next_boot(config.path(config.keeping.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
     child = LinkChild(starter(Path(path).resolve()), outlet)
     stop = Stop()
-    before = [signal.signal(each, stop) for each in SIGNALS]
+    before = {each: signal.signal(each, stop) for each in SIGNALS if not _is_unheard(each)}
     try:
         edge = Edge(config, boot, outlet, child, first, time.monotonic, time.sleep)
         until(stop, edge, drive, lambda: _role(edge, drive))
@@ -80,7 +83,7 @@ def run(path: str | os.PathLike[str]) -> None:
     finally:
         child.close()
         drive.close()
-        for each, handler in zip(SIGNALS, before, strict=True):
+        for each, handler in before.items():
             signal.signal(each, handler)
         say("end")
 
@@ -101,34 +104,59 @@ def first_parameters(path: Path) -> Parameters | None:
     return None
 
 
+def permitted(found: Parameters | None, agent: AgentSettings) -> Parameters | None:
+    """What an earlier start proved, where an update to it would be allowed today: the limits may be others by now."""
+    if found is None or found.fallback:
+        return found
+    centre, gains = Rules(agent.limits, agent.controller, agent.own).centre, found.gains
+    good = gains is None or (centre is not None and agent.limits.allows_gains(gains, centre))
+    if good and agent.limits.allows_tolerance(found.tolerance):
+        return found
+    say("last parameters not allowed any more", version=found.version, tolerance_m=found.tolerance)
+    return None
+
+
 def until(stop: Stop, edge: Edge, drive: Drive, role_of: Callable[[], Role]) -> None:
     """Connect, run, connect again where the drive was lost."""
     role: Role | None = None
+    troubles = Troubles()
     calm()
     hurry(edge.config.priority)
     while not stop.wanted:
         try:
             drive.connect()
+            troubles.look("drive", "")
             _check_rate(edge.config, drive)
             role = role_of() if role is None else role
-            if not go_on(stop, role):
-                return
+            go_on(stop, role)
+            return
         except DriveLost as error:
             edge.counts["drive lost"] += 1
-            say("drive lost", error=str(error))
+            troubles.look("drive", str(error))
             _wait(stop, edge)
             if role is not None:
                 role.lost()
 
 
-def go_on(stop: Stop, role: Role) -> bool:
-    """Sample after sample; False: the run is over."""
+def go_on(stop: Stop, role: Role) -> None:
+    """Sample after sample until the run is over or a signal comes; whatever ends it, the drive is left in order."""
     step = role.step
-    while not stop.wanted:
-        if not step():
-            return False
+    try:
+        while not stop.wanted:
+            if not step():
+                return
+    except DriveLost:
+        raise
+    except BaseException:
+        with suppress(Exception):
+            role.stop()
+        raise
     role.stop()
-    return False
+
+
+def _is_unheard(number: signal.Signals) -> bool:
+    """Whether whoever started this wants it to outlive its terminal (nohup)."""
+    return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
 def calm() -> None:
