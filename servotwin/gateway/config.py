@@ -239,7 +239,7 @@ def _secret(what: str, file: str | None, variable: str | None, folder: Path, env
             raise InvalidInput(f"{path}: others than its owner may open it; give it mode 0600")
         return _checked(what, path.read_text(encoding="utf-8").strip(), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(f"{path}: the {what} cannot be read ({error})") from None
+        raise InvalidInput(f"{path}: the {what} cannot be read ({getattr(error, 'strerror', None) or error})") from None
 
 
 def _checked(what: str, secret: str, where: str) -> str:

@@ -178,6 +178,7 @@ def service(table: Table, folder: Path, environment: Mapping[str, str] = os.envi
     values = {**given(table, PLAIN), **paths, **_store(table, folder, environment)}
     if "mqtt" in table.values:
         values["mqtt"] = part(table, "mqtt", lambda inner: mqtt(inner, folder, environment))
+    table.known("mqtt")
     with named(table):
         return ServiceConfig(**values)
 

@@ -42,6 +42,8 @@ def read_tokens(path: Path) -> Verifiers:
         It cannot be read, is readable by others, or something in it is no name or no verifier; what it holds instead
         is not shown.
     """
+    if not path.exists():
+        raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
     check_private(path)
     if not path.read_bytes().strip():
         return Verifiers()
