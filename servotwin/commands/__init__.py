@@ -1,0 +1,1 @@
+"""What the command line's commands take, group by group. Each imports what it does when it runs."""
