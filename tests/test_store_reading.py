@@ -19,6 +19,16 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
     assert store.outgoing("a", 4) == store.outgoing("nobody", 0) == []
 
 
+def test_an_edge_that_has_heard_more_than_a_restored_store_knows_hears_what_comes_next(store: Store) -> None:
+    for sequence, heard in ((1, 0), (2, 900), (3, 2**60)):
+        store.put([window(sequence=sequence), window("b", sequence)])
+        assert store.outgoing("a", heard) == []
+        store.commit([outcome(one, outgoing=(b"x%d" % sequence,)) for one in claim(store)], 201.0)
+    assert store.outgoing("a", 900) == [Posted(901, b"x2"), Posted(902, b"x3")]
+    assert [post.serial for post in store.outgoing("b", 0)] == [1, 2, 3]
+    assert store.outgoing("nobody", 7) == []
+
+
 def test_what_waits_and_for_how_long(store: Store) -> None:
     assert store.waiting(200.0) == Waiting(0, 0, 0.0)
     store.put([window(received=110.0), letter(received=120.0), window("b", received=150.0)])

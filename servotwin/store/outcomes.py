@@ -40,6 +40,12 @@ def _raise(connection: sa.Connection, outcome: Outcome) -> int | None:
     return found.scalar()
 
 
+def pass_over(connection: sa.Connection, servo: str, serial: int) -> None:
+    """Let the next message to the edge have a higher serial than that."""
+    behind = twins.c.servo == servo, twins.c.posted < serial
+    connection.execute(sa.update(twins).where(*behind).values(posted=serial))
+
+
 def _write(connection: sa.Connection, valid: Sequence[tuple[Outcome, int]], now: float) -> None:
     outcomes = [outcome for outcome, _ in valid]
     _states(connection, outcomes)

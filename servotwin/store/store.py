@@ -18,6 +18,8 @@ from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Posted, Put, St
 
 WORK_KINDS = (Kind.WINDOW, Kind.LETTER)
 _RACES = 8
+HIGHEST_HEARD = 2**52
+"""Of the serials that an edge may say to have heard: messages count to twice as far."""
 
 _Result = TypeVar("_Result")
 
@@ -111,8 +113,15 @@ class Store:
         self._written(lambda connection: lending.release(connection, owner, servos))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[Posted]:
-        """Messages to the edge of a serial above `after`, lowest first."""
-        return self._read(lambda connection: reading.outgoing(connection, servo, after, limit))
+        """Messages to the edge of a serial above `after`, lowest first.
+
+        An edge that has heard of later messages than there ever were knows a store from before this one was put back
+        from a backup: the next message gets a serial that the edge does not take for a repeated one.
+        """
+        found = self._read(lambda connection: reading.outgoing(connection, servo, after, limit))
+        if not found and self.posted([servo]).get(servo, after) < after <= HIGHEST_HEARD:
+            self._written(lambda connection: outcomes.pass_over(connection, servo, after))
+        return found
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serial of the newest message to the edge of each of these servos that was heard of."""
