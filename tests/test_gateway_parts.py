@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,6 +29,7 @@ from servotwin.gateway.config import UNBOOTED, EdgeConfig
 from servotwin.gateway.control import Controlling, Law
 from servotwin.gateway.edge import Edge
 from servotwin.gateway.keeping import Keeper
+from servotwin.gateway.log import Troubles
 from servotwin.gateway.outlet import BEHIND, PipeOutlet
 from servotwin.gateway.pipe import Pipe, send_whole
 from servotwin.gateway.run import Stop, first_parameters, until
@@ -509,3 +511,14 @@ def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float
         assert found[name] == pytest.approx(exact, abs=1.001)
     assert found["number"] == len(durations)
     assert found["max_us"] == pytest.approx(ordered[-1] * 1e6, abs=0.06)
+
+
+def test_a_trouble_is_told_when_it_comes_when_it_is_another_one_and_when_it_is_over(capfd: pytest.CaptureFixture[str]):
+    troubles = Troubles()
+    for why in ("", "", "refused", "refused", "away", "", ""):
+        troubles.look("to the twin", why)
+    troubles.look("disk", "")
+    told = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
+    assert [(line["event"], line["where"], line.get("why")) for line in told] == [
+        ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)
+    ]  # fmt: skip
