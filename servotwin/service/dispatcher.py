@@ -77,7 +77,7 @@ class Dispatcher:
         self._stopping = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._returns: set[str] = set()
-        self._faults: Counter[str] = Counter()
+        self._faults: Counter[tuple[str, bool]] = Counter()
 
     def poke(self) -> None:
         """Something new is to be worked on."""
@@ -153,12 +153,12 @@ class Dispatcher:
 
     async def _employ(self, worker: Worker, claims: Sequence[Claim]) -> None:
         """Let a worker work on claims; those that failed before each alone, so that the fault is found."""
-        claims = [claim._replace(attempts=1 + self._faults[claim.servo]) for claim in claims]
+        claims = [claim._replace(attempts=1 + self._faults[_queue(claim)]) for claim in claims]
         jobs = [
             [claim for claim in claims if claim.attempts == 1],
             *([claim] for claim in claims if claim.attempts > 1),
         ]
-        left = dict.fromkeys(claim.servo for claim in claims)
+        left = dict.fromkeys(claim.servo for job in jobs for claim in job)
         commits: list[asyncio.Task[Outcome | None]] = []
         now = self._parts.clocks.wall()
         try:
@@ -192,7 +192,7 @@ class Dispatcher:
             return None
         if not await self._committed(done.outcome):
             return None
-        self._faults.pop(claim.servo, None)
+        self._faults.pop(_queue(claim), None)
         self._tell(claim, done.outcome, done.seconds, now)
         return done.outcome
 
@@ -205,10 +205,9 @@ class Dispatcher:
             log.error("outcome not committed", extra={"servo": outcome.servo, "why": str(error)})
             self._returns.add(outcome.servo)
             return False
+        # A void one has no lease to give back: the outcome before it ended that, and whoever has one now needs it.
         counts.add("committed" if valid else "void")
-        if not valid:
-            self._returns.add(outcome.servo)
-        elif outcome.outgoing:
+        if valid and outcome.outgoing:
             self._parts.metrics.posted.add(by=len(outcome.outgoing))
             self._parts.posted(outcome.servo)
         if valid:
@@ -217,10 +216,10 @@ class Dispatcher:
 
     def _failed(self, claim: Claim, why: str) -> None:
         """A worker found no outcome: the next one is told how many did, and gives a message up at last."""
-        self._faults[claim.servo] += 1
+        self._faults[_queue(claim)] += 1
         self._parts.metrics.outcomes.add("failed")
         about = {"servo": claim.servo, "message_id": claim.messages[0].id if claim.messages else 0}
-        log.error("work failed", extra={**about, "faults": self._faults[claim.servo], "why": why})
+        log.error("work failed", extra={**about, "faults": self._faults[_queue(claim)], "why": why})
         self._returns.add(claim.servo)
 
     async def _give_back(self) -> None:
@@ -245,6 +244,11 @@ class Dispatcher:
             level = logging.WARNING if what in ALARMS else logging.DEBUG if what in QUIET else logging.INFO
             if log.isEnabledFor(level):
                 log.log(level, what, extra={**about, **_ids(found, windows)})
+
+
+def _queue(claim: Claim) -> tuple[str, bool]:
+    """Where its faults are counted: of a proof that kills its workers, windows that succeed meanwhile say nothing."""
+    return claim.servo, any(message.kind is Kind.PROOF for message in claim.messages)
 
 
 def _what(found: Evidence) -> str:
