@@ -332,3 +332,20 @@ def test_a_full_disk_stops_neither_the_controller_nor_the_link(
     assert whole(found)
     assert gateway.status()["windows"]["dropped"] == {}
     assert gateway.status()["link_process"] == link
+
+
+def test_a_link_process_that_is_killed_on_a_full_disk_takes_no_window_along(
+    gateway: Gateway, machine: StubMachine
+) -> None:
+    gateway.write(twin=None)
+    gateway.start()
+    until(lambda: gateway.status().get("link_process", 0) > 0)
+    link = gateway.status()["link_process"]
+    resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+    until(lambda: not gateway.status()["disk"]["safe"])
+    machine.wait_for(machine.number + 500)
+    os.kill(link, signal.SIGKILL)
+    until(lambda: gateway.status()["link_process"] != link and gateway.status()["disk"]["safe"])
+    assert gateway.signal(signal.SIGTERM) == 0
+    assert whole([sequence for _, sequence in gateway.outbox()])
+    assert len(gateway.outbox()) >= 4
