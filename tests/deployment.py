@@ -34,7 +34,7 @@ PATIENCE = 120.0
 TWIN = """
 [service]
 port = {port}
-store = "sqlite:///twin.db"
+store = "sqlite:///{store}"
 workers = 1
 speed = 2.0
 tokens = "tokens.toml"
@@ -92,22 +92,21 @@ CREATE TRIGGER seen AFTER INSERT ON windows BEGIN INSERT OR IGNORE INTO witness 
 class Process:
     """A command that can be started, killed with all its children, and started again."""
 
-    def __init__(self, name: str, folder: Path, arguments: Sequence[str]) -> None:
-        self.name, self._folder = name, folder
+    def __init__(self, name: str, log: Path, folder: Path, arguments: Sequence[str]) -> None:
+        self.name, self._log, self._folder = name, log / f"{name}.log", folder
         self._command = [sys.executable, *arguments]
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
     def log(self) -> str:
-        path = self._folder / f"{self.name}.log"
-        return path.read_text(errors="replace")[-4000:] if path.exists() else ""
+        return self._log.read_text(errors="replace")[-4000:] if self._log.exists() else ""
 
     @property
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
     def start(self, **options: Any) -> None:
-        with (self._folder / f"{self.name}.log").open("ab") as log:
+        with self._log.open("ab") as log:
             self._process = subprocess.Popen(
                 self._command, cwd=self._folder, stdout=log, stderr=log, start_new_session=True, **options
             )
@@ -133,6 +132,11 @@ class Process:
             return self._process.wait(PATIENCE)
         finally:
             kill_group(self._process.pid)
+
+
+def logs(fleet: "Fleet") -> str:
+    """The ends of all logs."""
+    return "\n".join(f"{each.name}: {each.log}" for each in (fleet.twin, *fleet.edges.values()))
 
 
 def end_all(processes: Collection[Process]) -> list[int]:
@@ -161,6 +165,8 @@ class Fleet:
         More of [service].
     edit : callable
         Changes an edge's configuration.
+    store : str
+        The twin's database.
     """
 
     def __init__(
@@ -169,19 +175,18 @@ class Fleet:
         roles: Sequence[str],
         service: str = "",
         edit: Callable[[EdgeConfig], EdgeConfig] = lambda config: config,
+        store: str = "twin.db",
     ) -> None:
         self.folder, self.port, self._edit = folder, free_port(), edit
         self.roles = {f"ax-{k}": role for k, role in enumerate(roles)}
         (folder / "tokens.toml").touch(0o600)
-        text = TWIN.format(port=self.port, rate=RATE, service=service)
+        self.database = folder / store
+        text = TWIN.format(port=self.port, rate=RATE, service=service, store=store)
         (folder / "twin.toml").write_text(text)
-        self.twin = Process("twin", folder, ["-m", "servotwin", "twin", "--config", "twin.toml"])
-        self.edges = {s: Process("edge", folder / s, ["-m", "servotwin.gateway", "edge.toml"]) for s in self.roles}
+        self.twin = Process("twin", folder, folder, ["-m", "servotwin", "twin", "--config", "twin.toml"])
+        run = ["-m", "servotwin.gateway", "edge.toml"]
+        self.edges = {servo: Process(servo, folder, folder / servo, run) for servo in self.roles}
         self._machines: subprocess.Popen[str] | None = None
-
-    @property
-    def database(self) -> Path:
-        return self.folder / "twin.db"
 
     def start(self, url: str) -> None:
         """Machines first, then edges that reach the twin at a URL, and the twin."""
@@ -284,6 +289,14 @@ def stored(fleet: Fleet) -> list[Key]:
     return ask(fleet.database, "SELECT servo, boot, sequence FROM messages WHERE kind = 'window'")
 
 
+def count_stored(fleet: Fleet) -> int:
+    """Windows in the twin's store; none before there is one."""
+    try:
+        return len(stored(fleet))
+    except sqlite3.OperationalError:
+        return 0
+
+
 def receipts(fleet: Fleet) -> dict[str, list[Receipt]]:
     """Of each servo, in the order in which they came."""
     found: dict[str, list[Receipt]] = {servo: [] for servo in fleet.roles}
@@ -300,10 +313,11 @@ def ask(path: Path, text: str) -> list[Any]:
         return database.execute(text).fetchall()
 
 
-def until(condition: Callable[[], bool], what: str, seconds: float = PATIENCE) -> None:
+def until(condition: Callable[[], bool], what: Callable[[], str], seconds: float = PATIENCE) -> None:
+    """`what` is asked for when it did not happen."""
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, f"waited in vain: {what}"
+        assert time.monotonic() < end, f"waited in vain: {what()}"
         time.sleep(0.1)
 
 

@@ -29,7 +29,7 @@ class Tls(NamedTuple):
 class Mosquitto:
     """A broker in a folder."""
 
-    def __init__(self, folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None) -> None:
+    def __init__(self, folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None, rules: str = "") -> None:
         self.program, self.folder, self.port = needed("mosquitto"), folder, free_port()
         self.scheme = "mqtt" if tls is None else "mqtts"
         self.process: subprocess.Popen[bytes] | None = None
@@ -43,6 +43,10 @@ class Mosquitto:
         ]
         if logins:
             lines.append(f"password_file {self._passwords(logins)}")
+        if rules:
+            (folder / "acl").write_text(rules)
+            (folder / "acl").chmod(0o600)
+            lines.append(f"acl_file {folder / 'acl'}")
         if tls is not None:
             lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
         self._settings = folder / "mosquitto.conf"
@@ -87,10 +91,12 @@ def free_port() -> int:
 
 
 @contextmanager
-def broker(folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None) -> Iterator[Mosquitto]:
-    """One that runs."""
+def broker(
+    folder: Path, logins: tuple[Login, ...] = (), tls: Tls | None = None, rules: str = ""
+) -> Iterator[Mosquitto]:
+    """One that runs; `rules` say who may do what."""
     folder.mkdir(exist_ok=True)
-    made = Mosquitto(folder, logins, tls)
+    made = Mosquitto(folder, logins, tls, rules)
     made.start()
     try:
         yield made

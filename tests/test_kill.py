@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from deployment import Fleet, deployed, end_all, pending, until, witnessed
+from deployment import Fleet, deployed, end_all, logs, pending, until, witnessed
 from httprelay import Chances, HttpRelay
 from killing import (
     Killer,
@@ -25,7 +25,7 @@ CUTS_S = (4.0, 8.0)
 def finish(fleet: Fleet) -> None:
     """No more windows; the edges deliver what they have, and all end well."""
     fleet.stop_machines()
-    until(lambda: pending(fleet) == 0, f"outboxes empty: {fleet.twin.log}")
+    until(lambda: pending(fleet) == 0, lambda: logs(fleet))
     assert set(end_all(fleet.edges.values())) == {0}
     assert fleet.twin.end() == 0
 

@@ -1,102 +1,25 @@
 """The link over MQTT with a real broker: exactly once, whatever dies; nobody speaks for another's servo."""
 
-import asyncio
 import socket
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mosquitto import Login, Mosquitto, Tls, broker, free_port
+from mosquitto import Mosquitto, broker, free_port
+from mqttparts import PATIENCE, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
 from relay import Relay, State, Weather
-from selfsigned import self_made
 
-from servotwin.errors import InvalidInput
 from servotwin.link import exchange
 from servotwin.link.broker import Broker, Connection, Events, Wanted
-from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
-from servotwin.link.transport import Parcel, Refused, Unreachable, squeezed
-from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Window, checksum, encode, pack_channel
-from servotwin.service.auth import Authority
-from servotwin.service.brokerdesk import Desk, Parts
-from servotwin.service.future import Boots
-from servotwin.service.ingest import Ingest
-from servotwin.service.landing import Landing
-from servotwin.service.limits import Buckets
-from servotwin.service.metrics import Metrics
-from servotwin.service.mqtt import Bridge
-from servotwin.service.outgoing import Outgoing
-from servotwin.service.tokens import Verifiers
-from servotwin.store.groupcommit import GroupCommit
-from servotwin.store.rows import Outcome, Posted
+from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, encode
 from servotwin.store.store import Store, open_store
-
-CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
-SERVOS = ("axis-1", "axis-2")
-TOKENS = {servo: f"token of {servo}" for servo in SERVOS}
-VERIFIERS = Verifiers({servo: verifier_of(token) for servo, token in TOKENS.items()})
-PATIENCE = 60.0
-
-
-def window(sequence: int, servo: str = "axis-1") -> Window:
-    return Window(servo, "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
-
-
-def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
-    return Parcel(servo, *squeezed(encode(window(sequence, servo))), "b0", sequence)
-
-
-class Twin:
-    """The service without HTTP and without estimation, on a thread of its own."""
-
-    def __init__(self, at: Broker, store: Store) -> None:
-        self.metrics, self.store = Metrics(), store
-        self.commits = GroupCommit(store)
-        self._broker, self._began, self._thread = at, threading.Event(), threading.Thread(target=self._run)
-        self._thread.start()
-        assert self._began.wait(PATIENCE)
-
-    def post(self, servo: str, body: bytes) -> None:
-        """What a worker's outcome does."""
-        (claim,) = (each for each in self.store.claim("test", 10, 60.0, 0.0) if each.servo == servo)
-        done = tuple(message.id for message in claim.messages)
-        assert self.store.commit([Outcome(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [True]
-        self._loop.call_soon_threadsafe(self.outgoing.post, servo)
-
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(PATIENCE)
-        self.commits.close()
-
-    def _run(self) -> None:
-        asyncio.run(self._main())
-
-    async def _main(self) -> None:
-        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), Landing()
-        self.outgoing = Outgoing(self._posted, 100, 0.2)
-        boots = Boots(1.0, 1e9)
-        ingest = Ingest(lambda incoming: landing(self.commits.put(incoming)), SERVOS.__contains__, boots, self.metrics)
-        buckets = Buckets(1e6, 1e6, self._loop.time)
-        parts = Parts(
-            Authority(VERIFIERS), SERVOS.__contains__, buckets, ingest, self.outgoing, lambda: None, self.metrics
-        )
-        bridge = Bridge(self._broker, Desk(parts), "twins")
-        await bridge.begin()
-        while not bridge.connected:
-            await asyncio.sleep(0.01)
-        self._began.set()
-        await self._stop.wait()
-        self.outgoing.close()
-        await bridge.end()
-
-    async def _posted(self, servo: str, serial: int) -> list[Posted]:
-        return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
 
 
 @pytest.fixture
@@ -110,45 +33,6 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store = open_store(f"sqlite:///{tmp_path}/twin.db")
     yield store
     store.close()
-
-
-@contextmanager
-def twin(at: Broker, store: Store) -> Iterator[Twin]:
-    running = Twin(at, store)
-    try:
-        yield running
-    finally:
-        running.close()
-
-
-@contextmanager
-def edge(at: Broker, servo: str = "axis-1", token: str | None = None, **times: float) -> Iterator[MqttTransport]:
-    options = {"timeout_s": 10.0, "wait_s": 5.0} | times
-    transport = MqttTransport(at, servo, TOKENS[servo] if token is None else token, **options)
-    try:
-        yield transport
-    finally:
-        transport.close()
-
-
-def insist(deliver: Callable[[], None]) -> int:
-    """As an outbox does: again and again; how often it took."""
-    for times in range(1, 100):
-        try:
-            deliver()
-        except Unreachable:
-            continue
-        return times
-    raise AssertionError("never delivered")
-
-
-def kept(store: Store, servo: str = "axis-1") -> list[int]:
-    """Sequences of the windows in the store."""
-    return sorted(held.sequence for held in store.windows(servo, 10_000))
-
-
-def refusals(running: Twin) -> dict[str, int]:
-    return {code: number for (code,), number in running.metrics.refused.values.items()}
 
 
 def test_windows_letters_and_messages_go_both_ways(server: Mosquitto, store: Store) -> None:
@@ -189,33 +73,6 @@ def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> Non
         assert sum(taken) == 40
         assert min(taken) > 0
         assert kept(store) == kept(store, "axis-2") == list(range(20))
-
-
-def test_a_user_and_a_password_where_the_broker_asks_for_them(tmp_path: Path, store: Store) -> None:
-    logins = Login("edge", "edge's password"), Login("twin", "twin's password")
-    with broker(tmp_path / "broker", logins) as server:
-        twins, edges = (Broker(server.url, *login) for login in reversed(logins))
-        with twin(twins, store), edge(edges) as here, edge(Broker(server.url), timeout_s=1.0) as nobody:
-            here.deliver(parcel(0))
-            with pytest.raises(Unreachable, match="refuses the connection"):
-                nobody.deliver(parcel(1))
-    assert kept(store) == [0]
-    assert "password" not in repr(edges)
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_over_tls_the_brokers_certificate_is_checked(tmp_path: Path, store: Store) -> None:
-    """The socket of a handshake that failed is left by paho to the garbage collector, which warns."""
-    files = Tls(*self_made(tmp_path))
-    with broker(tmp_path / "broker", tls=files) as server:
-        trusted = Broker(server.url, ca_file=str(files.certificate))
-        with twin(trusted, store), edge(trusted) as here, edge(Broker(server.url), timeout_s=1.0) as doubting:
-            here.deliver(parcel(0))
-            with pytest.raises(Unreachable, match="certificate verify failed"):
-                doubting.deliver(parcel(1))
-    assert kept(store) == [0]
-    with pytest.raises(InvalidInput, match="holds no certificates"):
-        MqttTransport(Broker("mqtts://127.0.0.1", ca_file=str(tmp_path / "absent.pem")), "axis-1", "token")
 
 
 def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store: Store) -> None:
@@ -385,36 +242,3 @@ def test_closing_wakes_whoever_waits(server: Mosquitto) -> None:
 def test_no_broker_is_no_twin() -> None:
     with edge(Broker(f"mqtt://127.0.0.1:{free_port()}"), timeout_s=0.5) as here, pytest.raises(Unreachable):
         here.deliver(parcel(0))
-
-
-@pytest.mark.parametrize(
-    "url", ["http://host", "mqtt://", "mqtt://host/path", "mqtt://me:secret@host", "mqtt://host:0", "mqtt://host:x"]
-)
-def test_an_address_that_is_none_is_named(url: str) -> None:
-    with pytest.raises(InvalidInput, match=r"give mqtt\(s\)://host"):
-        Broker(url)
-
-
-def test_without_paho_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "paho.mqtt.client", None)
-    with pytest.raises(InvalidInput, match=r"pip install 'servotwin\[mqtt\]'"):
-        MqttTransport(Broker("mqtt://127.0.0.1"), "axis-1", "token")
-
-
-def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
-    """Publish as anybody may."""
-    arrived, ready = threading.Event(), threading.Event()
-
-    def message(_topic: str, _payload: bytes, acknowledge: Callable[[], None]) -> None:
-        acknowledge()
-        arrived.set()
-
-    events = Events(message, lambda _: ready.set(), lambda _: None)
-    wanted = Wanted("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
-    connection = Connection(Broker(server.url), wanted, events)
-    try:
-        assert ready.wait(PATIENCE)
-        assert connection.publish(topic, payload, 60.0) is not None
-        assert arrived.wait(PATIENCE)
-    finally:
-        connection.close()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
 from servotwin.link.session import Retry, Sender
+from servotwin.link.sqlitefile import connect
 from servotwin.link.sqliteoutbox import BROKEN, UNWRITABLE, SqliteOutbox
 from servotwin.messages import Window, checksum, pack_channel
 
@@ -166,16 +168,27 @@ def test_a_full_disk_is_counted_and_survived(outbox: SqliteOutbox, path: Path) -
     fresh.close()
 
 
-def test_a_read_only_file_is_counted_and_survived(outbox: SqliteOutbox, path: Path) -> None:
+def test_a_read_only_file_is_counted_and_survived(
+    outbox: SqliteOutbox, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection opened on a disk that is read-only stays so when the disk no longer is."""
+
+    def read_only(*arguments: Any, **options: Any) -> sqlite3.Connection:
+        made = connect(*arguments, **options)
+        made.execute("PRAGMA query_only = ON")
+        return made
+
     outbox.put(window(0))
-    assert outbox._connection is not None
-    outbox._connection.execute("PRAGMA query_only = ON")
-    outbox.put(window(1))
-    outbox.post(b"letter")
-    outbox.remove(("b0", 0))
-    assert (sequences(outbox), outbox.safe) == ([1], False)
-    assert "readonly" in outbox.trouble
-    outbox._connection.execute("PRAGMA query_only = OFF")
+    outbox.close()
+    with monkeypatch.context() as patch:
+        patch.setattr("servotwin.link.sqliteoutbox.connect", read_only)
+        outbox.settle()
+        outbox.put(window(1))
+        outbox.post(b"letter")
+        outbox.remove(("b0", 0))
+        assert (sequences(outbox), outbox.safe) == ([1], False)
+        assert not outbox.settle()
+        assert "readonly" in outbox.trouble
     assert outbox.settle()
     fresh = again(outbox, path)
     assert (sequences(fresh), len(fresh.letters())) == ([1], 1)

@@ -41,8 +41,13 @@ def is_broken(error: sqlite3.Error) -> bool:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _BROKEN
 
 
-def connect(path: Path) -> sqlite3.Connection:
-    """An outbox's file, made where there is none.
+def was_read_only(error: Exception) -> bool:
+    """Whether the file was opened on a disk that was read-only: a connection to it stays so."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY
+
+
+def connect(path: Path, check: bool = True) -> sqlite3.Connection:
+    """An outbox's file, made where there is none; `check` looks whether it is whole.
 
     Raises
     ------
@@ -52,7 +57,7 @@ def connect(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
     try:
         connection.executescript(_SCHEMA)
-        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0] if check else "ok"
         if found != "ok":
             error = sqlite3.DatabaseError(found)
             error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT

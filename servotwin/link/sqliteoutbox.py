@@ -20,7 +20,19 @@ from typing import Any
 from servotwin.errors import InvalidInput
 from servotwin.link.eviction import Kept, excess, is_plain
 from servotwin.link.outbox import FULL, Dropped, Key
-from servotwin.link.sqlitefile import COUNT, DELETE, INSERT, NOTE, POST, TAKE, Statement, connect, is_broken, put_aside
+from servotwin.link.sqlitefile import (
+    COUNT,
+    DELETE,
+    INSERT,
+    NOTE,
+    POST,
+    TAKE,
+    Statement,
+    connect,
+    is_broken,
+    put_aside,
+    was_read_only,
+)
 from servotwin.link.transport import DEFLATE, Parcel, squeezed
 from servotwin.messages import Window, decode, encode
 
@@ -52,6 +64,7 @@ class SqliteOutbox:
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
+        self._read_only = False
         self._index: dict[Key, Kept] = {}
         self._letters: dict[bytes, None] = {}
         self._counts: Counter[str] = Counter()
@@ -214,12 +227,15 @@ class SqliteOutbox:
         with self._lock:
             if self._connection is not None:
                 self._connection.close()
-            self._connection = None
+            self._connection, self._read_only = None, False
 
     def _write(self) -> None:
         if self._connection is None:
             self._connection = connect(self._path)
             self._load(self._connection)
+        if self._read_only:
+            self.close()  # first: connections of one process to one file share what they know of it
+            self._connection = connect(self._path, check=False)
         if self._owed:
             self._connection.execute("BEGIN IMMEDIATE")
             for statement in self._owed.values():
@@ -246,6 +262,7 @@ class SqliteOutbox:
             self._begin_anew()
             return
         self.faults[UNWRITABLE] += 1
+        self._read_only = was_read_only(error) and self._connection is not None
         if self._connection is not None and self._connection.in_transaction:
             self._rolled_back(self._connection)
         held = [(key, owed) for key, owed in self._owed.items() if owed.text == INSERT]
