@@ -295,9 +295,10 @@ def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not
         assert found.store_password == "hunter2"
         assert "hunter2" not in repr(found)
     assert config(tmp_path, {}).store == f"sqlite:///{tmp_path / 'twin.db'}"
-    with pytest.raises(InvalidInput) as error:
-        config(tmp_path, {"store": "postgresql://me:hunter2@host/twin"})
-    assert "hunter2" not in str(error.value)
+    for holding in ("postgresql://me:hunter2@host/twin", "postgresql://me@host/twin?password=hunter2"):
+        with pytest.raises(InvalidInput, match="holds a password") as error:
+            config(tmp_path, {"store": holding})
+        assert "hunter2" not in str(error.value)
     (tmp_path / "password").chmod(0o604)
     with pytest.raises(InvalidInput, match="others"):
         read_secret(tmp_path / "password")
@@ -308,6 +309,8 @@ def test_another_address_needs_tokens_and_tls_or_a_proxy(tmp_path):
         with pytest.raises(InvalidInput, match="only with tokens"):
             config(tmp_path, {"bind": "0.0.0.0", **values})
     assert not config(tmp_path, {"bind": "::", "tokens": "tokens.toml", "behind_proxy": True}).local
+    with pytest.raises(InvalidInput, match="asks for tokens"):
+        config(tmp_path, {"bind": "127.0.0.1", "behind_proxy": True})
     for address in ("localhost", "127.0.0.2", "::1"):
         assert config(tmp_path, {"bind": address}).local
     assert ServiceConfig().local

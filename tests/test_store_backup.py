@@ -44,6 +44,12 @@ def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     assert restored.audit("a") == store.audit("a")[1:]
     assert restored.outgoing("a", 0) == store.outgoing("a", 0)
     assert restored.window("a", "boot", 3) == store.window("a", "boot", 3)
+    (summary,) = restored.servos()
+    assert summary.posted > store.servos()[0].posted + 100_000
+    restored.put([window(sequence=9)])
+    (claim,) = restored.claim("me", 1, 30.0, 300.0)
+    restored.commit([outcome(claim, outgoing=(b"v", b"w"))], 301.0)
+    assert [posted.serial for posted in restored.outgoing("a", 1)] == [summary.posted + 1, summary.posted + 2]
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(("backup", ".backup"))) == ["backup.db"]
     restored.close()
     store.close()

@@ -73,7 +73,7 @@ async def refusal(metrics: Metrics, request: Request, error: Exception) -> Respo
     """The answer to what was not taken; counted, and logged without what was sent."""
     assert isinstance(error, Refused)
     metrics.refused.add(error.refusal.value)
-    about = {"servo": request.path_params.get("servo", ""), "code": error.refusal.value, "why": error.detail}
+    about = {"servo": request.path_params.get("servo", "")[:64], "code": error.refusal.value, "why": error.detail}
     log.info("refused", extra={**about, "method": request.method, "status": error.status})
     headers = {"retry-after": "1"} if error.status in (429, 503) else {}
     if error.status == 401:

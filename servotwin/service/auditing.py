@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.error import HTTPError, URLError
 from urllib.parse import quote
-from urllib.request import Request, urlopen
+from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 import msgspec
 
@@ -117,11 +117,12 @@ def _asking(source: Source) -> Callable[[str], Any]:
         raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
     if source.token is not None:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
-    context = _context(source.ca) if url.startswith("https") else None
+    secure = [HTTPSHandler(context=_context(source.ca))] if url.startswith("https") else []
+    opener = build_opener(_Stay, *secure)
 
     def ask(path: str) -> Any:
         try:
-            with urlopen(Request(url + path, headers=headers), timeout=TIMEOUT_S, context=context) as answer:
+            with opener.open(Request(url + path, headers=headers), timeout=TIMEOUT_S) as answer:
                 return jsons.load(answer)
         except HTTPError as error:
             raise InvalidInput(f"{url}: {_refusal(error)}") from None
@@ -129,6 +130,13 @@ def _asking(source: Source) -> Callable[[str], Any]:
             raise InvalidInput(f"{url}: cannot be asked ({getattr(error, 'reason', error)})") from None
 
     return ask
+
+
+class _Stay(HTTPRedirectHandler):
+    """Goes nowhere else: the token is for this service alone."""
+
+    def redirect_request(self, *_args: Any) -> None:
+        """Nothing: the answer that says where to go is a refusal."""
 
 
 def _context(ca: Path | None) -> ssl.SSLContext:

@@ -80,8 +80,9 @@ class TokenFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.authority = Authority(read_tokens(path))
+        # First: what is written while it is read is then read again.
         self._seen = self._stamp()
+        self.authority = Authority(read_tokens(path))
 
     def refresh(self) -> bool:
         """Read the file again if it was replaced; whether it counts now."""

@@ -40,7 +40,7 @@ class ServiceConfig:
     tls_certificate, tls_key : Path or None
         PEM files; both or none.
     behind_proxy : bool
-        A proxy on the way does TLS.
+        A proxy on the way does TLS; that asks for tokens too.
     tokens : Path or None
         Verifiers of servos and operators; None: whoever reaches the machine itself may do everything.
     lockstep : bool
@@ -102,7 +102,8 @@ class ServiceConfig:
                 f"bind = {self.bind!r} can be reached from other machines: that is allowed only with tokens, and with "
                 "tls_certificate and tls_key or, where a proxy does the TLS, behind_proxy = true"
             )
-
+        if self.behind_proxy and self.tokens is None:
+            raise InvalidInput("behind_proxy = true lets other machines reach the service: that asks for tokens")
         if self.mqtt is not None and not self.mqtt.local and self.tokens is None:
             raise InvalidInput(f"mqtt url = {self.mqtt.broker.url!r} is not on this machine: that asks for tokens")
         if self.mqtt is not None and self.lockstep:
@@ -197,7 +198,7 @@ def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> dict[s
     if "://" not in url:
         raise table.invalid("store", "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
     head = url.split("://", 1)[1].split("/", 1)[0]
-    if ":" in head.rpartition("@")[0]:
+    if ":" in head.rpartition("@")[0] or "password=" in url.partition("?")[2]:
         raise InvalidInput(
             f"{table.source}: {table.path('store')} holds a password; give it in store_password_file or in the "
             f"environment variable {PASSWORD}"

@@ -10,7 +10,7 @@ import sys
 from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 
-from servotwin.service.config import PASSWORD
+from servotwin.service import config, mqttconfig
 from servotwin.service.job import LENGTH, Done, Job, Start, done_of, framed
 from servotwin.store.rows import Claim
 
@@ -186,5 +186,6 @@ class Pool:
 
 def _environment() -> Mapping[str, str]:
     """The service's, without what no worker has to know."""
-    mine = {key: value for key, value in os.environ.items() if key != PASSWORD}
+    secret = config.PASSWORD, mqttconfig.PASSWORD
+    mine = {key: value for key, value in os.environ.items() if key not in secret}
     return {**mine, "OPENBLAS_NUM_THREADS": "1"}

@@ -19,6 +19,8 @@ from servotwin.store.schema import REVISION, metadata
 PAGES = 2048
 """Pages that are copied between two reports."""
 PRIVATE = 0o600
+SINCE = 1_000_000
+"""Messages to one edge that may have been posted since a backup."""
 
 Progress = Callable[[int, int], None]
 """(pages that remain, pages in all)."""
@@ -68,6 +70,9 @@ def backup(url: str, to: Path, progress: Progress | None = None) -> Counts:
 def restore(backed_up: Path, url: str, progress: Progress | None = None) -> Counts:
     """Put a backup in the place of a store that does not exist or holds nothing.
 
+    What was posted since the backup is lost, but edges have it: they ignore serials up to the last that they got. So
+    numbers go on far beyond those in the backup.
+
     Raises
     ------
     InvalidInput
@@ -78,7 +83,10 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> Coun
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)
     with written(place, PRIVATE) as temporary:
-        return _copied(backed_up, temporary, progress)
+        counts = _copied(backed_up, temporary, progress)
+        with _opened(temporary, "mode=rw") as store:
+            store.execute("UPDATE twins SET posted = posted + ?", (SINCE,))
+        return counts
 
 
 def _sqlite_file(url: str, instead: str, file: Path) -> Path:
