@@ -31,7 +31,7 @@ from servotwin.gateway.edge import Edge
 from servotwin.gateway.keeping import Keeper
 from servotwin.gateway.log import Troubles
 from servotwin.gateway.outlet import BEHIND, PipeOutlet
-from servotwin.gateway.pipe import Pipe, send_whole
+from servotwin.gateway.pipe import Pipe
 from servotwin.gateway.run import Stop, first_parameters, until
 from servotwin.gateway.supervise import Supervising
 from servotwin.gateway.ticks import Counts, summary
@@ -137,11 +137,6 @@ def test_a_frame_that_is_longer_than_any_is_refused(ends: tuple[socket.socket, s
     ends[1].sendall(b"\xff\xff\xff\xff")
     with pytest.raises(InvalidMessage, match="4294967295 bytes"):
         Pipe(ends[0]).take()
-
-
-def test_a_blocking_end_speaks_the_same(ends: tuple[socket.socket, socket.socket]) -> None:
-    send_whole(ends[1], b"frame")
-    assert Pipe(ends[0]).take() == [b"frame"]
 
 
 def test_a_cut_crosses_as_it_is() -> None:
@@ -355,6 +350,24 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
         pass
     assert edge.agent.settings.boot == "b0.2"
     assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
+
+
+@pytest.mark.parametrize("then", [samples(1000, 3), [Sample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])
+def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far: Far, then: list[Sample]) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    role = Controlling(edge, ScriptedDrive([*samples(0, 15), *then]))
+    for _ in range(14):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    role.step()
+    assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 0.0))
+    voltage = role.law.voltage
+    for _ in then:
+        role.step()
+    assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 1e-4))
+    assert role.law.voltage == pytest.approx(voltage)
 
 
 def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> None:

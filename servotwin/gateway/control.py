@@ -33,7 +33,7 @@ class Law:
 
     def change(self, law: LawParameters, reference: float, position: float) -> None:
         """Another law from the tick that is due on; the voltage stays."""
-        if self.state is not None and isfinite(reference + position):
+        if self.state is not None:
             self.state = transfer(self.law, law, self.state, reference, position)
         self.law = law
 
@@ -104,9 +104,8 @@ class Controlling:
         if isfinite(sample.reference):
             self._reference = sample.reference  # where there is none, the last one holds
         wanted = self._reference + agent.offset
-        if agent.parameters is not self._in_force:
-            self._in_force = agent.parameters
-            self.law.change(self._law(self._in_force), wanted, sample.position)
+        if agent.parameters is not self._in_force and isfinite(sample.position):
+            self._follow(agent.parameters, wanted, sample.position)
         voltage = self.law.tick(wanted, sample.position)
         self._drive.write(voltage)
         if not isfinite(sample.reference + sample.theta_m + sample.position):
@@ -117,13 +116,17 @@ class Controlling:
         """Samples are missing, in which the voltage was held, or they are counted anew."""
         if self._edge.due is None:
             return
-        same, before = self._drive.machine == self._machine, self._edge.agent
+        same = self._drive.machine == self._machine
         self._machine, self._away = self._drive.machine, False
         if not same or number != self._edge.due:
             missing = number - self._edge.due if same else -1
-            self._edge.skip(missing, self._reference + before.offset, self.law.voltage)
-        if self._edge.agent is not before:
-            self._in_force = self._edge.agent.parameters
+            self._edge.skip(missing, self._reference + self._edge.agent.offset, self.law.voltage)
+
+    def _follow(self, parameters: Parameters, wanted: float, position: float) -> None:
+        """Run on these; a new boot brings the old ones once more, or what came with the last sample before it."""
+        self._in_force, law = parameters, self._law(parameters)
+        if law != self.law.law:
+            self.law.change(law, wanted, position)
 
     def _law(self, parameters: Parameters) -> LawParameters:
         return self._edge.config.law(self._edge.agent.controller, parameters.tolerance)

@@ -94,8 +94,3 @@ class Pipe:
             place = end
         del self._in[:place]
         return frames
-
-
-def send_whole(end: socket.socket, frame: bytes) -> None:
-    """Send a frame over a blocking socket."""
-    end.sendall(_HEAD.pack(len(frame)) + frame)
