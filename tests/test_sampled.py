@@ -10,10 +10,12 @@ from paper_loop import CURRENT, MOTOR, RESTING, SCREW, SPEED, Array, Case, Loop
 from servotwin.control import law
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.crossing import is_leaving
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SquareWave, as_pieces
 from servotwin.simulation import Run, Simulation, simulate
+from servotwin.simulation.sampled import SampledEngine
 
 DEGREE = np.pi / 180.0
 PAPER = Servo.preset("paper")
@@ -325,3 +327,23 @@ def test_dead_zone_events_of_the_ticks() -> None:
     assert set(zone.time[~zone.state_triggered]) - {3.0} == {0.501}
     assert np.count_nonzero(zone.state_triggered) >= 3
     assert len(simulate(PAPER, 0.1, controller=PAPER.controller.replace(sample_rate=1e3), tolerance=1.0).events) == 0
+
+
+def test_a_machine_at_rest_on_a_flank_stays_there() -> None:
+    """Speed and acceleration are rounding; both the flank and the gap were once left at once, for ever."""
+    controller = PAPER.controller.replace(sample_rate=1000.0)
+    engine = Simulation(
+        PAPER, 1.0, controller=controller, gap=26.0 * DEGREE, input_bias=0.05, sample_rate=1000.0
+    ).engine
+    assert isinstance(engine, SampledEngine)
+    at_rest = [
+        8.9388262268245e-16, -3.238578447934892e-14, -3.368443595238671, -3.141550792479408, -0.0009999866751965955,
+        -0.0009999866751977627, -1.0130608536309195e-14, -1.5446491372043975e-14, -0.049999999999965204,
+        0.4537856055185257, 0.05, 0.0,
+    ]  # fmt: skip
+    leaving = {
+        (mode.name, guard.side): is_leaving(engine.tables, m, g, np.array(at_rest), engine.scratch.series)
+        for m, mode in enumerate(engine.plant.automaton.modes)
+        for g, guard in enumerate(mode.guards)
+    }
+    assert not (leaving["-/held", -1] and leaving["open/held", -1])

@@ -17,9 +17,13 @@ NEGLIGIBLE = 1e-18
 @inlined
 def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
     """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
-    rounding."""
+    rounding, `TERMS` where all are.
+
+    Where as many as there are states are zero, all are (Cayley and Hamilton): a later one is rounding, whatever its
+    size. Taken for motion it made a machine at rest on a flank leave it and come back without end.
+    """
     product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
-    for order in range(TERMS):
+    for order in range(min(TERMS, t.states)):
         if abs(c[order]) > rounding(t, mode, guard, order, x):
             return order
     return TERMS
