@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -9,10 +11,12 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from rich.console import Console
 from twin_messages import eq_21
 
 from servotwin import messages
 from servotwin.bench.estimator_windows import Case, paper_loop_cases
+from servotwin.bench.glances import triage as bench
 from servotwin.cosim import cosimulate
 from servotwin.errors import InvalidInput
 from servotwin.identify.disturbance import disturbance, quick_bias
@@ -322,3 +326,17 @@ def test_settings_in_toml() -> None:
 def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
     with pytest.raises(InvalidInput, match=f"triage {name}"):
         TriageSettings(**{name: value})
+
+
+# --- the bench
+
+
+def test_the_bench_says_how_often_a_glance_errs(tmp_path) -> None:
+    output = tmp_path / "triage.json"
+    rows = bench(output=output, gaps=2, console=Console(file=io.StringIO()))
+    for row in rows:
+        assert row.seen[0] < 0.1
+        assert row.seen[-1] == 1.0
+        assert list(row.seen) == sorted(row.seen)
+        assert 0.0 < row.least <= row.median
+    assert len(json.loads(output.read_text())["rows"]) == len(rows) == 3

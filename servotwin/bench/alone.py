@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from servotwin.bench import accuracy, endurance, tick
+from servotwin.bench import accuracy, endurance, glances, tick
 from servotwin.bench.fleet import command as whole
 from servotwin.bench.fleet.setting import QUICK, Scale
 from servotwin.bench.novelty import command as worth_sending
@@ -35,6 +35,10 @@ def _fleet(date: str, output: Path | None, quick: bool) -> None:
     whole.fleet(date, output, QUICK if quick else Scale())
 
 
+def _triage(date: str, output: Path | None, quick: bool) -> None:
+    glances.triage(date, output, glances.QUICK if quick else glances.GAPS)
+
+
 def _tick(date: str, output: Path | None, quick: bool) -> None:
     tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
 
@@ -43,6 +47,7 @@ ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     accuracy.NAME: _estimator,
     endurance.NAME: _hostile,
     whole.NAME: _fleet,
+    glances.NAME: _triage,
     side_by_side.NAME: _policies,
     tick.NAME: _tick,
     worth_sending.NAME: _novelty,

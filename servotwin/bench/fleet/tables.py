@@ -12,7 +12,7 @@ from rich.table import Table
 from servotwin.bench.fleet.runs import Ran
 from servotwin.bench.fleet.setting import Scale
 from servotwin.bench.fleet.watch import EDGES, TWIN, WORKERS
-from servotwin.bench.machine import machine
+from servotwin.bench.machine import cores, machine
 
 ROLES = (EDGES, TWIN, WORKERS)
 ASKED_INGEST = 2000.0
@@ -60,6 +60,9 @@ def _of_cadence(scale: Scale, whole: Ran) -> Iterator[Line]:
         "... behind schedule at the edges: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.late))
     )
     yield Line("... cores kept busy: edges, twin, workers", "2", _cores(whole))
+    spent = [1e3 * whole.watch.spent(role) / max(1, told.windows) for role in ROLES]
+    allowed = 1e3 * cores() / scale.rate
+    yield Line("... processor time per window: the same", f"< {allowed:.3g} ms", _numbers("ms", *spent))
 
 
 def _of_outage(scale: Scale, whole: Ran) -> Iterator[Line]:
@@ -86,8 +89,8 @@ def show(scale: Scale, alone: Ran, whole: Ran, console: Console) -> None:
 
 def _says(whole: Ran) -> str:
     """What shares the machine with the twin."""
-    cores = {role: whole.watch.cores(role) for role in ROLES}
-    share = cores[EDGES] / max(1e-9, sum(cores.values()))
+    spent = {role: whole.watch.spent(role) for role in ROLES}
+    share = spent[EDGES] / max(1e-9, sum(spent.values()))
     return f"The edges are {100.0 * share:.0f} % of the processor time; they run on the same cores as the twin."
 
 

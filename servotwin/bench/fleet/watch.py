@@ -61,12 +61,15 @@ class Watch:
         self.samples.append(sample)
         return sample
 
+    def spent(self, role: str) -> float:
+        """s of processor time between the first and the last look at a role."""
+        seen = [sample.used[role].cpu for sample in self.samples if role in sample.used] or [0.0]
+        return seen[-1] - seen[0]
+
     def cores(self, role: str) -> float:
-        """How many cores a role kept busy between the first and the last look at it."""
-        seen = [(sample.time, sample.used[role].cpu) for sample in self.samples if role in sample.used]
-        if len(seen) < 2 or seen[-1][0] <= seen[0][0]:
-            return 0.0
-        return (seen[-1][1] - seen[0][1]) / (seen[-1][0] - seen[0][0])
+        """How many cores a role kept busy meanwhile."""
+        times = [sample.time for sample in self.samples if role in sample.used]
+        return self.spent(role) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
     def memory(self, role: str) -> tuple[int, int, int]:
         """Bytes at the first look, half-way and at most."""
