@@ -35,7 +35,13 @@ _DESCRIPTION = (
 def make_app(edge: EdgeApi, read: ReadApi, step: StepApi | None, metrics: Metrics, lifespan: Lifespan) -> FastAPI:
     """The application; `step` only where time is what requests say it is."""
     app = FastAPI(
-        title="servotwin twin", version="1", description=_DESCRIPTION, lifespan=lifespan, docs_url=None, redoc_url=None
+        title="servotwin twin",
+        version="1",
+        description=_DESCRIPTION,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
     )
     for method, path, endpoint, says in _routes(edge, read, step):
         app.add_api_route(path, endpoint, methods=[method], openapi_extra=says, response_model=None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import re
 from collections.abc import Callable
 from functools import partial
@@ -18,9 +20,12 @@ from servotwin.service.refused import Refused
 from servotwin.service.shelf import Shelf
 from servotwin.store.errors import StoreUnavailable
 from servotwin.store.links import Found, Link
+from servotwin.store.rows import Waiting
 from servotwin.store.store import Store
 
 MOST = 1000
+FRESH_S = 0.5
+"""s for which a count of what waits is told again."""
 Health = Callable[[], dict[str, Any]]
 """What is well: "ok" as a whole, and why."""
 
@@ -50,6 +55,8 @@ class ReadApi:
     ) -> None:
         self._authority, self._store, self._shelf = authority, store, shelf
         self._health, self._metrics, self._wall = health, metrics, wall
+        self._counting = asyncio.Lock()
+        self._count: tuple[float, Waiting | None] = -math.inf, None
 
     async def servos(self, request: Request) -> Response:
         """Every servo that was heard of, by name; `after` a name, `limit` at most."""
@@ -99,8 +106,7 @@ class ReadApi:
         """Whether all is well: 200, or 503; and how much waits."""
         found = self._health()
         try:
-            waiting = await self._shelf.ask(lambda: self._store.waiting(self._wall()))
-            found["waiting"] = waiting._asdict()
+            found["waiting"] = (await self._counted())._asdict()
         except StoreUnavailable:
             found["ok"] = found["store"] = False
         return as_json(found, 200 if found["ok"] else 503)
@@ -108,6 +114,15 @@ class ReadApi:
     async def metrics(self, _request: Request) -> Response:
         """Prometheus' text format."""
         return Response(self._metrics.text(), media_type=CONTENT_TYPE)
+
+    async def _counted(self) -> Waiting:
+        """How much waits; counted now and then only, as anybody may ask, and as often as he likes."""
+        async with self._counting:
+            at, found = self._count
+            if found is None or self._wall() - at >= FRESH_S:
+                found = await self._shelf.ask(lambda: self._store.waiting(self._wall()))
+                self._count = self._wall(), found
+            return found
 
     def _named(self, request: Request) -> str:
         """The servo of the address, for an operator."""
