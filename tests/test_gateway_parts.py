@@ -387,6 +387,23 @@ def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> No
     assert len(drive.voltages) == 10
 
 
+def test_a_drive_that_was_right_before_may_come_right_again() -> None:
+    """As a server that is up before its variables are there."""
+    edge = edge_of(PipeOutlet(False))
+    drive = ScriptedDrive([*samples(0, 5), DriveLost("gone"), *samples(5, 5), None])
+    reach, refusals = drive.connect, [None, InvalidInput("no such variable"), None]
+
+    def connect() -> None:
+        reach()
+        refused = refusals.pop(0)
+        if refused is not None:
+            raise refused
+
+    drive.connect = connect
+    until(Stop(), edge, drive, lambda: Controlling(edge, drive))
+    assert (refusals, edge.counts["drive lost"], edge.agent.samples) == ([], 2, 10)
+
+
 @pytest.mark.parametrize("role", [Controlling, Supervising])
 def test_another_machine_under_the_due_number_begins_a_new_boot(role: type) -> None:
     supervised = role is Supervising

@@ -33,6 +33,8 @@ from servotwin.messages import Acknowledge, InvalidMessage, encode
 
 NICE = 10
 TEND_S = 1.0
+SHORTEST_S = 0.1
+"""Between two polls that bring nothing: a twin that does not wait, since it ends, is not asked as often as it goes."""
 
 
 class LinkProcess:
@@ -167,7 +169,7 @@ class LinkProcess:
             told = self._listener.step()
             for serial, body in told.messages:
                 self._emit(frames.encode(frames.HeardFrame(serial, body)))
-            self._stopping.wait(told.wait_s)
+            self._stopping.wait(told.wait_s if told.messages else max(told.wait_s, SHORTEST_S))
 
     def _emit(self, frame: bytes) -> None:
         """From another thread: let the main one send it."""

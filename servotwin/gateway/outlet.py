@@ -77,6 +77,11 @@ class PipeOutlet:
         """Whether the link process has taken everything."""
         return not self._kept and (self._pipe is None or self._pipe.backlog == 0)
 
+    @property
+    def untaken(self) -> int:
+        """Windows that no link process is known to have on the disk."""
+        return len(self._cuts)
+
     def connect(self, pipe: Pipe) -> None:
         """A new link process: it is given everything that the last one may not have taken."""
         self.disconnect()

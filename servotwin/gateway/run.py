@@ -85,7 +85,7 @@ def run(path: str | os.PathLike[str]) -> None:
         drive.close()
         for each, handler in before.items():
             signal.signal(each, handler)
-        say("end")
+        say("end", windows_left_behind=outlet.untaken)
 
 
 def first_parameters(path: Path) -> Parameters | None:
@@ -124,9 +124,8 @@ def until(stop: Stop, edge: Edge, drive: Drive, role_of: Callable[[], Role]) -> 
     hurry(edge.config.priority)
     while not stop.wanted:
         try:
-            drive.connect()
+            _connect(edge.config, drive, known=role is not None)
             troubles.look("drive", "")
-            _check_rate(edge.config, drive)
             role = role_of() if role is None else role
             go_on(stop, role)
             return
@@ -189,6 +188,17 @@ def _wait(stop: Stop, edge: Edge) -> None:
 
 def _role(edge: Edge, drive: Any) -> Role:
     return Controlling(edge, drive) if edge.config.role == "control" else Supervising(edge, drive)
+
+
+def _connect(config: EdgeConfig, drive: Drive, known: bool) -> None:
+    """Reach the drive; what is wrong with one that was right before may come right again, as when it starts up."""
+    try:
+        drive.connect()
+        _check_rate(config, drive)
+    except InvalidInput as error:
+        if not known:
+            raise
+        raise DriveLost(str(error)) from None
 
 
 def _check_rate(config: EdgeConfig, drive: Drive) -> None:
