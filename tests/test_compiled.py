@@ -9,6 +9,7 @@ import sys
 import pytest
 
 import servotwin
+from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled, stamp
 
 LIST_STAMPS = """
@@ -76,3 +77,14 @@ def test_stamps_follow_helpers_and_constants(stamp_of) -> None:
     assert stamp_of(plus_two, 2.0) != base
     assert stamp_of(plus_one, 3.0) != base
     assert compiled(caller).py_func(1.0) == 6.0
+
+
+def test_a_cache_that_has_no_place_is_a_sentence(monkeypatch):
+    """As under a service manager: servotwin's folder is read-only and its user has no home."""
+
+    def refused(_self, py_func):
+        raise RuntimeError(f"cannot cache function {py_func.__name__!r}: no locator available for file 'x.py'")
+
+    monkeypatch.setattr("numba.core.caching.FunctionCache.__init__", refused)
+    with pytest.raises(InvalidInput, match="name one that may be in the environment variable NUMBA_CACHE_DIR"):
+        compiled(lambda x: x)
