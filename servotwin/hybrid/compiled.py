@@ -51,8 +51,8 @@ def _compile(function: _Function, **options: Any) -> _Function:
         dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     except RuntimeError:  # it compiles when it is first called: nothing but the cache can be amiss here
         raise InvalidInput(
-            "compiled code cannot be kept: neither the folder of servotwin nor the user's home may be written; name one "
-            "that may be in the environment variable NUMBA_CACHE_DIR"
+            "compiled code cannot be kept: neither the folder of servotwin nor the user's home may be written; name "
+            "one that may in the environment variable NUMBA_CACHE_DIR"
         ) from None
     # A set of strings is written in another order by every process.
     told = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
