@@ -248,7 +248,7 @@ def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
 class ScriptedDrive:
     """Both drives: gives what it is told, notes what it is given."""
 
-    machine, lag, can_move, rate = "m", 0.0, True, RATE
+    machine, lag, can_move, patient, rate = "m", 0.0, True, False, RATE
 
     def __init__(self, given: list[Sample | Block | Exception | None]) -> None:
         self.given, self.voltages, self.log = given, [], []
@@ -457,6 +457,42 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far)
     assert answer.taken
     role.stop()
     assert drive.log[-1] == "move 0.0"
+
+
+def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet, "MOST", 2000)
+    dropped = {}
+    for patient in (False, True):
+        box = PipeOutlet(True)
+        box.connect(far.near)
+        edge = edge_of(box, SUPERVISED)
+        drive = ScriptedDrive([block(10 * k, 10, 1e-3 * k) for k in range(12)])
+        drive.patient = patient
+        monkeypatch.setattr(edge, "pause", lambda _, box=box: [box._done(serial) for serial in list(box._kept)[:1]])
+        role = Supervising(edge, drive)
+        for _ in range(12):
+            role.step()
+        dropped[patient] = box.dropped[BEHIND]
+    assert dropped[False] > 0
+    assert dropped[True] == 0
+
+
+def test_the_end_waits_while_the_link_process_takes_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = PipeOutlet(True)
+    edge = edge_of(box)
+    for k in range(50):
+        box.offer(cut(k), 0.0)
+    clock = edge.clock
+
+    def pause(seconds: float) -> None:
+        clock.pause(200.0 * seconds)
+        if len(box._cuts) > 3:
+            box._done(min(box._cuts))
+
+    monkeypatch.setattr(edge, "pause", pause)
+    edge.finish(3.0)
+    assert box.untaken == 3
+    assert 47.0 < clock.now < 55.0
 
 
 def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:

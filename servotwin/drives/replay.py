@@ -89,6 +89,11 @@ class Replay:
         return self._extent.rate
 
     @property
+    def patient(self) -> bool:
+        """Where it is read as fast as it goes."""
+        return self._speed == 0.0
+
+    @property
     def machine(self) -> str:
         """The log's name."""
         return self._path.name

@@ -110,6 +110,10 @@ class SupervisedDrive(Drive, Protocol):
     def can_move(self) -> bool:
         """Whether it adds probing moves to its reference; where not, the agent's settings must allow none."""
 
+    @property
+    def patient(self) -> bool:
+        """Whether samples wait until they are read, however long that takes."""
+
     def read(self, most: int = 0) -> Block | None:
         """The next samples, at least one of them unless nothing came for a while; None: the run is over.
 

@@ -21,6 +21,7 @@ from servotwin.gateway.ticks import Counts
 
 Clock = Callable[[], float]
 CHILD_S, TOLD_S, PIECE_S = 0.1, 1.0, 0.005
+LET_UP_S = 1.0
 BRIDGED_S = 1.0
 """Time without samples after which a new boot begins."""
 
@@ -139,10 +140,20 @@ class Edge:
             self._told_due = now + TOLD_S
             self._outlet.tell(self._told())
 
+    def wait_for_link(self) -> None:
+        """Until the link process is not far behind, a while at most; for a drive whose samples wait."""
+        end = self.clock() + LET_UP_S
+        while self._outlet.behind and self.clock() < end:
+            self.exchange()
+            self.tend()
+            self.pause(PIECE_S)
+
     def finish(self, seconds: float) -> None:
-        """Give the link process a while to take what is left, and a last word on how it went."""
-        end, told = self.clock() + seconds, False
+        """Give the link process a while to take what is left, while it takes any, and a last word on how it went."""
+        end, told, left = self.clock() + seconds, False, self._outlet.untaken
         while self.clock() < end and not (told and self._outlet.settled):
+            if self._outlet.untaken < left:
+                end, left = self.clock() + seconds, self._outlet.untaken
             if self._outlet.settled:
                 self._outlet.tell(self._told())
                 told = True

@@ -82,6 +82,11 @@ class PipeOutlet:
         """Windows that no link process is known to have on the disk."""
         return len(self._cuts)
 
+    @property
+    def behind(self) -> bool:
+        """Whether the link process has so much to take that windows may have to be given up soon."""
+        return self._size > MOST // 2
+
     def connect(self, pipe: Pipe) -> None:
         """A new link process: it is given everything that the last one may not have taken."""
         self.disconnect()

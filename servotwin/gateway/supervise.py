@@ -31,6 +31,8 @@ class Supervising:
     def step(self) -> bool:
         """One block; whether the run goes on. Raises `DriveLost`."""
         self._follow()
+        if self._drive.patient:
+            self._edge.wait_for_link()
         block = self._drive.read(self._until())
         began = self._edge.clock()
         if block is None:

@@ -36,7 +36,7 @@ class OpcUaDrive:
         Monotonic seconds, and how to wait for some.
     """
 
-    can_move = False
+    can_move = patient = False
     lag = 0.0
 
     def __init__(

@@ -154,7 +154,7 @@ class SimulatedSupervised:
     Reconnected to the same run of the machine it goes on with the sample that is due, as long as the machine has it.
     """
 
-    can_move = True
+    can_move, patient = True, False
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
         self._line = Line(address, "supervise", silence)
