@@ -177,6 +177,12 @@ class Agent:
             self._supervisor.answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
+    def put_back(self, former: Parameters) -> list[Outgoing]:
+        """The drive does not take what is in force, and runs on those; returns what is to be sent now."""
+        said = self._supervisor.put_back(former)
+        self._deadline = self._next_deadline()
+        return [Outgoing(self.samples, each) for each in said]
+
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller

@@ -64,6 +64,10 @@ class Supervisor:
         """Take an update from the twin."""
         return self._take(switch.offer(self._state, update, self._rules, self._here, self._error))
 
+    def put_back(self, former: Parameters) -> Said:
+        """The drive runs on those, as it does not take what is in force."""
+        return self._take(switch.put_back(self._state, former, self._here))
+
     def asked(self, now: float) -> None:
         """A window is on its way to the twin."""
         self._asked = now if self._asked is None else self._asked

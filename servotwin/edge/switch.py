@@ -22,9 +22,11 @@ from servotwin.edge.guard import Instant, applied, judge, receipt, repeats
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.verdict import FallbackSet, Verdict
-from servotwin.messages import Fallback, Gains, Reason, Receipt, Update
+from servotwin.messages import Cause, Fallback, Gains, Reason, Receipt, Update
 
 MOST_DOUBLINGS = 6
+REFUSED_S = 10.0
+"""No update is taken so long after a drive has refused one, twice as long after the next."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,23 +116,26 @@ def settle(state: Switch, rules: Rules, here: Instant, error: float | None) -> S
 
 def fall_back(state: Switch, fallback: FallbackSet, verdict: Verdict, here: Instant) -> Step:
     """The fallback set at the next sample, whatever the error is; what waits is refused."""
+    gains = fallback.gains or state.current.gains
+    new = Parameters(0, fallback.tolerance, here.time, gains=gains, band=fallback.band, fallback=True)
+    return _leave(state, new, fallback.gains, verdict, fallback.refuse_s, here)
+
+
+def put_back(state: Switch, former: Parameters, here: Instant) -> Step:
+    """What the drive runs on, as it does not take what is in force; what waits is refused."""
+    new = replace(former, data_time=here.time, window=None)
+    return _leave(state, new, former.gains, Verdict(Cause.DRIVE, 0.0, 0.0), REFUSED_S, here)
+
+
+def _leave(
+    state: Switch, new: Parameters, gains: Gains | None, verdict: Verdict, refuse_s: float, here: Instant
+) -> Step:
+    """Other parameters at the next sample, under a version of their own, and no updates for a while."""
     old, waiting = state.current, state.waiting
     version = 1 + max(old.version, 0 if waiting is None else waiting.update.version)
-    refuse_s = fallback.refuse_s * 2.0 ** min(state.fallbacks, MOST_DOUBLINGS)
-    new = Parameters(
-        version,
-        fallback.tolerance,
-        here.time,
-        None,
-        here.sample,
-        gains=fallback.gains or old.gains,
-        band=fallback.band,
-        fallback=True,
-        not_before=here.sample + round(refuse_s * here.rate),
-    )
-    told = Fallback(
-        here.servo, here.boot, here.sample, *verdict, old.version, version, fallback.tolerance, fallback.gains
-    )
+    not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, MOST_DOUBLINGS) * here.rate)
+    new = replace(new, version=version, sample=here.sample, not_before=not_before)
+    told = Fallback(here.servo, here.boot, here.sample, *verdict, old.version, version, new.tolerance, gains)
     refused = () if waiting is None else (receipt(waiting.update, Reason.AFTER_FALLBACK, here.sample, new, here),)
     return Step(Switch(new, None, state.fallbacks + 1), (*refused, told))
 

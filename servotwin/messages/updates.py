@@ -38,6 +38,7 @@ class Cause(StrEnum):
     ERROR_ENERGY = "error energy outside the predicted band"
     EFFORT = "effort outside the predicted band"
     SILENCE = "the twin is silent"
+    DRIVE = "the drive does not take the parameters"
 
 
 class Gains(Struct, frozen=True):
@@ -213,7 +214,7 @@ class Fallback(Struct, frozen=True, tag="fallback/1"):
         First sample under the fallback set.
     cause : Cause
     measured, allowed : float
-        What was seen and what was allowed: m, V or s, as the cause says.
+        What was seen and what was allowed: m, V or s, as the cause says; 0 where it is a drive's refusal.
     replaced : int
         The version that was in force.
     parameter_version : int

@@ -198,6 +198,8 @@ def _event(one: Told) -> Entry:
 
 def _measured(body: Told) -> str:
     """What was seen and what was allowed, in the cause's unit."""
+    if body.get("cause") == Cause.DRIVE:
+        return ""
     scale, unit = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, "V")}.get(body.get("cause", ""), (1e6, "um"))
     try:
         return f", {body['measured'] * scale:.4g} {unit} where {body['allowed'] * scale:.4g} {unit} are allowed"
