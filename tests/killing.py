@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from random import Random
 
-from deployment import EVERY, PATIENCE, RATE, WINDOW_S, Fleet, count_witnessed, dropped, receipts, stored, witnessed
+from deployment import EVERY, PATIENCE, RATE, WINDOW_S, Fleet
 from mosquitto import Mosquitto
+from records import count_witnessed, dropped, receipts, stored, witnessed
 
 APART_S = 8.0
 """Kills of one edge: the second of two in one window's time would take a window of its own."""

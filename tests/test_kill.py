@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from deployment import Fleet, deployed, end_all, logs, pending, until, witnessed
+from deployment import Fleet, deployed, end_all, logs, until
 from httprelay import Chances, HttpRelay
 from killing import (
     Killer,
@@ -14,6 +14,7 @@ from killing import (
     strike_until,
 )
 from mosquitto import broker
+from records import pending, witnessed
 from relay import Relay, Weather
 
 SEED = 20

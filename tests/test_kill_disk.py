@@ -7,21 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from deployment import (
-    Fleet,
-    Process,
-    count_stored,
-    count_witnessed,
-    deployed,
-    dropped,
-    end_all,
-    logs,
-    pending,
-    stored,
-    until,
-    witnessed,
-)
+from deployment import Fleet, Process, deployed, end_all, logs, until
 from killing import by_boot, check_controllers_ticked, check_exactly_once
+from records import count_stored, count_witnessed, dropped, pending, stored, witnessed
 from smalldisk import Disk, small_disk
 
 FAULT_S = 6.0
