@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 import secrets
 import shutil
+import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.gateway.config import ROLES, UNBOOTED, EdgeConfig, TwinLink
@@ -18,13 +20,14 @@ from servotwin.outputs import make_directory, write_text
 from servotwin.plant.noise import Noise
 from servotwin.scenario import Scenario
 from servotwin.scenariofile import Recording
+from servotwin.service.alone import in_turn
 from servotwin.service.config import ServiceConfig
 from servotwin.service.secretfile import PRIVATE, write_private
 from servotwin.service.tokens import Verifiers, read_tokens, write_tokens
 from servotwin.service.twinfile import TwinFile, read_twin
-from servotwin.tomltable import read_toml
+from servotwin.tomltable import did_you_mean, read_toml
 
-TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "twin.crt"
+TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
 
 
@@ -49,6 +52,9 @@ class Enrolment:
         A servo that has a token gets another one; the former counts no more.
     noise : float
         m rms on the measured position, which the edge's watch has to put up with.
+    ca : Path or None
+        Certificates that the edge checks the twin's against. None: the twin's own where it has signed itself, else
+        those of the edge's system.
     """
 
     servo: str
@@ -59,6 +65,7 @@ class Enrolment:
     url: str | None = None
     again: bool = False
     noise: float = 0.0
+    ca: Path | None = None
 
 
 def enroll(path: Path, wanted: Enrolment) -> list[Path]:
@@ -73,15 +80,14 @@ def enroll(path: Path, wanted: Enrolment) -> list[Path]:
     """
     twin = read_twin(path)
     tokens = _tokens_file(twin)
-    known = _known(tokens)
-    _check(wanted, known)
+    _check(wanted, _known(tokens))
     new = not (wanted.folder / CONFIG).exists()
     text = edge_toml(edge_config(twin, wanted)) if new else ""
     token, folder = secrets.token_urlsafe(32), make_directory(wanted.folder)
-    made = _configured(twin, folder, text) if new else []
+    made = _configured(_trusted(twin, wanted), folder, text) if new else []
     write_private(folder / TOKEN, token + "\n")
     made.append(folder / TOKEN)
-    write_tokens(tokens, replace(known, servos={**known.servos, wanted.servo: verifier_of(token)}))
+    _add(tokens, "servos", wanted.servo, token, wanted.again)
     return [*made, tokens]
 
 
@@ -89,12 +95,32 @@ def enroll_operator(path: Path, name: str, file: Path, again: bool = False) -> l
     """Make an operator known, whose token goes to `file`; as `enroll`."""
     twin = read_twin(path)
     tokens = _tokens_file(twin)
-    known = _known(tokens)
-    _check_name(name, known.operators, again)
+    _check_name(name, _known(tokens).operators, again)
+    if file.exists() and not again:
+        raise InvalidInput(f"{file}: is there already; give another file, or --again to replace it by a new token")
     token = secrets.token_urlsafe(32)
     write_private(file, token + "\n")
-    write_tokens(tokens, replace(known, operators={**known.operators, name: verifier_of(token)}))
+    _add(tokens, "operators", name, token, again)
     return [file, tokens]
+
+
+def revoke(path: Path, name: str) -> Path:
+    """Take a servo's or an operator's token from the twin of that file: it counts no more, at once; the tokens' file.
+
+    Raises
+    ------
+    InvalidInput
+        Nobody of that name has a token.
+    """
+    tokens = _tokens_file(read_twin(path))
+    known = read_tokens(tokens)
+    if name not in known.servos and name not in known.operators:
+        raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, [*known.servos, *known.operators])}")
+    servos, operators = dict(known.servos), dict(known.operators)
+    servos.pop(name, None)
+    operators.pop(name, None)
+    write_tokens(tokens, Verifiers(servos, operators))
+    return tokens
 
 
 def drive_of(path: Path | None) -> Mapping[str, object]:
@@ -123,7 +149,7 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
         noise=Noise(wanted.noise) if wanted.noise > 0.0 else None,
     )
     agent = replace(scenario.agent_settings(), boot=UNBOOTED)
-    certificate = None if twin.service.tls_certificate is None else CERTIFICATE
+    certificate = None if _trusted(twin, wanted) is None else CERTIFICATE
     link = TwinLink(wanted.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
     return EdgeConfig(agent, wanted.role, agent.controller or law, wanted.drive, link, folder=wanted.folder)
 
@@ -142,17 +168,43 @@ def url_of(service: ServiceConfig) -> str:
     return f"{'http' if service.tls_key is None else 'https'}://{host}:{service.port}"
 
 
-def _configured(twin: TwinFile, folder: Path, text: str) -> list[Path]:
+def _configured(certificates: Path | None, folder: Path, text: str) -> list[Path]:
     made = [write_text(folder / CONFIG, text)]
-    if twin.service.tls_certificate is not None:
-        made.append(Path(shutil.copy(twin.service.tls_certificate, folder / CERTIFICATE)))
+    if certificates is not None:
+        made.append(Path(shutil.copyfile(certificates, folder / CERTIFICATE)))
     return made
+
+
+def _trusted(twin: TwinFile, wanted: Enrolment) -> Path | None:
+    """What the edge checks the twin's certificate against; None: what its system knows."""
+    if wanted.ca is not None:
+        _signers(wanted.ca)
+        return wanted.ca
+    own = twin.service.tls_certificate
+    return own if own is not None and any(each["subject"] == each["issuer"] for each in _signers(own)) else None
+
+
+def _signers(certificates: Path) -> list[Any]:
+    """Those in a file that may sign others; raises InvalidInput where it holds no certificates."""
+    try:
+        return ssl.create_default_context(cafile=str(certificates)).get_ca_certs()
+    except OSError as error:
+        raise InvalidInput(f"{certificates}: holds no certificates that can be read ({error})") from None
 
 
 def _tokens_file(twin: TwinFile) -> Path:
     if twin.service.tokens is None:
         raise InvalidInput(f'{twin.path}: [service] names no file of tokens; add tokens = "tokens.toml"')
     return twin.service.tokens
+
+
+def _add(tokens: Path, role: str, name: str, token: str, again: bool) -> None:
+    """To the file as it is now: others may have been enrolled meanwhile."""
+    with in_turn(tokens):
+        known = _known(tokens)
+        there: Mapping[str, bytes] = getattr(known, role)
+        _check_name(name, there, again)
+        write_tokens(tokens, replace(known, **{role: {**there, name: verifier_of(token)}}))
 
 
 def _known(tokens: Path) -> Verifiers:

@@ -3,13 +3,14 @@
 import json
 import re
 import stat
+import threading
 
 import httpx
 import pytest
 from service_system import OPERATOR, bearer, place, process, twin_file, window
 from typer.testing import CliRunner
 
-from servotwin import cli
+from servotwin import cli, provision
 from servotwin.edge.settings import AgentSettings
 from servotwin.gateway.config import token_of
 from servotwin.gateway.configfile import load
@@ -145,3 +146,29 @@ def test_a_store_is_backed_up_and_put_back(tmp_path):
     assert run("restore", tmp_path / "copy.db", "--config", twin).exit_code == 0
     assert (tmp_path / "twin.db").exists()
     assert run("restore", tmp_path / "nothing.db", "--config", twin).exit_code == 2
+
+
+def test_whoever_is_enrolled_at_the_same_time_is_not_forgotten(tmp_path):
+    twin = fresh(tmp_path)
+    barrier, made = threading.Barrier(8), []
+
+    def enroll(name):
+        barrier.wait()
+        made.extend(provision.enroll_operator(twin, name, tmp_path / name))
+
+    threads = [threading.Thread(target=enroll, args=(f"boss-{i}",)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 16
+    assert sorted(read_tokens(tmp_path / "tokens.toml").operators) == [f"boss-{i}" for i in range(8)]
+
+
+def test_an_operator_s_token_replaces_no_file_that_is_there(tmp_path):
+    twin = fresh(tmp_path)
+    before = twin.read_text()
+    refused = run("enroll", "boss", "--operator", twin, "--twin", twin)
+    assert refused.exit_code == 2
+    assert "is there already" in refused.stderr
+    assert twin.read_text() == before

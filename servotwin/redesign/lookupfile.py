@@ -93,7 +93,7 @@ def told(policy: CertifiedPolicy) -> dict[str, str]:
     """Everything that a policy's proofs depend on, by name and in full."""
     parts = {"servotwin": servotwin.__version__, "feedforward_limit": repr(policy.feedforward_limit)}
     for name in ("servo", "uncertainty", "demands"):
-        parts |= dict(_lines(name, getattr(policy, name)))
+        parts |= dict(spelled(name, getattr(policy, name)))
     trial = {f"trial.{name}": repr(getattr(policy.trial, name)) for name in ("duration", "last", "rate")}
     return {**parts, **trial}
 
@@ -134,11 +134,11 @@ def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
         )
 
 
-def _lines(name: str, value: object) -> Iterator[tuple[str, str]]:
-    """(dotted name, value in full) of every value in nested dataclasses."""
+def spelled(name: str, value: object) -> Iterator[tuple[str, str]]:
+    """(dotted name, value in full) of everything in nested dataclasses."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            yield from _lines(f"{name}.{field.name}", getattr(value, field.name))
+            yield from spelled(f"{name}.{field.name}", getattr(value, field.name))
     else:
         yield name, repr(value)
 

@@ -1,4 +1,4 @@
-"""One process for one SQLite store: two would lend each other's servos away, and never tell each other's edges."""
+"""Locks between processes: they end with whoever holds them, however that ends."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from servotwin.store.address import address_of, file_of
 
 @contextmanager
 def alone(store: str) -> Iterator[None]:
-    """Hold a store for this process, however it ends; one of PostgreSQL is shared, and not held.
+    """Hold a store for this process; one of PostgreSQL is shared, and not held.
 
-    A file beside the store is locked: SQLite loses its own locks where the store's is opened and closed once more.
+    Two services on one SQLite store would lend each other's servos away, and never tell each other's edges.
 
     Raises
     ------
@@ -28,26 +28,34 @@ def alone(store: str) -> Iterator[None]:
     if file is None:
         yield
         return
-    whole = file.resolve()
-    descriptor = _opened(whole.with_name(f"{whole.name}-lock"))
-    try:
-        _hold(descriptor, file)
+    with _beside(file) as descriptor:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InvalidInput(
+                f"store {file}: another twin works on it; end that one first, or let several share a PostgreSQL"
+            ) from None
         yield
-    finally:
-        os.close(descriptor)
 
 
-def _opened(lock: Path) -> int:
+@contextmanager
+def in_turn(file: Path) -> Iterator[None]:
+    """Change a file after whoever else is changing it; raises InvalidInput where nothing can be made beside it."""
+    with _beside(file) as descriptor:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+
+
+@contextmanager
+def _beside(file: Path) -> Iterator[int]:
+    """The file that is locked: not `file`, which is replaced, or loses SQLite's own locks when it is closed."""
+    whole = file.resolve()
+    lock = whole.with_name(f"{whole.name}-lock")
     try:
-        return os.open(lock, os.O_CREAT | os.O_RDWR, PRIVATE)
+        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, PRIVATE)
     except OSError as error:
         raise InvalidInput(f"{lock}: cannot be made ({error.strerror})") from None
-
-
-def _hold(descriptor: int, file: Path) -> None:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        raise InvalidInput(
-            f"store {file}: another twin works on it; end that one first, or let several share a PostgreSQL"
-        ) from None
+        yield descriptor
+    finally:
+        os.close(descriptor)

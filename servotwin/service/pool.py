@@ -126,11 +126,6 @@ class Pool:
         """Workers whose process runs."""
         return sum(worker.pid is not None for worker in self._workers)
 
-    @property
-    def pids(self) -> list[int]:
-        """Of the processes that run."""
-        return [worker.pid for worker in self._workers if worker.pid is not None]
-
     async def begin(self) -> None:
         """Start all workers.
 

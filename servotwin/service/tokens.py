@@ -57,9 +57,7 @@ def read_tokens(path: Path) -> Verifiers:
 def write_tokens(path: Path, verifiers: Verifiers) -> None:
     """Replace the file as a whole, mode 0600; InvalidInput where that is impossible."""
     parts = [_written("servos", verifiers.servos), _written("operators", verifiers.operators)]
-    write_private(
-        path, "# Digests of tokens; as precious as the tokens: keep this file to its owner.\n" + "\n".join(parts)
-    )
+    write_private(path, _HEAD + "\n".join(parts))
 
 
 def _written(name: str, verifiers: Mapping[str, bytes]) -> str:

@@ -25,7 +25,6 @@ _LOG_PAGES = 2000
 _READERS = 8
 _OURS = (IntegrityError, DataError, ProgrammingError)
 _LOST_RACES = ("40001", "40P01")
-_ATTEMPTS = 5
 
 
 class Engines(NamedTuple):

@@ -12,8 +12,7 @@ import json
 import os
 import platform
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib import import_module, metadata
 from pathlib import Path
@@ -25,6 +24,7 @@ import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.identify.gap import METHODS
 from servotwin.plant.servo import Servo
+from servotwin.redesign.lookupfile import spelled
 from servotwin.twin.settings import TwinSettings
 
 SOURCES = ("control", "hybrid", "identify", "messages", "plant", "redesign", "simulation", "twin")
@@ -41,7 +41,7 @@ def context_of(servo: Servo, settings: TwinSettings) -> tuple[str, str]:
 
     The JSON is one object of texts: what each thing is called, and the value in full.
     """
-    parts = {**surroundings(), **dict(_lines(_MODEL, servo)), **dict(_lines(_SETTINGS, settings))}
+    parts = {**surroundings(), **dict(spelled(_MODEL, servo)), **dict(spelled(_SETTINGS, settings))}
     text = json.dumps(parts, sort_keys=True, indent=0)
     return hashlib.sha256(text.encode()).hexdigest()[:32], text
 
@@ -114,15 +114,6 @@ def _source(package: str) -> str:
     for path in sorted((root / package).rglob("*.py")):
         total.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes() + b"\0")
     return total.hexdigest()[:16]
-
-
-def _lines(name: str, value: object) -> Iterator[tuple[str, str]]:
-    """(dotted name, value in full) of everything in nested dataclasses."""
-    if is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from _lines(f"{name}.{field.name}", getattr(value, field.name))
-    else:
-        yield name, repr(value)
 
 
 def _nested(parts: Mapping[str, str], name: str) -> dict[str, Any]:
