@@ -13,7 +13,7 @@ from types import FrameType
 from rich.console import Console
 from rich.live import Live
 
-from servotwin.drives.simulated.diary import write_speed
+from servotwin.drives.simulated.diary import read_speed, write_speed
 from servotwin.errors import InvalidInput
 from servotwin.up import display, pacing, usage
 from servotwin.up.display import Picture, clock
@@ -28,6 +28,7 @@ from servotwin.up.twinwatch import Twin, TwinWatch
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PIECE_S, SHOW_S, SAY_S, ADAPT_S = 0.1, 0.5, 5.0, 3.0
 NEWS_S = 30.0
+SPEED, CAUTION = "speed", 0.7
 
 
 def up(path: Path, speed: float | None = None, seconds: float | None = None, console: Console | None = None) -> None:
@@ -61,8 +62,10 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
         except Stopped:
             console.print("ended before everything ran")
         finally:
-            show.end()
-            site.end()
+            try:
+                show.end()
+            finally:
+                site.end()
         show.conclude()
 
 
@@ -76,6 +79,12 @@ def greet(folder: Folder, console: Console) -> None:
             told = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
             console.print(f"going on with {told}", soft_wrap=True, highlight=False)
     console.print("starting (the very first time, code is compiled for a minute or two) ...", highlight=False)
+
+
+def first_speed(folder: Folder) -> float:
+    """A little below the last one, which another machine or another load may not hold."""
+    last = [read_speed(folder.servo(servo) / SPEED) or 0.0 for servo in SERVOS]
+    return max(pacing.SLOWEST, CAUTION * min(last))
 
 
 class Stop:
@@ -106,7 +115,7 @@ class Show:
 
     def __init__(self, folder: Folder, site: Site, speed: float | None, console: Console) -> None:
         self._folder, self._site, self._console = folder, site, console
-        self._fixed, self._speed = speed is not None, speed or pacing.SLOWEST
+        self._fixed, self._speed = speed is not None, speed or first_speed(folder)
         self._readers = {servo.name: Reader(servo, folder.servo(servo)) for servo in SERVOS}
         self._watch: TwinWatch | None = None
         self._pace = Paced()
@@ -152,7 +161,9 @@ class Show:
             self._console.print(line, soft_wrap=True, highlight=False)
         pace = self._pace
         told = f"{pace.mean_speed:.1f} times real time, {pace.told_share}, for {clock(picture.seconds)}"
-        self._console.print(f"in the mean {told}; everything has ended", soft_wrap=True, highlight=False)
+        self._console.print(
+            f"in the mean {told}; all has ended, and goes on from here", soft_wrap=True, highlight=False
+        )
 
     @contextmanager
     def _live(self) -> Iterator[Live | None]:
@@ -186,7 +197,7 @@ class Show:
     def _tell_speed(self) -> None:
         with suppress(OSError):
             for servo in SERVOS:
-                write_speed(self._folder.servo(servo) / "speed", self._speed)
+                write_speed(self._folder.servo(servo) / SPEED, self._speed)
 
     def _picture(self, now: float, twin: Twin | None) -> Picture:
         left = 0.0 if self._site.forwarder is None else self._site.forwarder.left

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from servotwin.up.pacing import CORES, LIMIT, SLOWEST
 from servotwin.up.reading import Judged, View
-from servotwin.up.twinwatch import Twin
+from servotwin.up.twinwatch import OK, Twin
 
 NONE = "-"
 HOUR = 3600.0
@@ -57,16 +57,17 @@ def rendered(picture: Picture) -> RenderableType:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=True)
     table.add_column("", style="dim", no_wrap=True)
     for view in picture.views:
-        table.add_column(view.plan.name, no_wrap=True, min_width=16)
-    for name, cell in ROWS:
+        table.add_column(view.plan.name, no_wrap=True, min_width=18)
+    troubled = any(view.restarts for view in picture.views)
+    for name, cell in [*ROWS, *([RESTARTS] if troubled else [])]:
         table.add_row(name, *(Text.from_markup(cell(view)) for view in picture.views))
     return Group(table, Text.from_markup("\n".join(["", *below(picture)]), overflow="fold"))
 
 
 def below(picture: Picture) -> list[str]:
     """Speed, processor, twin, and where all is kept."""
-    lines = [f"{_speed(picture)}   {_processor(picture)}   since {clock(picture.seconds)}", _twin(picture)]
-    lines.append(f"[dim]{escape(picture.folder)}   logs: *.log there   Ctrl-C ends it, the next start goes on[/]")
+    lines = [f"{_speed(picture)}   {_processor(picture)}   for {clock(picture.seconds)}", _twin(picture)]
+    lines.append(f"[dim]{picture.url}   {escape(picture.folder)}/*.log   Ctrl-C ends it[/]")
     return lines if not picture.news else [*lines, f"[yellow]{escape(picture.news)}[/]"]
 
 
@@ -92,7 +93,7 @@ def _short(view: View) -> str:
 
 def _speed(picture: Picture) -> str:
     if picture.cores is None and picture.reached == 0.0:
-        return "starting at {:g} x real time".format(picture.asked)
+        return f"starting at {picture.asked:g} x real time"
     slow = picture.reached < 0.95 * SLOWEST <= 0.95 * picture.asked
     note = f" [red](this machine does not hold {SLOWEST:g})[/]" if slow else ""
     return f"[bold]{picture.reached:.1f}[/] x real time{note}"
@@ -110,9 +111,9 @@ def _processor(picture: Picture) -> str:
 def _twin(picture: Picture) -> str:
     twin = picture.twin
     if twin is None:
-        return f"twin {picture.url}: [yellow]no answer yet[/]"
+        return "twin: [yellow]no answer[/]"
     counts = ", ".join(f"{number} {name}" for name, number in twin.counts.items() if number or name != "workers lost")
-    return f"twin {picture.url}: {counts}, {_waits(twin)}"
+    return f"twin: {counts}, {_waits(twin)}"
 
 
 def _waits(twin: Twin | None) -> str:
@@ -139,7 +140,8 @@ def _estimate(view: View) -> str:
         return NONE
     told = view.judged.told
     low, high = map(degrees, told.interval)
-    return f"{degrees(told.gap):.3f} ± {0.5 * (high - low):.3f}" if isfinite(high - low) else f"{degrees(told.gap):.3f}"
+    note = "" if told.status == OK else f" [yellow]{escape(told.status)}[/]"
+    return f"{degrees(told.gap):.3f} ± {0.5 * (high - low):.3f}{note}"
 
 
 def _error(view: View) -> str:
@@ -147,7 +149,7 @@ def _error(view: View) -> str:
     if judged is None or judged.error is None:
         return NONE
     colour = "green" if judged.inside else "red"
-    return f"[{colour}]{judged.error:+.4f}[/] [dim]{_ago(judged)}[/]"
+    return f"[{colour}]{round(judged.error, 4) + 0.0:+.4f}[/] [dim]{_ago(judged)}[/]"
 
 
 def _ago(judged: Judged) -> str:
@@ -169,7 +171,7 @@ def _version(view: View) -> str:
 
 def _gains(view: View) -> str:
     numbers = [_number(view, key, 1e-3, digits) for key, digits in _GAINS.items()]
-    return NONE if NONE in numbers else " / ".join(numbers)
+    return NONE if NONE in numbers else " ".join(numbers)
 
 
 def _acknowledged(view: View) -> str:
@@ -192,36 +194,36 @@ def _link(view: View) -> str:
     return "[yellow]coming back[/]" if trouble else "[green]up[/]" if view.edge else NONE
 
 
-_GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 2, "kd_v_s_per_m": 3}
+_GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 1, "kd_v_s_per_m": 2}
 ROWS: Sequence[tuple[str, Cell]] = (
     ("", lambda view: f"[dim]{view.plan.trait}[/]"),
     ("edge's role", lambda view: view.plan.role),
-    ("policy", lambda view: view.plan.model),
+    ("twin's policy", lambda view: view.plan.model),
     ("machine time", lambda view: NONE if view.machine is None else clock(view.machine.time_s)),
-    ("true gap now, deg", _gap),
+    ("true gap, deg", _gap),
     ("estimate, deg", _estimate),
     ("off by, deg", _error),
     ("wear, deg/h", _wear),
-    ("version in force", _version),
+    ("version", _version),
     ("dead zone, mm", lambda view: _number(view, "tolerance_m", 1e3, 4)),
-    ("Kp / Ki / Kd", _gains),
+    ("Kp Ki Kd, V/mm", _gains),
     ("feedforward, mV", lambda view: _number(view, "feedforward_v", 1e3, 1)),
     ("windows cut", lambda view: str(view.cut) if view.edge else NONE),
     ("acknowledged", _acknowledged),
     ("waiting", _waiting),
     ("dropped", _dropped),
     ("link", _link),
-    ("restarts", lambda view: f"[red]{view.restarts}[/]" if view.restarts else "0"),
 )
+RESTARTS: tuple[str, Cell] = ("restarts", lambda view: f"[red]{view.restarts}[/]" if view.restarts else "0")
 
 
 def summary(picture: Picture) -> Iterable[str]:
     """The last words, one line per servo."""
     for view in picture.views:
         machine = NONE if view.machine is None else clock(view.machine.time_s)
-        truth = _error(view)
-        yield Text.from_markup(
-            f"{view.plan.name}: machine time {machine}, true gap {_gap(view)} deg, estimated {_estimate(view)} deg "
-            f"(off by {truth}), version {_version(view)}; windows: {view.cut} cut, {_acknowledged(view)} acknowledged, "
-            f"{_waiting(view)} waiting, {_dropped(view)} dropped"
-        ).plain
+        windows = (
+            f"{view.cut} cut, {_acknowledged(view)} acknowledged, {_waiting(view)} waiting, {_dropped(view)} dropped"
+        )
+        gap = f"gap {_gap(view)} deg, estimated {_estimate(view)} (off by {_error(view)})"
+        told = f"{view.plan.name}: {machine} of machine time, {gap}, version {_version(view)}, windows: {windows}"
+        yield Text.from_markup(told).plain

@@ -22,7 +22,7 @@ from servotwin.link.session import Retry
 from servotwin.outputs import write_text
 from servotwin.service.tokens import Verifiers, write_tokens
 from servotwin.up.pacing import FASTEST
-from servotwin.up.plan import RATE, SERVOS, ServoPlan, machine_toml, twin_toml
+from servotwin.up.plan import PRE_TRIGGER_S, RATE, SERVOS, WINDOW_S, ServoPlan, machine_toml, twin_toml
 
 MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operator.token"
 EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
@@ -143,7 +143,8 @@ def _fill(path: Path) -> None:
         )
         provision.enroll(path / TWIN, wanted)
         config = load(folder / EDGE)
-        write_text(folder / EDGE, edge_toml(replace(config, agent=replace(config.agent, retry=_RETRY))))
+        agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
+        write_text(folder / EDGE, edge_toml(replace(config, agent=agent)))
         write_text(folder / MACHINE, machine_toml(servo))
     write_text(path / MARKER, msgspec.json.encode(Marker([servo.name for servo in SERVOS])).decode() + "\n")
 

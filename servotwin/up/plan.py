@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 RATE = 1000.0
 """Hz. Estimates of the gap are as good as at 5 kHz, to a thousandth of a degree, and a tick costs what a tick costs."""
+WINDOW_S, PRE_TRIGGER_S = 4.0, 0.3
+"""A calm loop turns the screw back late: windows of 2 s show one side only of gaps from 26 deg on, those of 3 s both
+sides of 40."""
 NEW_GAP, WORN_GAP = 0.0, 40.0
 """deg"""
 HOUR = 3600.0

@@ -23,11 +23,12 @@ METRICS = {
     'servotwin_evidence_total{kind="update"}': "updates",
     "servotwin_workers_lost_total": "workers lost",
 }
+OK = "ok"
 _REFUSED = "servotwin_refused_total{"
 
 
 class Estimated(NamedTuple):
-    """The newest estimate of a servo.
+    """The newest estimate of a servo that was OK.
 
     Attributes
     ----------
@@ -38,6 +39,7 @@ class Estimated(NamedTuple):
     interval : (float, float)
         rad, 95 %.
     status : str
+        Of the newest estimate of all.
     rate, rate_half : float
         rad/s, wear by the trend, and half its 95 % interval; NaN before there is one.
     """
@@ -149,12 +151,17 @@ def counted(metrics: str) -> dict[str, int]:
 
 
 def newest_estimate(links: list[dict[str, Any]]) -> Estimated | None:
-    """Of the evidence chain, newest window first; None: no window was estimated."""
+    """Of the evidence chain, newest window first; None: no window of them was estimated well."""
+    status = ""
     for link in links:
-        found = {each["kind"]: each["body"] for each in link["found"]}
-        estimate = (found.get("estimate") or {}).get("estimate")
-        if estimate is not None and estimate["gap"] is not None:
-            told = estimate["time"], estimate["gap"], tuple(estimate["interval"]), estimate["status"]
+        found = {each["kind"]: each for each in link["found"]}
+        if "estimate" not in found:
+            continue
+        status = status or found["estimate"]["status"]
+        if found["estimate"]["status"] == OK:
+            estimate = found["estimate"]["body"]["estimate"]
+            low, high = estimate["interval"]
+            told = estimate["time"], estimate["gap"], (low, high), status
             return Estimated(link["window"]["boot"], *told, *_wear(found.get("trend")))
     return None
 
@@ -163,4 +170,4 @@ def _wear(trend: dict[str, Any] | None) -> tuple[float, float]:
     """Rate and half its interval: second place of the trend's state, gap before and offset behind."""
     if trend is None:
         return nan, nan
-    return trend["mean"][1], NORMAL_95 * sqrt(trend["covariance"][4])
+    return trend["body"]["mean"][1], NORMAL_95 * sqrt(trend["body"]["covariance"][4])
