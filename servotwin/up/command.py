@@ -183,6 +183,8 @@ class Show:
     def _tend(self, now: float) -> None:
         for news in self._site.tend(now):
             self._news, self._news_until = news, now + NEWS_S
+            if not self._console.is_terminal:
+                self._console.print(news, soft_wrap=True, highlight=False, markup=False)
 
     def _adapt(self, now: float) -> None:
         states = {servo.name: self._readers[servo.name].machine() for servo in SERVOS}
@@ -203,7 +205,7 @@ class Show:
         left = 0.0 if self._site.forwarder is None else self._site.forwarder.left
         views = []
         for servo in SERVOS:
-            told = None if twin is None else twin.estimates.get(servo.name)
+            told = None if self._watch is None else self._watch.estimates.get(servo.name)
             restarts = self._site.machines[servo.name].restarts + self._site.edges[servo.name].restarts
             views.append(self._readers[servo.name].view(told, left if servo.outages else 0.0, restarts))
         pace, news = self._pace, self._news if now < self._news_until else ""

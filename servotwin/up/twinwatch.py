@@ -64,14 +64,11 @@ class Twin(NamedTuple):
         s since the oldest of them came.
     counts : dict of str to int
         Since its start, by the names of `METRICS`, and "refused".
-    estimates : dict of str to Estimated
-        By servo.
     """
 
     waiting: int
     age: float
     counts: dict[str, int]
-    estimates: dict[str, Estimated]
 
 
 class TwinWatch:
@@ -86,6 +83,8 @@ class TwinWatch:
     ----------
     twin : Twin or None
         None: it did not answer.
+    estimates : dict of str to Estimated
+        The newest of each servo.
     """
 
     def __init__(self, url: str, token: str, servos: Sequence[str]) -> None:
@@ -93,7 +92,7 @@ class TwinWatch:
         self._place, self._servos = (parts.hostname or "", parts.port), servos
         self._headers = {"authorization": f"Bearer {token}"}
         self.twin: Twin | None = None
-        self._known: dict[str, Estimated] = {}
+        self.estimates: dict[str, Estimated] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="twin watch", daemon=True)
 
@@ -122,12 +121,12 @@ class TwinWatch:
         waiting = msgspec.json.decode(self._get(line, "/healthz"))["waiting"]
         counts = counted(self._get(line, "/metrics").decode())
         for servo in self._servos:
-            limit = LATER if servo in self._known else FIRST
+            limit = LATER if servo in self.estimates else FIRST
             links = msgspec.json.decode(self._get(line, f"/v1/servos/{servo}/audit?limit={limit}"))
             newest = newest_estimate(links)
             if newest is not None:
-                self._known[servo] = newest
-        return Twin(waiting["messages"], waiting["age"], counts, dict(self._known))
+                self.estimates[servo] = newest
+        return Twin(waiting["messages"], waiting["age"], counts)
 
     def _get(self, line: HTTPConnection, path: str) -> bytes:
         line.request("GET", path, headers=self._headers)
