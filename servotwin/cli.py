@@ -81,6 +81,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "up": running.up,
     "twin": running.twin,
     "enroll": running.enroll,
+    "revoke": running.revoke,
     "audit": running.audit,
     "replay": running.replay,
     "backup": running.backup,

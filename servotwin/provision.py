@@ -113,13 +113,15 @@ def revoke(path: Path, name: str) -> Path:
         Nobody of that name has a token.
     """
     tokens = _tokens_file(read_twin(path))
-    known = read_tokens(tokens)
-    if name not in known.servos and name not in known.operators:
-        raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, [*known.servos, *known.operators])}")
-    servos, operators = dict(known.servos), dict(known.operators)
-    servos.pop(name, None)
-    operators.pop(name, None)
-    write_tokens(tokens, Verifiers(servos, operators))
+    with in_turn(tokens):
+        known = read_tokens(tokens)
+        everybody = [*known.servos, *known.operators]
+        if name not in everybody:
+            raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, everybody)}")
+        servos, operators = dict(known.servos), dict(known.operators)
+        servos.pop(name, None)
+        operators.pop(name, None)
+        write_tokens(tokens, Verifiers(servos, operators))
     return tokens
 
 

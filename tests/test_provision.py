@@ -4,9 +4,14 @@ import json
 import re
 import stat
 import threading
+from datetime import UTC, datetime, timedelta
 
 import httpx
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.x509.oid import NameOID
+from selfsigned import self_made
 from service_system import OPERATOR, bearer, place, process, twin_file, window
 from typer.testing import CliRunner
 
@@ -172,3 +177,51 @@ def test_an_operator_s_token_replaces_no_file_that_is_there(tmp_path):
     assert refused.exit_code == 2
     assert "is there already" in refused.stderr
     assert twin.read_text() == before
+
+
+def test_a_token_that_is_taken_back_counts_no_more(tmp_path):
+    twin = twin_file(tmp_path)
+    before = read_tokens(tmp_path / "tokens.toml")
+    assert run("revoke", "ax-1", "--twin", twin).exit_code == 0
+    assert run("revoke", "me", "--twin", twin).exit_code == 0
+    assert read_tokens(tmp_path / "tokens.toml") == before.__class__({"ax-2": before.servos["ax-2"]}, {})
+    assert stat.S_IMODE((tmp_path / "tokens.toml").stat().st_mode) == 0o600
+    again = run("revoke", "ax-1", "--twin", twin)
+    assert again.exit_code == 2
+    assert "'ax-1' has no token" in again.stderr
+
+
+def test_an_edge_gets_what_it_needs_to_believe_the_twin(tmp_path):
+    """A certificate that has signed itself goes along; one of the system's does not; signers are named."""
+    certificate, key = self_made(tmp_path)
+    tls = f'tls_certificate = "{certificate}"\ntls_key = "{key}"\n'
+    twin = fresh(tmp_path, tls)
+    options = ("enroll", "ax-1", "--twin", twin, "--url", "https://h", "--edge")
+    assert run(*options, tmp_path / "own").exit_code == 0
+    assert (tmp_path / "own" / "ca.crt").read_bytes() == certificate.read_bytes()
+    assert load(tmp_path / "own" / "edge.toml").twin.ca_file == "ca.crt"
+    signed = signed_by_another(tmp_path, key)
+    certificate.write_bytes(signed)
+    assert run(*options, tmp_path / "known", "--again").exit_code == 0
+    assert not (tmp_path / "known" / "ca.crt").exists()
+    assert load(tmp_path / "known" / "edge.toml").twin.ca_file is None
+    (tmp_path / "signers").mkdir()
+    signers, _ = self_made(tmp_path / "signers")
+    assert run(*options, tmp_path / "named", "--again", "--ca", signers).exit_code == 0
+    assert (tmp_path / "named" / "ca.crt").read_bytes() == signers.read_bytes()
+    refused = run(*options, tmp_path / "none", "--again", "--ca", twin)
+    assert (refused.exit_code, "holds no certificates" in refused.stderr) == (2, True)
+    assert not (tmp_path / "none").exists()
+
+
+def signed_by_another(folder, key):
+    """A certificate for a key that another one has signed."""
+    (folder / "authority").mkdir()
+    issuer, issuers_key = (path.read_bytes() for path in self_made(folder / "authority"))
+    authority = x509.load_pem_x509_certificate(issuer)
+    private = serialization.load_pem_private_key(key.read_bytes(), None)
+    now, name = datetime.now(UTC), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "twin")])
+    builder = x509.CertificateBuilder(authority.subject, name, private.public_key(), x509.random_serial_number())
+    builder = builder.not_valid_before(now).not_valid_after(now + timedelta(days=1))
+    signed = builder.sign(serialization.load_pem_private_key(issuers_key, None), hashes.SHA256())
+    return signed.public_bytes(serialization.Encoding.PEM)

@@ -48,6 +48,8 @@ def enroll(
     url: Annotated[str | None, typer.Option(help="Where the edge reaches the twin; its own address without.")] = None,
     operator: Annotated[Path | None, typer.Option(help="Enroll an operator instead; the token goes here.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Replace the token that there is.")] = False,
+    noise_um: Annotated[float, typer.Option(min=0.0, help="On the measured position, rms: the watch allows it.")] = 0.0,
+    ca: Annotated[Path | None, typer.Option(help="What the edge checks the twin's certificate against.")] = None,
 ) -> None:
     """Make a servo known to the twin: a token of its own, and a folder with all that its edge needs."""
     from servotwin import provision
@@ -55,10 +57,21 @@ def enroll(
     if operator is not None:
         made = provision.enroll_operator(twin, name, operator, again)
     else:
-        wanted = name, edge or Path(name), role, sample_rate_hz, provision.drive_of(drive), url, again
+        told = provision.drive_of(drive), url, again, noise_um * 1e-6, ca
+        wanted = name, edge or Path(name), role, sample_rate_hz, *told
         made = provision.enroll(twin, provision.Enrolment(*wanted))
     for path in made:
         print(f"written: {path}")
+
+
+def revoke(
+    name: Annotated[str, typer.Argument(help="The servo's name, or the operator's.")],
+    twin: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+) -> None:
+    """Take a token back: the twin refuses it within a second, what it has stored stays."""
+    from servotwin import provision
+
+    print(f"written: {provision.revoke(twin, name)}")
 
 
 def audit(

@@ -19,8 +19,9 @@ from threading import Event, Thread
 from typing import Any
 
 from servotwin.edge.outlet import WITHHELD
+from servotwin.errors import InvalidInput
 from servotwin.gateway import frames
-from servotwin.gateway.config import EdgeConfig
+from servotwin.gateway.config import EdgeConfig, token_of
 from servotwin.gateway.configfile import load
 from servotwin.gateway.keeping import Keeper
 from servotwin.gateway.log import Troubles, say
@@ -65,6 +66,7 @@ class LinkProcess:
         self._told = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
         self._troubles, self._given_up = Troubles(), dict[str, int]()
+        self._token, self._renewed = _token(config), False
 
     def run(self) -> None:
         """Until the control process is gone."""
@@ -91,7 +93,7 @@ class LinkProcess:
 
     def _serve(self) -> None:
         tended = 0.0
-        while not (self._pipe.broken or self._broken):
+        while not (self._pipe.broken or self._broken or self._renewed):
             self._stand()
             while self._outgoing:
                 self._pipe.post(self._outgoing.pop(0))
@@ -126,13 +128,25 @@ class LinkProcess:
         for serial in self._keeper.tend():
             self._pipe.post(frames.encode(frames.DoneFrame(serial)))
         self._look()
+        self._renew()
         try:
             write_status(self._config.path(self._config.keeping.status), self._status())
         except OSError:
             self._faults["status not written"] += 1
 
+    def _renew(self) -> None:
+        """A token that was replaced since: the link process that comes after this one reads it."""
+        if self._courier is None or self._listener is None or not (self._courier.trouble or self._listener.trouble):
+            return
+        with suppress(InvalidInput):  # it is being replaced just now
+            self._renewed = _token(self._config) != self._token
+        if self._renewed:
+            say("token replaced")
+
     def _look(self) -> None:
         """Let whoever reads the log know what has gone wrong since, and what is well again."""
+        if self._stopping.is_set():
+            return
         look = self._troubles.look
         look("disk", "" if self.outbox.safe else self.outbox.trouble)
         if self._courier is not None and self._listener is not None:
@@ -212,6 +226,11 @@ class LinkProcess:
             known["up"] = {"trouble": self._courier.trouble, **self._courier.counts}
             known["down"] = {"trouble": self._listener.trouble, **self._listener.counts}
         return {**known, "link_process": os.getpid(), "written": time.time()}
+
+
+def _token(config: EdgeConfig) -> str:
+    """The servo's; empty where there is no twin."""
+    return "" if config.twin is None else token_of(config.twin, config.folder)
 
 
 def main(arguments: list[str]) -> int:
