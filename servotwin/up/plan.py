@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 RATE = 1000.0
-"""Hz. Estimates of the gap are as good as at 5 kHz, to a thousandth of a degree, and a tick costs what a tick costs."""
+"""Hz. It gives gaps to a thousandth of a degree, and each tick costs the same, however many there are in a second."""
 WINDOW_S, PRE_TRIGGER_S = 4.0, 0.3
 """A calm loop turns the screw back late: windows of 2 s show one side only of gaps from 26 deg on, those of 3 s both
 sides of 40."""
