@@ -65,7 +65,8 @@ listen = "127.0.0.1:0"
 speed = 1.0
 speed_file = "speed"
 block_s = 0.005
-slack_s = 30.0
+slack_s = 60.0
+keep_s = 100.0
 """
 
 

@@ -39,6 +39,8 @@ from servotwin.link.sqliteoutbox import SqliteOutbox
 from servotwin.messages import (
     Acknowledge,
     Answer,
+    Cause,
+    Fallback,
     Hello,
     InvalidMessage,
     Probe,
@@ -305,7 +307,7 @@ def samples(first: int, count: int, reference: float = 1e-3) -> list[Sample]:
     return [Sample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
 
 
-def letters(far: Far, kind: type) -> list[object]:
+def letters(far: Far, kind: type | tuple[type, ...]) -> list[object]:
     found = [decode(frame.body) for frame in far.heard() if isinstance(frame, frames.LetterFrame)]
     return [message for message in found if isinstance(message, kind)]
 
@@ -457,6 +459,35 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far)
     assert answer.taken
     role.stop()
     assert drive.log[-1] == "move 0.0"
+
+
+def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> None:
+    """The agent runs on what the drive runs on, under a version of its own; the twin hears of it after the receipt."""
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box, SUPERVISED)
+    drive = ScriptedDrive([block(5 * k, 5) for k in range(40)])
+    role = Supervising(edge, drive)
+    role.step()
+    drive.refuse = True
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(5):
+        role.step()
+    drive.refuse = False
+    for _ in range(3):
+        role.step()
+    in_force = edge.agent.parameters
+    assert (in_force.version, in_force.tolerance) == (2, drive.voltages[0].tolerance)
+    assert [p.version for p in drive.voltages] == [0]
+    pumped(box)
+    receipt, fallback = letters(far, (Receipt, Fallback))
+    assert isinstance(receipt, Receipt)
+    assert receipt.applied
+    assert isinstance(fallback, Fallback)
+    assert (fallback.cause, fallback.replaced, fallback.parameter_version) == (Cause.DRIVE, 1, 2)
+    role.lost()
+    role.step()
+    assert drive.voltages[-1] == in_force
 
 
 def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:

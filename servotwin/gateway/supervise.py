@@ -5,7 +5,9 @@ from __future__ import annotations
 from math import nan
 
 from servotwin.edge.drive import Block, DriveRefused, SupervisedDrive
+from servotwin.edge.parameters import Parameters
 from servotwin.gateway.edge import Edge
+from servotwin.gateway.log import say
 
 LONGEST_BLOCK_S = 0.05
 """What comes from the twin waits no longer than this for the drive."""
@@ -25,7 +27,8 @@ class Supervising:
         self._edge, self._drive = edge, drive
         self._most = max(1, round(LONGEST_BLOCK_S * edge.config.agent.sample_rate))
         self._machine = drive.machine
-        self._written: object = None
+        self._written: Parameters | None = None
+        self._taken: Parameters | None = None
         self._moved, self._reference = 0.0, edge.config.agent.reference
 
     def step(self) -> bool:
@@ -70,11 +73,20 @@ class Supervising:
         """Let the drive run as the agent wants it to."""
         agent = self._edge.agent
         if agent.parameters is not self._written:
-            self._written = agent.parameters
             try:
                 self._drive.write(agent.parameters)
-            except DriveRefused:
-                self._edge.counts["parameters refused by the drive"] += 1
+                self._taken = agent.parameters
+            except DriveRefused as refusal:
+                self._refused(str(refusal))
+            self._written = agent.parameters
         if agent.offset != self._moved:
             self._drive.move(agent.offset)
             self._moved = agent.offset
+
+    def _refused(self, why: str) -> None:
+        """The drive runs on what it took last: so does the agent, and the twin is told. At first nobody knows what that
+        is."""
+        self._edge.counts["parameters refused by the drive"] += 1
+        say("drive refused", version=self._edge.agent.parameters.version, why=why)
+        if self._taken is not None:
+            self._edge.send(self._edge.agent.put_back(self._taken))
