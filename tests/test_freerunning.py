@@ -99,8 +99,11 @@ def free_running(folder: Path) -> dict[float, dict]:
     write_speed(folder / "speed", 5e-3)  # the edge comes to the first sample, or to one soon after it
     with machine(folder / "machine.toml") as (address, _), service(folder / "twin.toml") as url:
         drive = {"kind": "simulated", "address": address, "silence_s": 0.0}
-        enroll(folder / "twin.toml", Enrolment("axis", folder / "axis", "supervise", RATE, drive, url))
-        edge = Process("edge", folder / "axis", ["-m", "servotwin.gateway", "edge.toml"])
+        enroll(
+            folder / "twin.toml",
+            Enrolment("axis", folder / "axis", role="supervise", sample_rate=RATE, drive=drive, url=url),
+        )
+        edge = Process("edge", folder, folder / "axis", ["-m", "servotwin.gateway", "edge.toml"])
         edge.start()
         try:
             wait(lambda: reached(folder) > 0)
