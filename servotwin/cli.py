@@ -82,6 +82,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "twin": running.twin,
     "enroll": running.enroll,
     "revoke": running.revoke,
+    "servos": running.servos,
     "audit": running.audit,
     "replay": running.replay,
     "backup": running.backup,

@@ -134,6 +134,13 @@ def test_a_fallback_stands_where_it_happened(cause: Cause, measured: float, allo
     assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {said}"
 
 
+def test_a_drive_that_refuses_is_no_question_of_size() -> None:
+    event = found(
+        "fallback", Cause.DRIVE.value, version=3, body={"cause": Cause.DRIVE.value, "measured": 0.0, "allowed": 0.0}
+    )
+    assert chain(link(1), events=[event])[0].endswith(f"FALLBACK from version 3: {Cause.DRIVE.value}")
+
+
 def test_starts_of_the_edge_and_faults_of_the_twin_are_told() -> None:
     events = [
         found("hello", "b2", version=3, made=70.0),

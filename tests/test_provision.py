@@ -121,6 +121,7 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
         asked = run("audit", "ax-1", "--url", url, "--token", token, "--json")
         assert asked.exit_code == 0, asked.output
         told = run("audit", "ax-1", "--url", url, "--token", token)
+        everybody = run("servos", "--url", url, "--token", token)
         refused = run("audit", "ax-1", "--url", url)
         assert refused.exit_code == 2
         assert "token" in refused.stderr
@@ -130,6 +131,11 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
     assert (link["window"]["boot"], link["window"]["sequence"]) == ("b", 0)
     table = run("audit", "ax-1", "--config", twin)
     assert told.stdout == table.stdout
+    assert run("servos", "--config", twin).stdout == everybody.stdout
+    head, line = everybody.stdout.splitlines()
+    assert line.split()[:2] == ["ax-1", "-"]
+    assert line.index("2") == head.index("last heard")
+    assert [each["servo"] for each in json.loads(run("servos", "--config", twin, "--json").stdout)] == ["ax-1"]
     assert "boot b\n" in table.stdout
     line = r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d +0 .*(unidentifiable|mismatch|bound): .*\S$"
     assert re.search(line, table.stdout, re.MULTILINE), table.stdout

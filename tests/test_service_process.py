@@ -110,6 +110,8 @@ def test_a_window_goes_all_the_way_and_a_signal_ends_it_well(tmp_path):
             metrics = client.get("/metrics").text
             assert 'servotwin_messages_total{kind="window",put="new"} 1' in metrics
             assert 'servotwin_outcomes_total{result="committed"} 1' in metrics
+            assert 'servotwin_waiting{kind="messages"} 0\n' in metrics
+            assert "servotwin_waiting_seconds 0\n" in metrics
             client.post("/v1/servos/ax-1/letters", content=hello(boot="next"), headers=bearer())
             [greeting] = until(lambda: client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json())
             assert (greeting["kind"], greeting["status"], greeting["body"]["boot"]) == ("hello", "next", "next")

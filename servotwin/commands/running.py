@@ -74,6 +74,20 @@ def revoke(
     print(f"written: {provision.revoke(twin, name)}")
 
 
+def servos(
+    config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),
+    url: Annotated[str | None, typer.Option(help="Ask a service instead: https://twin:8765.")] = None,
+    token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
+    ca: Annotated[Path | None, typer.Option(help="Certificates that the service's is checked against.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON array instead of lines.")] = False,
+) -> None:
+    """Every servo at a glance: gap, version, receipt, what waits, when it was last heard of."""
+    from servotwin.service.auditing import Source
+    from servotwin.service.auditing import servos as run
+
+    run(Source(config, url, token, ca), json)
+
+
 def audit(
     servo: Annotated[str, typer.Argument(help="The servo's name.")],
     config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),

@@ -16,7 +16,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_ope
 import msgspec
 
 from servotwin.errors import InvalidInput
-from servotwin.service.audittext import Told, lines_of
+from servotwin.service.audittext import SERVOS, Told, lines_of, servo_line
 from servotwin.service.command import present_store
 from servotwin.service.readapi import MOST, shown, told
 from servotwin.service.secretfile import read_secret
@@ -82,6 +82,39 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
         return
     for line in lines_of(*story, changes=changes):
         print(line)
+
+
+def servos(source: Source, json: bool) -> None:
+    """Print every servo that was heard of, at a glance.
+
+    Raises
+    ------
+    InvalidInput
+        Whoever should know cannot be asked.
+    """
+    if source.url is not None:
+        ask = _asking(source)
+        found = _pages(lambda after: ask(f"/v1/servos?limit={MOST}&after={quote(after, safe='')}"))
+    else:
+        store = present_store(service_of(source.config))
+        try:
+            found = _pages(lambda after: [each._asdict() for each in store.servos(after)])
+        finally:
+            store.close()
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    print(SERVOS)
+    for each in found:
+        print(servo_line(each))
+
+
+def _pages(page: Callable[[str], list[Told]]) -> list[Told]:
+    """All servos; a page holds those after a name."""
+    found: list[Told] = []
+    while more := page(found[-1]["servo"] if found else ""):
+        found += more
+    return found
 
 
 def _of_store(servo: str, config: Path, limit: int) -> Story:

@@ -11,6 +11,8 @@ from servotwin.messages import Cause
 
 DEG = 180.0 / math.pi
 HOUR = 3600.0
+SERVOS = f"{'servo':24}  {'gap, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'waits':>5}  last heard, UTC"
+"""Above `servos_line`."""
 HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap, deg':>15}  {'error, um':>9}  {'version':>7}  what followed"
 _OPEN = "a setting was found, and waits to be sent"
 Told = Mapping[str, Any]
@@ -44,6 +46,15 @@ def lines_of(servo: Told, links: Sequence[Told], events: Iterable[Told], changes
             boot = of
             yield f"boot {boot}"
         yield line
+
+
+def servo_line(servo: Told) -> str:
+    """One servo at a glance."""
+    version = "-" if servo["version"] is None else servo["version"]
+    heard = "never" if servo["heard"] is None else _time(servo["heard"])
+    receipt = servo["receipt"][:12] or "-"
+    status = f"{_gap(servo) or '-':>15}  {servo['status'][:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>5}"
+    return f"{servo['servo']:24}  {status}  {heard}"
 
 
 def _head(servo: Told, links: Sequence[Told]) -> Iterator[str]:
@@ -198,6 +209,8 @@ def _event(one: Told) -> Entry:
 
 def _measured(body: Told) -> str:
     """What was seen and what was allowed, in the cause's unit."""
+    if body.get("cause") == Cause.DRIVE:
+        return ""
     if body.get("cause") == Cause.DRIVE:
         return ""
     scale, unit = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, "V")}.get(body.get("cause", ""), (1e6, "um"))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -57,6 +58,8 @@ class ReadApi:
         self._health, self._metrics, self._wall = health, metrics, wall
         self._counting = asyncio.Lock()
         self._count: tuple[float, Waiting | None] = -math.inf, None
+        metrics.watch("servotwin_waiting", "Messages and proofs not yet worked on.", self._numbers, "kind")
+        metrics.watch("servotwin_waiting_seconds", "For how long the oldest message waits.", self._age)
 
     async def servos(self, request: Request) -> Response:
         """Every servo that was heard of, by name; `after` a name, `limit` at most."""
@@ -113,7 +116,17 @@ class ReadApi:
 
     async def metrics(self, _request: Request) -> Response:
         """Prometheus' text format."""
+        with suppress(StoreUnavailable):  # then the numbers are those of before
+            await self._counted()
         return Response(self._metrics.text(), media_type=CONTENT_TYPE)
+
+    def _numbers(self) -> Mapping[str, float]:
+        found = self._count[1]
+        return {} if found is None else {"messages": found.messages, "proofs": found.proofs}
+
+    def _age(self) -> float:
+        found = self._count[1]
+        return math.nan if found is None else found.age
 
     async def _counted(self) -> Waiting:
         """How much waits; counted now and then only, as anybody may ask, and as often as he likes."""
