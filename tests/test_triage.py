@@ -203,6 +203,7 @@ def test_what_is_no_measurement_of_a_gap_is_left_to_the_estimator() -> None:
     ("changes", "watch", "why"),
     [
         ({}, {"doubt": "a request is open"}, "a request is open"),
+        ({"boot": "c"}, {"doubt": "no window was estimated yet"}, "no window was estimated yet"),
         ({"boot": "c"}, {}, "started anew"),
         ({"version": 2}, {"version": 1}, "parameters of version 2 are in force"),
         ({"reason": "probe"}, {}, "because of: probe"),
@@ -305,6 +306,23 @@ def test_a_servo_on_which_glances_mislead_gets_none() -> None:
     assert "a glance misled by 1 deg" in triage.watch.doubt
     triage.learn(message, estimate, None, "")
     assert triage.watch.doubt == ""
+
+
+def test_estimates_in_vain_become_rare_until_something_changes() -> None:
+    """A loop that shows one contact only, and was never seen to show both: no offset, no gap."""
+    blind = [one for one in calm_windows() if one.sequence >= 3]
+    many = [
+        msgspec.structs.replace(blind[k % len(blind)], sequence=100 + k, start=20.0 * k, parameter_version=1)
+        for k in range(24)
+    ]
+    twin, store = triaged(many)
+    assert not any(estimate.ok for estimate in store.estimates.values())
+    # Three in a row, then one in eight.
+    assert [identity[2] - 100 for identity in store.estimates] == [0, 1, 2, 10, 18]
+    assert "not looked at: 3 estimates in a row did not count" in store.glances["servo", "boot-1", 105].why
+    restarted = msgspec.structs.replace(many[-1], sequence=200, start=600.0, parameter_version=2, servo="servo")
+    twin.receive(restarted, 600.0)
+    assert ("servo", "boot-1", 200) in store.estimates
 
 
 # --- settings

@@ -24,6 +24,7 @@ ROUTINE = ("reference", "periodic")
 """Reasons of windows that come anyway; any other says that something is new, or was asked for."""
 
 _SHORTEST = 400  # samples, as for the estimator
+_PATIENCE, _SPARSE = 3, 8  # estimates in a row that did not count, after which only one window in so many is tried
 
 
 class Watch(Struct, frozen=True):
@@ -45,6 +46,8 @@ class Watch(Struct, frozen=True):
         m, usual.
     glances : int
         Windows since.
+    vain : int
+        Estimates in a row that did not count.
     """
 
     doubt: str = "no window was estimated yet"
@@ -57,6 +60,7 @@ class Watch(Struct, frozen=True):
     bias_std: float = math.inf
     misfit: float = math.nan
     glances: int = 0
+    vain: int = 0
 
 
 class Glance(Struct, frozen=True):
@@ -102,6 +106,17 @@ def due(message: WindowMessage, watch: Watch, settings: TriageSettings) -> str:
     return ""
 
 
+def in_vain(message: WindowMessage, watch: Watch) -> str:
+    """Why a window is not even looked at: estimates of such windows have said nothing lately; empty: it is.
+
+    A loop that always shows one contact, of an encoder whose offset is not known, would be estimated for ever.
+    """
+    changed = (message.boot, message.parameter_version) != (watch.boot, watch.version) or message.reason not in ROUTINE
+    if changed or watch.vain < _PATIENCE or watch.glances + 1 >= _SPARSE:
+        return ""
+    return f"not looked at: {watch.vain} estimates in a row did not count, and one window in {_SPARSE} is tried"
+
+
 def glance(
     message: WindowMessage,
     window: Window,
@@ -124,7 +139,9 @@ def glance(
         The encoder's offset as earlier windows showed it, mean and standard deviation, rad.
     settings : TriageSettings, optional
     """
-    settings = settings or TriageSettings()
+    settings, tired = settings or TriageSettings(), in_vain(message, watch)
+    if tired:
+        return _blind(tired, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:
         return _blind("the window has no theta_m, or too few samples: what to make of it, the estimator says")
     if not (math.isfinite(watch.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
@@ -136,8 +153,8 @@ def glance(
     return msgspec.structs.replace(told, moved=bool(why), why=why or "nothing moved")
 
 
-def _blind(why: str) -> Glance:
-    return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, True, why)
+def _blind(why: str, moved: bool = True) -> Glance:
+    return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
 def _unclear(seen: Quick, settings: TriageSettings) -> str:

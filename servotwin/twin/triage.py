@@ -17,7 +17,7 @@ from servotwin.identify.whitened.quick import Quick, quick_fit
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.twin.decode import decode_window
-from servotwin.twin.glance import Watch, allowed, glance
+from servotwin.twin.glance import Glance, Watch, allowed, glance
 from servotwin.twin.requests import Requests
 from servotwin.twin.store import Store
 from servotwin.twin.triagesettings import TriageSettings
@@ -55,20 +55,19 @@ class Triage:
         store : Store
         """
         asked = asks is not None and asks.pending is not None
-        watch = msgspec.structs.replace(self.watch, doubt="a request is open") if asked else self.watch
+        watch = msgspec.structs.replace(self.watch, doubt="a request is open", vain=0) if asked else self.watch
         try:
             seen = glance(message, decode_window(message), self.servo, watch, _offset(trend), self.settings)
         except InvalidInput:
             return False  # why it is no window, the estimator says
         store.add_glance(message, seen)
         if not seen.moved:
-            usual = max(_FADES * watch.misfit, seen.misfit)
-            self.watch = msgspec.structs.replace(watch, misfit=usual, glances=watch.glances + 1)
+            self.watch = _glanced(self.watch, seen)
         return not seen.moved
 
     def doubt(self, why: str) -> None:
         """The next window is estimated, whatever it shows."""
-        self.watch = msgspec.structs.replace(self.watch, doubt=why, glances=0)
+        self.watch = msgspec.structs.replace(self.watch, doubt=why, glances=0, vain=0)
 
     def learn(self, message: WindowMessage, estimate: GapEstimate, trend: Trend | None, why_not: str) -> None:
         """Note an estimate, and why it does not count, where it does not: then the next window is estimated too.
@@ -76,7 +75,10 @@ class Triage:
         What a glance at its own window says is what later ones are compared with.
         """
         if why_not:
-            self.doubt(why_not)
+            whose = {"boot": message.boot, "version": message.parameter_version}
+            self.watch = msgspec.structs.replace(
+                self.watch, doubt=why_not, glances=0, vain=self.watch.vain + 1, **whose
+            )
             return
         window, before = decode_window(message), self.watch.misfit
         seen = quick_fit(window, self.servo, estimate.gap, _offset(trend))
@@ -99,6 +101,12 @@ class Triage:
         if off <= allowed(math.hypot(seen.std, estimate.std), self.settings):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
+
+
+def _glanced(watch: Watch, seen: Glance) -> Watch:
+    """After a window of which a glance was enough."""
+    usual = watch.misfit if math.isnan(seen.misfit) else max(_FADES * watch.misfit, seen.misfit)
+    return msgspec.structs.replace(watch, misfit=usual, glances=watch.glances + 1)
 
 
 def _offset(trend: Trend | None) -> tuple[float, float] | None:

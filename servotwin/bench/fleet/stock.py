@@ -24,7 +24,7 @@ PERIOD = 20.0
 """s from one change of the reference to the next: the paper's cadence."""
 FIRST_GAP, GAP_STEP = math.radians(5.0), math.radians(1.0)
 SETTLED = 4
-"""Windows of a run that are left out: the first steps, and the first updates."""
+"""Windows of a run that only the twin's commissioning sees: the first steps, and the first updates."""
 NOISE = Noise(1e-6, (1.0, 400.0))
 BOOT = "boot-1"
 COMMISSIONED = 10 * PERIOD
@@ -38,11 +38,14 @@ class Place(NamedTuple):
     ----------
     gap : float
         rad.
+    first : tuple of Window
+        From the loop's start on: the twin learns of the encoder's offset in these, if the later ones show one contact.
     windows : tuple of Window
         One after the other in the same steady loop; steps to one side and to the other take turns.
     """
 
     gap: float
+    first: tuple[Window, ...]
     windows: tuple[Window, ...]
 
 
@@ -65,7 +68,7 @@ def _place(number: int, windows: int, seed: int) -> Place:
         name="axis",
     )
     found = cosimulate(scenario).windows
-    return Place(gap, tuple(found[SETTLED : SETTLED + windows]))
+    return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
 
 
 def readdressed(window: Window, servo: str, sequence: int, start: float, version: int) -> Window:
@@ -89,12 +92,13 @@ class Known(NamedTuple):
     version: int
 
 
-def commissioned(fleet: Fleet, servo: str, place: Place, rounds: int = 6) -> Known:
+def commissioned(fleet: Fleet, servo: str, place: Place) -> Known:
     """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
     state, version = b"", 0
-    for number in range(rounds):
-        start = COMMISSIONED + (number - rounds) * PERIOD
-        window = readdressed(place.windows[number % len(place.windows)], servo, number, start, version)
+    learnt = (*place.first, *place.windows)[: SETTLED + 2]
+    for number, recorded in enumerate(learnt):
+        start = COMMISSIONED + (number - len(learnt)) * PERIOD
+        window = readdressed(recorded, servo, number, start, version)
         outcome = work(fleet, _claim(servo, state, number, Kind.WINDOW, encode(window)), start)
         state = outcome.state
         sent = [decode(body) for body in outcome.outgoing]
