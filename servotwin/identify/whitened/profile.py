@@ -12,6 +12,8 @@ from servotwin.identify.whitened.search import PLACE_ONLY, PLACES, descend
 
 _CHI_SQUARED_95 = 3.841458820694124
 _CLOSE, _TRIALS = 0.1, 12
+_FURTHER = 3.0  # times as far, at most, the next trial lies
+_WELL_WITHIN = 1.0 / _FURTHER**2  # of what is allowed: any less makes no difference to the next trial
 _NEAR = 0.1  # of the gap: closer by, the best place is next to that of the fit, if the spread is not wider
 
 
@@ -33,11 +35,16 @@ def profile_interval(found: Found, std: float, calibration: float, largest: floa
     allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
 
     def rise(gap: float) -> float:
-        """How much worse the best fit with this gap is, in units of what is allowed."""
+        """How much worse the best fit with this gap is, in units of what is allowed; well within, how much at most."""
         near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
-        places = {found.point.place} if near else {*same_way(found.point, gap), *PLACES}
-        fits = [descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY) for place in places]
-        return (min(fit.slopes.cost for fit in fits) - found.fit.slopes.cost) / allowed
+        places = (found.point.place,) if near else (*same_way(found.point, gap), *PLACES)
+        lowest = math.inf
+        for place in dict.fromkeys(places):
+            fit = descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
+            lowest = min(lowest, (fit.slopes.cost - found.fit.slopes.cost) / allowed)
+            if lowest <= _WELL_WITHIN:
+                break
+        return lowest
 
     first = min(1.96 * std, 0.5 * largest)
     return _end(rise, found.point.gap, -first, 0.0), _end(rise, found.point.gap, first, largest)
@@ -76,7 +83,7 @@ def _end(rise: Callable[[float], float], middle: float, step: float, limit: floa
             inside = size
         else:
             outside = size
-        size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), 3.0)
+        size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), _FURTHER)
         if not inside < size < outside:
             size = 0.5 * (inside + outside)
     else:
