@@ -80,7 +80,7 @@ port = 0                      # servotwin up takes any free one
 tokens = "tokens.toml"
 workers = 1
 speed = {speed:.1f}                 # machine time passes that much faster than the clock, at most
-retention_days = 2
+retention_days = 0.1
 log_level = "warning"
 """
 _MODEL = """
