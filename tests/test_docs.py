@@ -12,6 +12,7 @@ import pytest
 import servotwin as st
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.gateway import configfile as gateway
+from servotwin.service.twinfile import read_twin
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], key=str)
@@ -20,7 +21,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(servotwin(?:\.\w+)+)`")
 FILE = re.compile(r"`((?:servotwin|tests|docs)/[\w./-]+\.\w+)(?:::(\w+))?`")
 
-LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": gateway.load}
+LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": gateway.load, "models": read_twin}
 """By a key that only files of this sort have; any other is a scenario."""
 
 
