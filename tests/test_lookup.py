@@ -31,6 +31,7 @@ from servotwin.redesign.lookup import (
 )
 from servotwin.redesign.lookupfile import build, load
 from servotwin.redesign.region import Region
+from servotwin.redesign.setting import Setting
 from servotwin.redesign.uncertainty import Uncertainty
 from servotwin.twin.policies import policy_of
 from servotwin.twin.settings import TwinSettings
@@ -161,6 +162,30 @@ def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
     assert wide.gap == POLICY.uncertainty.gap
     none = replace(table(), cells=dict.fromkeys(cells)).find(asked)
     assert isinstance(none, Refusal)
+
+
+def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
+    asked = region(1.0, 2.0, feedforward=0.03)
+    narrow = table().find(asked)
+    other = Setting(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
+    cells = {key: found if key.level == 0 else replace(found, setting=other) for key, found in table().cells.items()}
+    changed = replace(table(), cells=cells)
+    kept = changed.find(asked, replace(other, controller=other.controller.replace(feedforward=-0.01)))
+    assert kept.setting.controller == other.controller.replace(feedforward=0.03)
+    assert kept.gap == POLICY.uncertainty.gap
+    assert changed.find(asked).setting == narrow.setting
+    assert changed.find(asked, replace(other, controller=other.controller.replace(Ki=1.0))).setting == narrow.setting
+
+
+def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
+    fine = Grid(2.0 * DEG, (1e-2,), (0.0,))
+    narrow, wide = (table().cells[Key(level, 0, 0, 0)] for level in (0, 1))
+    other = Setting(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
+    widest = len(fine.levels(POLICY.uncertainty.gap)) - 1
+    assert widest > 3
+    cells = {Key(0, 0, 0, 0): narrow, Key(widest, 0, 0, 0): replace(wide, setting=other)}
+    found = replace(table(), grid=fine, cells=cells).find(region(0.1, 0.2), other)
+    assert found.setting == narrow.setting
 
 
 def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:

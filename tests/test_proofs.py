@@ -12,7 +12,7 @@ import pytest
 
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
-from servotwin.messages import Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Update, Window, decode, encode
 from servotwin.redesign.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certifiedpolicy import CertifiedPolicy
 from servotwin.redesign.lookup import Grid, TablePolicy
@@ -59,7 +59,7 @@ class Queue:
     def __init__(self, fleet: Fleet) -> None:
         self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
 
-    def give(self, message: Window | Receipt | Incoming) -> Outcome:
+    def give(self, message: Window | Receipt | Fallback | Incoming) -> Outcome:
         body, kind = (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), Kind.WINDOW)
         self.serial += 1
         stored = Stored(self.serial, kind, body, "", float(self.serial))
@@ -68,8 +68,8 @@ class Queue:
         self.outcomes.append(outcome)
         return outcome
 
-    def window(self, number: int, version: int = 0) -> Outcome:
-        return self.give(msgspec.structs.replace(windows()[number], parameter_version=version))
+    def window(self, number: int, version: int = 0, **changes) -> Outcome:
+        return self.give(msgspec.structs.replace(windows()[number], parameter_version=version, **changes))
 
     def applied(self, update: Update) -> Outcome:
         sample = round(update.data_time * 5000.0) + 20000
@@ -169,7 +169,7 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet,
     plain, exact = TablePolicy.prove, CertifiedPolicy.prove
     monkeypatch.setattr(TablePolicy, "prove", lambda *given: looked_up.append(1) or plain(*given))
     monkeypatch.setattr(CertifiedPolicy, "prove", lambda *given: made.append(1) or exact(*given))
-    outcome = queue.window(2, back.version)
+    outcome = queue.window(2, back.version, reason="asked for")
     assert "redesign" in kinds(outcome)
     assert (len(looked_up), len(made)) == (0, 1)
     assert not outcome.enqueue
@@ -186,6 +186,17 @@ def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: Fleet, monkeyp
     assert kinds(outcome) == ["proof"]
     assert outcome.evidence[0].status == "not proved: another setting is in force by now"
     assert queue.state == before
+
+
+def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> None:
+    queue, update, _ = begun(fleet)
+    quiet = queue.window(1, update.version)
+    assert kinds(quiet) == ["glance"]
+    told = Fallback("axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, 0.0)
+    queue.give(told)
+    outcome = queue.window(2, update.version + 1)
+    assert "estimate" in kinds(outcome)
+    assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
 
 
 def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Fleet, monkeypatch) -> None:

@@ -205,7 +205,7 @@ def test_what_is_no_measurement_of_a_gap_is_left_to_the_estimator() -> None:
         ({}, {"doubt": "a request is open"}, "a request is open"),
         ({"boot": "c"}, {"doubt": "no window was estimated yet"}, "no window was estimated yet"),
         ({"boot": "c"}, {}, "started anew"),
-        ({"version": 2}, {"version": 1}, "parameters of version 2 are in force"),
+        ({"version": 2}, {"version": 1}, ""),
         ({"reason": "probe"}, {}, "because of: probe"),
         ({"reason": ""}, {}, "because of: nothing stated"),
         ({}, {"glances": 49}, "due: 49 windows"),

@@ -88,7 +88,7 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         region = Region(gap, *self._input_bias(evidence), self._friction(evidence), _noise(evidence))
-        found = prover.prove(region)
+        found = prover.prove(region, _running(evidence))
         if isinstance(found, Refusal):
             return _fallen_back(prover.fallback(), region, found.reason)
         if _in_force(found.setting, evidence):
@@ -96,7 +96,7 @@ class CertifiedPolicy:
         sent = _sent(found, region.noise, estimate.gap, "")
         return replace(sent, owed=region) if prover.owes else sent
 
-    def prove(self, region: Region) -> Certificate | Refusal:
+    def prove(self, region: Region, _running: Setting | None = None) -> Certificate | Refusal:
         """The cheapest setting that holds in a region, by simulation."""
         known = region.within(self.uncertainty)
         return certify(self.servo, known, self.held(), self.trial, region.feedforward, region.noise, self.clock)
@@ -160,6 +160,13 @@ def _noise(evidence: Evidence) -> float:
     """m rms; 0 where nobody could tell."""
     noise = evidence.disturbance.noise
     return noise if math.isfinite(noise) else 0.0
+
+
+def _running(evidence: Evidence) -> Setting | None:
+    """What the edge runs, as far as is known."""
+    if evidence.controller is None or evidence.tolerance is None:
+        return None
+    return Setting(evidence.controller, evidence.tolerance)
 
 
 def _in_force(setting: Setting, evidence: Evidence) -> bool:

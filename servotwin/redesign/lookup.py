@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certificate import Certificate, Refusal
 from servotwin.redesign.certified import certify
@@ -20,8 +21,10 @@ from servotwin.redesign.certifiedpolicy import CertifiedPolicy
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
 from servotwin.redesign.region import Region
+from servotwin.redesign.setting import Setting
 from servotwin.redesign.uncertainty import Range
 
+_KEPT_LEVELS = 2  # of width: nobody is troubled with an update for a little less
 _QUIET = 1e-6  # m rms: noise below is like none
 
 
@@ -102,16 +105,20 @@ class CertifiedTable:
     fallback: Certificate
     cells: dict[Key, Certificate | None]
 
-    def find(self, region: Region) -> Certificate | Refusal:
-        """The certificate of the narrowest proved cell that contains a region, its feedforward put in."""
+    def find(self, region: Region, running: Setting | None = None) -> Certificate | Refusal:
+        """The certificate of the narrowest proved cell that contains a region, its feedforward put in.
+
+        A cell up to four times as wide comes before it whose setting is `running` already, but for the feedforward.
+        """
         if region.friction[0] < self.friction[0] or region.friction[1] > self.friction[1]:
             return Refusal(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")
         if abs(region.feedforward) > self.feedforward_limit:
             return Refusal(f"a feedforward of {region.feedforward:.3g} V is in no cell of the table")
-        for key in self._containing(region):
-            found = self.cells.get(key)
-            if found is not None:
-                return _fed(found, region.feedforward)
+        proved = [(key, found) for key in self._containing(region) if (found := self.cells.get(key)) is not None]
+        if proved:
+            widest = proved[0][0].level + _KEPT_LEVELS
+            kept = [found for key, found in proved if key.level <= widest and _alike(found.setting, running)]
+            return _fed((kept or [proved[0][1]])[0], region.feedforward)
         low, high = (math.degrees(end) for end in region.gap)
         left = 1e3 * region.largest_bias
         return Refusal(
@@ -206,9 +213,9 @@ class TablePolicy:
         """The setting of a cell that contains all that the evidence allows; without one the fallback set, and why."""
         return self.policy.decide(evidence, self)
 
-    def prove(self, region: Region) -> Certificate | Refusal:
+    def prove(self, region: Region, running: Setting | None) -> Certificate | Refusal:
         """Looked up."""
-        return self.table.find(region)
+        return self.table.find(region, running)
 
     def fallback(self) -> Certificate:
         """Looked up."""
@@ -227,7 +234,7 @@ class _Withdrawn:
     why: str
     owes: ClassVar[bool] = False
 
-    def prove(self, _region: Region) -> Refusal:
+    def prove(self, _region: Region, _running: Setting | None) -> Refusal:
         return Refusal(self.why)
 
     def fallback(self) -> Certificate:
@@ -236,6 +243,13 @@ class _Withdrawn:
 
 def _holds(cell: Range, low: float, high: float) -> bool:
     return cell[0] <= low and high <= cell[1]
+
+
+def _alike(one: Setting, other: Setting | None) -> bool:
+    """Whether two settings are the same but for the feedforward."""
+    if other is None or one.tolerance != other.tolerance:
+        return False
+    return gains_of(one.controller) == gains_of(other.controller.replace(feedforward=one.controller.feedforward))
 
 
 def _fed(found: Certificate, feedforward: float) -> Certificate:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from servotwin.redesign.certificate import Certificate, Refusal
+from servotwin.redesign.setting import Setting
 from servotwin.redesign.uncertainty import Range, Uncertainty
 
 
@@ -53,8 +54,8 @@ class Prover(Protocol):
     @property
     def owes(self) -> bool: ...
 
-    def prove(self, region: Region) -> Certificate | Refusal:
-        """A setting that holds there, or why there is none."""
+    def prove(self, region: Region, running: Setting | None) -> Certificate | Refusal:
+        """A setting that holds there, or why there is none; `running` is in force, where that is known."""
         ...
 
     def fallback(self) -> Certificate:

@@ -35,7 +35,7 @@ class Watch(Struct, frozen=True):
     doubt : str
         Why no glance is enough; empty: the last window that was estimated may be relied on.
     boot, version : str, int
-        Of that window, and of the parameters in force in it.
+        Of the window that was estimated last, and of the parameters in force in it.
     time : float
         Of its middle, s.
     gap, std : float
@@ -95,8 +95,6 @@ def due(message: WindowMessage, watch: Watch, settings: TriageSettings) -> str:
         return watch.doubt
     if message.boot != watch.boot:
         return "the edge has started anew"
-    if message.parameter_version != watch.version:
-        return f"parameters of version {message.parameter_version} are in force, and were not before"
     if message.reason not in ROUTINE:
         return f"the edge sent it because of: {message.reason or 'nothing stated'}"
     if watch.glances + 1 >= settings.every:

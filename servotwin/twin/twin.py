@@ -272,6 +272,8 @@ class Twin:
             self._versions.give_up()
             self._known.fall_back(message)
             self._tuned_for = None
+            if self._triage is not None:
+                self._triage.doubt("the edge has fallen back")
         return []
 
     def _send(self, update: Update | None, now: float) -> list[Message]:
