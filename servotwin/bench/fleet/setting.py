@@ -89,7 +89,7 @@ class Scale:
     windows: int = 16
     workers: int = 2
     connections: int = 64
-    proofs: float = 30.0
+    proofs: float = 6.0
     every: int = 50
 
     def full(self) -> Scale:
