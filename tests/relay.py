@@ -62,6 +62,7 @@ class Relay:
         self._weather, self._random = weather, Random(seed)
         self._state = State.FLOWING
         self._writers: set[Writer] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._ready = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._main()), name="relay")
 
@@ -115,7 +116,7 @@ class Relay:
 
     async def _main(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        server = await asyncio.start_server(self._begin, "127.0.0.1", 0)
         self.port = server.sockets[0].getsockname()[1]
         cutting = asyncio.create_task(self._cut_by_chance())
         self._ready.set()
@@ -133,6 +134,12 @@ class Relay:
             if self._weather.cut_s is not None:
                 self._abort()
 
+    def _begin(self, reader: Reader, writer: Writer) -> None:
+        """A task of our own: asyncio's for a connection logs it as an error when it is cancelled in the end (3.11)."""
+        task = asyncio.create_task(self._accept(reader, writer))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
     async def _accept(self, reader: Reader, writer: Writer) -> None:
         self.counts["connection"] += 1
         self._writers.add(writer)
@@ -141,7 +148,7 @@ class Relay:
                 self.counts["refused"] += 1
             else:
                 await self.serve(reader, writer)
-        except (OSError, EOFError, asyncio.CancelledError):  # cancelled at the end only, which the caller logs in 3.11
+        except (OSError, EOFError, asyncio.CancelledError):  # cancelled at the end only
             self.counts["broken"] += 1
         finally:
             await self._let_go(writer)
