@@ -112,9 +112,17 @@ def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPat
         monkeypatch.undo()
 
 
-def test_without_a_standard_error_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", None)
-    log.say("event")
+def test_without_a_standard_error_nothing_is_said(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log.say("heard")
+    with monkeypatch.context() as context:
+        context.setattr(sys, "stderr", None)
+        log.say("unheard")
+    out, said = capfd.readouterr()
+    assert out == ""
+    assert "heard" in said
+    assert "unheard" not in said
 
 
 class Failing:
