@@ -1,48 +1,30 @@
-"""The gateway's parts without processes: pipe, outlet, law guard, roles, keeper, boots, counts."""
+"""The control process without a process: the law's guard, both roles, drives that are lost, refuse or wait."""
 
 import math
-import socket
 from array import array
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-import msgspec
 import pytest
+from gateway_parts import CONFIG, LAW, RATE, Far, cut, pumped
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.control.controller import Controller
 from servotwin.control.law import start, tick
-from servotwin.edge.cut import Cut
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
-from servotwin.edge.limits import Limits
-from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.probe import ProbeLimits
-from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import FileStore, kept
 from servotwin.errors import InvalidInput
 from servotwin.gateway import frames, outlet
-from servotwin.gateway.boots import next_boot
-from servotwin.gateway.config import UNBOOTED, EdgeConfig
+from servotwin.gateway.config import EdgeConfig
 from servotwin.gateway.control import Controlling, Law
 from servotwin.gateway.edge import Edge
-from servotwin.gateway.keeping import Keeper
-from servotwin.gateway.log import Troubles
 from servotwin.gateway.outlet import BEHIND, PipeOutlet
-from servotwin.gateway.pipe import Pipe
-from servotwin.gateway.run import Stop, first_parameters, until
+from servotwin.gateway.run import Stop, until
 from servotwin.gateway.supervise import Supervising
-from servotwin.gateway.ticks import Counts, summary
-from servotwin.link.sqliteoutbox import SqliteOutbox
 from servotwin.messages import (
-    Acknowledge,
     Answer,
     Cause,
     Fallback,
-    Hello,
-    InvalidMessage,
     Probe,
     Receipt,
     Request,
@@ -51,173 +33,12 @@ from servotwin.messages import (
     encode,
 )
 
-RATE = 100.0
-LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
-SETTINGS = AgentSettings("axis-1", UNBOOTED, RATE, 0.1, limits=Limits(maximum=1e-3), probe=ProbeLimits(1e-3, 0.0, 0.05))
-CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
-
-
-def cut(sequence: int = 0, samples: int = 10) -> Cut:
-    signals = {name: array("d", [1e-3 * k for k in range(samples)]) for name in CHANNELS}
-    return Cut(7, sequence, "reference", 3, 0.0, signals, 0.1, None)
-
-
-@pytest.fixture
-def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ours, theirs = socket.socketpair()
-    yield ours, theirs
-    ours.close()
-    theirs.close()
-
-
-class Far:
-    """The link process's end of an outlet, spoken to by the test."""
-
-    def __init__(self) -> None:
-        ours, theirs = socket.socketpair()
-        self.pipe = Pipe(theirs)
-        self.near = Pipe(ours)
-
-    def heard(self) -> list[frames.ToLink]:
-        return [frames.to_link(data) for data in self.pipe.take()]
-
-    def say(self, *said: frames.ToControl) -> None:
-        for frame in said:
-            self.pipe.post(frames.encode(frame))
-        while self.pipe.backlog:
-            self.pipe.pump()
-
-    def close(self) -> None:
-        self.pipe.close()
-        self.near.close()
-
 
 @pytest.fixture
 def far() -> Iterator[Far]:
     made = Far()
     yield made
     made.close()
-
-
-def pumped(box: PipeOutlet) -> None:
-    for _ in range(20):
-        box.exchange()
-
-
-@given(st.lists(st.binary(max_size=200_000), max_size=5), st.integers(1, 50_000))
-def test_frames_cross_a_pipe_whole_and_in_order(sent: list[bytes], piece: int) -> None:
-    ours, theirs = socket.socketpair()
-    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, piece)
-    near, far = Pipe(ours), Pipe(theirs)
-    for frame in sent:
-        near.post(frame)
-    came: list[bytes] = []
-    while near.backlog:
-        near.pump()
-        came += far.take()
-    for _ in range(3):
-        came += far.take()
-    assert came == sent
-    near.close()
-    far.close()
-
-
-def test_a_pipe_never_waits_and_knows_when_the_other_end_is_gone(ends: tuple[socket.socket, socket.socket]) -> None:
-    near = Pipe(ends[0])
-    assert near.take() == []
-    near.post(bytes(10_000_000))
-    for _ in range(1000):
-        near.pump()
-    assert near.backlog > 0
-    assert not near.broken
-    ends[1].close()
-    near.pump()
-    assert near.broken
-
-
-def test_a_frame_that_is_longer_than_any_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
-    ends[1].sendall(b"\xff\xff\xff\xff")
-    with pytest.raises(InvalidMessage, match="4294967295 bytes"):
-        Pipe(ends[0]).take()
-
-
-def test_a_cut_crosses_as_it_is() -> None:
-    frame = frames.to_link(frames.encode(frames.framed(cut(), "b0", 5)))
-    assert isinstance(frame, frames.CutFrame)
-    assert (frame.cut, frame.boot, frame.serial) == (cut(), "b0", 5)
-    with pytest.raises(InvalidMessage):
-        frames.to_link(b"rubbish")
-    with pytest.raises(InvalidMessage):
-        frames.to_control(frames.encode(frame))
-
-
-def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Far) -> None:
-    box = PipeOutlet(True)
-    box.boot = "b0"
-    box.offer(cut(0), 0.0)
-    assert box.waiting
-    box.connect(far.near)
-    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, 0.0, ""))
-    box.save(Parameters(3, 1e-4))
-    pumped(box)
-    assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
-    far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
-    heard = box.exchange()
-    assert heard is not None
-    assert heard.standing
-    assert box.waiting
-    assert box.dropped == {"outbox full": 2}
-    again = Far()
-    box.connect(again.near)
-    pumped(box)
-    assert [type(frame).__name__ for frame in again.heard()] == ["SaveFrame"]
-    assert not box.settled
-    again.say(frames.DoneFrame(3), frames.StandingFrame(0, {}))
-    pumped(box)
-    assert box.settled
-    assert not box.waiting
-    again.close()
-
-
-def test_the_twins_messages_count_once_whoever_repeats_them(far: Far) -> None:
-    box = PipeOutlet(True)
-    box.connect(far.near)
-    body = encode(Acknowledge("axis-1", "b0", 0))
-    far.say(frames.HeardFrame(4, body), frames.HeardFrame(0, body), frames.HeardFrame(4, body), frames.BackFrame())
-    heard = box.exchange()
-    assert heard is not None
-    assert len(heard.messages) == 2
-    assert heard.back
-    pumped(box)
-    assert far.heard() == [frames.HandledFrame(4), frames.HandledFrame(4)]
-
-
-def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
-    far: Far, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(outlet, "MOST", 100_000)
-    box = PipeOutlet(True)
-    box.connect(far.near)
-    for k in range(20):
-        box.offer(cut(k, 500), 0.0)
-    assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.framed(cut(0, 500), "", 1)))
-    assert not box.connected
-
-
-def test_without_a_twin_nobody_owes_an_answer() -> None:
-    box = PipeOutlet(False)
-    box.offer(cut(), 0.0)
-    assert not box.waiting
-
-
-def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:
-    box = PipeOutlet(True)
-    box.connect(far.near)
-    far.pipe.post(b"rubbish")
-    while far.pipe.backlog:
-        far.pipe.pump()
-    assert box.exchange() is None
-    assert not box.connected
 
 
 POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e308, -1e308])
@@ -536,86 +357,3 @@ def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:
         pass
     assert edge.counts["parameters refused by the drive"] >= 1
     assert (edge.counts["samples missed"], edge.counts["boot: samples missing"]) == (3, 1)
-
-
-@pytest.fixture
-def keeper(tmp_path: Path) -> Iterator[Keeper]:
-    outbox = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1")
-    yield Keeper(replace(CONFIG, folder=tmp_path), outbox)
-    outbox.close()
-
-
-def test_a_cut_that_comes_again_is_kept_and_counted_once(keeper: Keeper, tmp_path: Path) -> None:
-    bad = cut(1)
-    bad.signals["position"][3] = math.nan
-    for serial, each in enumerate([cut(0), bad, cut(0), bad, cut(2)], 1):
-        assert keeper.take(frames.framed(each, "b1", serial)) == [serial]
-    outbox = keeper._outbox
-    assert outbox.pending() == [("b1", 0), ("b1", 2)]
-    assert outbox.dropped == {"sample not finite": 1}
-    assert outbox.get(("b1", 0)).boot == "b1"
-
-
-def test_proved_parameters_are_written_or_tried_again(keeper: Keeper, tmp_path: Path) -> None:
-    store = FileStore(tmp_path / "parameters.json")
-    (tmp_path / "parameters.json.new").mkdir()
-    assert keeper.take(frames.SaveFrame(1, kept(Parameters(1, 1e-4)))) == []
-    assert keeper.take(frames.SaveFrame(2, kept(Parameters(2, 2e-4)))) == [1]
-    assert keeper.faults["parameters not written"] == 2
-    (tmp_path / "parameters.json.new").rmdir()
-    assert keeper.tend() == [2]
-    assert keeper.tend() == []
-    found = store.load()
-    assert found is not None
-    assert found.version == 2
-
-
-def test_the_cursor_only_rises(keeper: Keeper) -> None:
-    for serial in (3, 7, 5):
-        keeper.take(frames.HandledFrame(serial))
-    assert keeper._outbox.recall("cursor") == 7
-
-
-def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
-    file = tmp_path / "boots"
-    assert [next_boot(file, bytes([k])) for k in range(3)] == ["b1-00", "b2-01", "b3-02"]
-    file.write_text("rubbish")
-    assert next_boot(file, b"\x07") == "b1-07"
-    assert next_boot(tmp_path / "absent" / "boots", b"\x08") == "b1-08"
-
-
-def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:
-    file = tmp_path / "parameters.json"
-    assert first_parameters(file) is None
-    FileStore(file).save(Parameters(4, 1e-4))
-    found = first_parameters(file)
-    assert found is not None
-    assert found.version == 4
-    file.write_text("rubbish")
-    assert first_parameters(file) is None
-    assert (tmp_path / "parameters.json.broken").read_text() == "rubbish"
-
-
-@given(st.lists(st.floats(0.0, 2e-3), min_size=1, max_size=300))
-def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float]) -> None:
-    counts = Counts()
-    for each in durations:
-        counts.add(each)
-    found = summary(counts.dumps(), counts.longest)
-    ordered = sorted(durations)
-    for name, share in (("median_us", 0.5), ("p99_us", 0.99)):
-        exact = ordered[max(0, math.ceil(share * len(ordered)) - 1)] * 1e6
-        assert found[name] == pytest.approx(exact, abs=1.001)
-    assert found["number"] == len(durations)
-    assert found["max_us"] == pytest.approx(ordered[-1] * 1e6, abs=0.06)
-
-
-def test_a_trouble_is_told_when_it_comes_when_it_is_another_one_and_when_it_is_over(capfd: pytest.CaptureFixture[str]):
-    troubles = Troubles()
-    for why in ("", "", "refused", "refused", "away", "", ""):
-        troubles.look("to the twin", why)
-    troubles.look("disk", "")
-    told = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
-    assert [(line["event"], line["where"], line.get("why")) for line in told] == [
-        ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)
-    ]  # fmt: skip
