@@ -148,6 +148,30 @@ def test_a_refused_base_is_replaced_by_what_is_in_force():
     assert lost.version == 1
 
 
+def test_what_follows_on_a_refused_update_is_put_on_what_is_in_force():
+    """A twin that is behind: its updates follow on one another, and the first one comes too late."""
+    twin, _ = make()
+    sent = [twin.receive(window_message(k, 10.0 * (k + 1)), 10.0 * k + 11.0)[1] for k in range(4)]
+    assert [update.base_version for update in sent] == [0, 1, 2, 3]
+    (again,) = twin.receive(receipt(sent[0], Reason.EXPIRED, in_force=0), 45.0)
+    assert (again.version, again.base_version, again.window) == (5, 0, sent[3].window)
+    for update in sent[1:]:
+        assert twin.receive(receipt(update, Reason.BASE_MISMATCH, in_force=0), 46.0) == []
+    _, following = twin.receive(window_message(4, 50.0), 51.0)
+    assert (following.version, following.base_version) == (6, 5)
+    (last,) = twin.receive(receipt(again, Reason.EXPIRED, in_force=0), 52.0)
+    assert (last.version, last.base_version) == (7, 0)
+    assert twin.receive(receipt(last), 53.0) == []
+    assert twin.next_wake() is None
+
+
+@pytest.mark.parametrize(("reason", "in_force"), [(Reason.APPLIED, 1), (Reason.SUPERSEDED, 0), (Reason.OLD_VERSION, 1)])
+def test_what_follows_on_an_update_that_may_hold_is_left_alone(reason, in_force):
+    twin, _ = make()
+    sent = [twin.receive(window_message(k, 10.0 * (k + 1)), 10.0 * k + 11.0)[1] for k in range(2)]
+    assert twin.receive(receipt(sent[0], reason, in_force=in_force), 25.0) == []
+
+
 def test_a_twin_that_lost_its_memory_catches_up_with_the_edge():
     twin, _ = make()
     _, update = twin.receive(window_message(0, 10.0, version=0), 11.0)

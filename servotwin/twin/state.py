@@ -62,6 +62,7 @@ class VersionsState(Struct, frozen=True):
     pending: Update | None
     newest: float
     earlier: tuple[str, ...]
+    root: int = 0
 
 
 class RequestsState(Struct, frozen=True):
@@ -179,12 +180,12 @@ def restored_trend(state: TrendState, settings: TrendSettings) -> Trend:
 
 def _versions(versions: Versions) -> VersionsState:
     v = versions
-    return VersionsState(v.boot, v.in_force, v.issued, v.pending, v.newest, tuple(v.earlier))
+    return VersionsState(v.boot, v.in_force, v.issued, v.pending, v.newest, tuple(v.earlier), v.root)
 
 
 def _restored_versions(state: VersionsState) -> Versions:
     s = state
-    return Versions(s.boot, s.in_force, s.issued, s.pending, s.newest, list(s.earlier))
+    return Versions(s.boot, s.in_force, s.issued, s.pending, s.newest, list(s.earlier), s.root)
 
 
 def _wear(wear: Wear) -> WearState:

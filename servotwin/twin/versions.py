@@ -35,6 +35,8 @@ class Versions:
         Data time of the newest update of this boot, s.
     earlier : list of str
         Boots that are over, the last `EARLIER` of them.
+    root : int
+        First of the updates that follow on one another, the pending one last: it stands on what was in force.
     """
 
     boot: str | None = None
@@ -43,6 +45,7 @@ class Versions:
     pending: Update | None = None
     newest: float = -math.inf
     earlier: list[str] = field(default_factory=list)
+    root: int = 0
 
     def hear(self, boot: str, in_force: int) -> bool:
         """Note what a message says about its boot; False when that boot is over."""
@@ -60,18 +63,20 @@ class Versions:
 
     def issue(self, update: Update) -> Update:
         """The update under the next version, on the version that the edge will run when it arrives."""
-        base = self.in_force if self.pending is None else self.pending.version
-        return self._number(update, base)
+        return self._anew(update) if self.pending is None else self._number(update, self.pending.version)
 
     def settle(self, receipt: Receipt) -> Update | None:
-        """Note a receipt; the update to send instead when the pending one was refused for its base or number."""
+        """Note a receipt; the update to send instead when the pending one was refused for its base or number, or will
+        be, as one that it follows on was refused."""
         if not self.hear(receipt.boot, receipt.parameter_version) or self.pending is None:
             return None
+        if self._breaks(receipt):
+            return self._anew(self.pending)
         if receipt.version != self.pending.version or receipt.reason is Reason.TOO_SOON:
             return None
         refused, self.pending = self.pending, None
         if receipt.reason is Reason.BASE_MISMATCH or self.in_force > refused.version:
-            return self._number(refused, self.in_force)
+            return self._anew(refused)
         return None
 
     @property
@@ -88,6 +93,22 @@ class Versions:
             self.earlier = [*self.earlier, self.boot][-EARLIER:]
         self.boot, self.in_force = boot, in_force
         self.pending, self.newest = None, -math.inf
+
+    def _breaks(self, receipt: Receipt) -> bool:
+        """Whether the pending update stands on one that will never be in force.
+
+        A twin that is behind issues one update after the other before it reads the first receipt: were only the last
+        one's receipt to count, the edge would refuse all of them until the twin has caught up.
+        """
+        assert self.pending is not None
+        follows = self.root <= receipt.version < self.pending.version and self.in_force < self.pending.base_version
+        return follows and not receipt.applied and receipt.reason is not Reason.SUPERSEDED
+
+    def _anew(self, update: Update) -> Update:
+        """On what is in force."""
+        found = self._number(update, self.in_force)
+        self.root = found.version
+        return found
 
     def _number(self, update: Update, base: int) -> Update:
         self.issued += 1
