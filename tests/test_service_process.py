@@ -264,8 +264,10 @@ def test_bytes_that_are_no_request_do_no_harm(tmp_path):
                     line.shutdown(socket.SHUT_WR)
                     while line.recv(65536):
                         pass
-                except ConnectionError:
-                    pass
+                except TimeoutError:
+                    raise
+                except OSError:
+                    pass  # the twin hung up
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
     assert "Traceback" not in (tmp_path / "log").read_text()
 

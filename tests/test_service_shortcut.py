@@ -1,4 +1,4 @@
-"""A window is put past the framework's layers: the answer is that of the framework, whatever is asked."""
+"""Windows and questions for messages go past the framework's layers: it would answer the same, whatever is asked."""
 
 import asyncio
 from typing import Any
@@ -10,16 +10,29 @@ from service_system import OPERATOR, OTHER, TOKEN, served, twin_file, window
 from servotwin.messages import encode
 
 NAMES = ("ax-1", "ax-2", "ax-9", "b", "a/b", "..", "%2F", "ax-1\n", "é", "\0", "a" * 70, "", "0", "1", "01", "-1", "٣")
+QUERIES = (
+    "",
+    "after=0",
+    "after=7&wait=0",
+    "after=0&after=x",
+    "wait=0.001",
+    "after=-1",
+    "wait=31",
+    "wait=nan",
+    "after=%30",
+)
 AUTHORIZATIONS = ("", "Basic x", "Bearer", *(f"Bearer {token}" for token in (TOKEN, OTHER, OPERATOR, "guess", "é")))
 
 
 @st.composite
 def requests(draw: st.DrawFn) -> tuple[dict[str, Any], list[bytes]]:
-    """Scope and body: of a window, with something wrong about it now and then."""
+    """Scope and body: of a window or a question, with something wrong about it now and then."""
     sent = window(draw(st.integers(0, 2)), draw(st.sampled_from(["ax-1", "ax-2"])))
     parts = [sent.servo, "windows", sent.boot, str(sent.sequence)]
     if draw(st.booleans()):
         parts[draw(st.sampled_from([0, 2, 3]))] = draw(st.sampled_from(NAMES))
+    asks = draw(st.booleans())
+    parts = [parts[0], "outgoing"] if asks else parts
     path = "/v1/servos/" + "/".join(parts) + draw(st.sampled_from(["", "", "/", "\n"]))
     values = {
         "authorization": draw(st.sampled_from((AUTHORIZATIONS[3], *AUTHORIZATIONS))),
@@ -27,13 +40,12 @@ def requests(draw: st.DrawFn) -> tuple[dict[str, Any], list[bytes]]:
         "content-length": draw(st.sampled_from(["", "5", "99999999", "x", "-1"])),
     }
     headers = [(key.encode(), value.encode("latin-1")) for key, value in values.items() if value]
-    scope = {"type": "http", "method": draw(st.sampled_from(["PUT", "PUT", "POST"])), "path": path, "headers": headers}
+    method = draw(st.sampled_from(["GET", "GET", "HEAD"] if asks else ["PUT", "PUT", "POST"]))
+    query = draw(st.sampled_from(QUERIES)).encode()
+    scope = {"type": "http", "method": method, "path": path, "headers": headers, "query_string": query}
     body = encode(sent)
     body = body[: draw(st.integers(0, len(body)))] if draw(st.booleans()) else body
-    return {**scope, "query_string": b"", "root_path": "", "scheme": "http", "server": ("twin", 80)}, [
-        body[:50],
-        body[50:],
-    ]
+    return {**scope, "root_path": "", "scheme": "http", "server": ("twin", 80)}, [body[:50], body[50:]]
 
 
 async def answered(app: Any, scope: dict[str, Any], parts: list[bytes]) -> tuple[int, list[Any], bytes]:

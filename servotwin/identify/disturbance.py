@@ -183,9 +183,11 @@ def _roughness(means: Array) -> float:
 def _spread(drive: Array) -> float:
     """Standard deviation of the mean of correlated values, from the means of groups, a drift being none of chance."""
     count = min(_GROUPS, drive.size)
-    groups = np.array([part.mean() for part in np.array_split(drive, count)])
-    slope, _ = np.polyfit(np.arange(count), groups, 1)
-    left = groups - groups.mean() - slope * (np.arange(count) - 0.5 * (count - 1))
+    bounds = np.arange(count + 1) * drive.size // count
+    groups = np.add.reduceat(drive, bounds[:-1]) / np.diff(bounds)
+    line = np.arange(count) - 0.5 * (count - 1)
+    slope = float(line @ groups) / float(line @ line)
+    left = groups - groups.mean() - slope * line
     by_chance = math.sqrt(float(left @ left) / (count - 2) * 12.0 / (count * (count * count - 1.0)))
     drift = 0.5 * abs(slope) * (count - 1) if abs(slope) > _DRIFTS * by_chance else 0.0
     return math.hypot(_few(count - 2) * math.sqrt(float(left @ left) / (count - 2) / count), drift)

@@ -99,7 +99,7 @@ class System:
         whole = gate, bodies, self.ingest, self._parts, self.dispatcher, self._owner
         step = StepApi(*whole) if self.config.lockstep else None
         api = make_app(edge, read, step, self.metrics, self._lifespan)
-        return Shortcut(api, edge.put_window, partial(refusal, self.metrics))
+        return Shortcut(api, edge.put_window, edge.get_outgoing, partial(refusal, self.metrics))
 
     async def begin(self) -> None:
         """Take back what a crash left borrowed, start the workers, begin to work."""

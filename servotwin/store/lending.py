@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -22,18 +24,14 @@ def lend(
 ) -> list[str]:
     """Lease the servos that have waited longest; those due to be woken get half of the places at least."""
     lent: list[str] = []
-    for condition, order, share in _queues(now, kinds, limit):
-        wanted = min(share, limit - len(lent))
-        # One that ends later than any made by now comes from before a clock was set back.
-        late = until + (until - now)
-        free = sa.or_(twins.c.lease_until.is_(None), twins.c.lease_until <= now, twins.c.lease_until > late)
-        query = sa.select(twins.c.servo).where(condition, free).order_by(order).limit(wanted)
-        if only is not None:
-            query = query.where(twins.c.servo == only)
-        # SQLite has one writer at a time, and leaves this out.
-        found = connection.scalars(query.with_for_update(skip_locked=True)).all()
-        _lease(connection, found, owner, until)
-        lent += found
+    # A lease that ends later than any made by now comes from before a clock was set back.
+    bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
+    for query, share in _queues(frozenset(kinds), only is not None):
+        wanted = min(math.ceil(share * limit), limit - len(lent))
+        found = connection.scalars(query, bound | {"_wanted": wanted}).all()
+        if found:
+            connection.execute(_LEASE, {"_servos": found, "_owner": owner, "_until": until})
+            lent += found
     return lent
 
 
@@ -45,9 +43,7 @@ def release(connection: sa.Connection, owner: str, servos: Collection[str] | Non
 
 def claims(connection: sa.Connection, servos: Sequence[str], kinds: Collection[Kind], per_servo: int) -> list[Claim]:
     """What there is to do for servos that are lent, in their order."""
-    columns = twins.c.servo, states.c.state, twins.c.serial, twins.c.attempts
-    query = sa.select(*columns).outerjoin(states, states.c.servo == twins.c.servo).where(twins.c.servo.in_(servos))
-    rows = {row.servo: row for row in connection.execute(query)}
+    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
     undone = _undone(connection, servos, kinds, per_servo)
     return [
         Claim(servo, rows[servo].state or b"", rows[servo].serial, tuple(undone[servo]), rows[servo].attempts)
@@ -57,50 +53,78 @@ def claims(connection: sa.Connection, servos: Sequence[str], kinds: Collection[K
 
 def woken(connection: sa.Connection, servos: Collection[str], now: float) -> set[str]:
     """Which of them are due to be woken."""
-    return set(connection.scalars(sa.select(twins.c.servo).where(twins.c.servo.in_(servos), twins.c.wake <= now)))
+    return set(connection.scalars(_WOKEN, {"_servos": list(servos), "_now": now}))
 
 
-def _queues(
-    now: float, kinds: Collection[Kind], limit: int
-) -> list[tuple[sa.ColumnElement[bool], sa.ColumnElement[float], int]]:
-    """(whose turn it is, in which order, how many at most)."""
-    found: list[tuple[sa.ColumnElement[bool], sa.ColumnElement[float], int]] = []
+@lru_cache(maxsize=32)
+def _queues(kinds: frozenset[Kind], one: bool) -> list[tuple[sa.Select[Any], float]]:
+    """(who is next in a queue, how much of all it may take at most); of `one` servo alone."""
+    found: list[tuple[sa.Select[Any], float]] = []
     if Kind.WINDOW in kinds or Kind.LETTER in kinds:
-        found.append((twins.c.wake <= now, twins.c.wake, (limit + 1) // 2))
-        found.append((twins.c.ready.is_not(None), twins.c.ready, limit))
-        found.append((twins.c.wake <= now, twins.c.wake, limit))
+        due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
+        found.append((_next(due, twins.c.wake, one), 0.5))
+        found.append((_next(ready, twins.c.ready, one), 1.0))
+        found.append((_next(due, twins.c.wake, one), 1.0))
     if Kind.PROOF in kinds:
-        found.append((twins.c.asked.is_not(None), twins.c.asked, limit))
+        found.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
     return found
 
 
-def _lease(connection: sa.Connection, servos: Sequence[str], owner: str, until: float) -> None:
-    if servos:
-        lent = {"lease_owner": owner, "lease_until": until, "attempts": twins.c.attempts + 1}
-        connection.execute(sa.update(twins).where(twins.c.servo.in_(servos)).values(lent))
+def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: bool) -> sa.Select[Any]:
+    """Those whose turn it is and that nobody has."""
+    until = twins.c.lease_until
+    late = sa.bindparam("_late", type_=sa.Double)
+    free = sa.or_(until.is_(None), until <= _NOW, until > late)
+    wanted = sa.bindparam("_wanted", type_=sa.Integer)
+    query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(wanted)
+    query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
+    # SQLite has one writer at a time, and leaves this out.
+    return query.with_for_update(skip_locked=True)
 
 
 def _undone(
     connection: sa.Connection, servos: Sequence[str], kinds: Collection[Kind], per_servo: int
 ) -> dict[str, list[Stored]]:
     found: dict[str, list[Stored]] = {servo: [] for servo in servos}
-    for queue, of in ((WORK, {Kind.WINDOW, Kind.LETTER}), (PROOFS, {Kind.PROOF})):
-        wanted = of & set(kinds)
+    for of in ({Kind.WINDOW, Kind.LETTER}, {Kind.PROOF}):
+        wanted = frozenset(of & set(kinds))
         if wanted:
-            for row in connection.execute(_oldest(servos, queue, wanted, per_servo)):
+            for row in connection.execute(_oldest(wanted), {"_servos": servos, "_per_servo": per_servo}):
                 found[row.servo].append(Stored(row.id, Kind(row.kind), row.body, row.encoding, row.received, row.key))
     return found
 
 
-def _oldest(
-    servos: Sequence[str], queue: sa.ColumnElement[bool], kinds: Collection[Kind], per_servo: int
-) -> sa.Select[Any]:
+@lru_cache(maxsize=8)
+def _oldest(kinds: frozenset[Kind]) -> sa.Select[Any]:
+    """The first messages of these kinds of each servo, proofs alone or the others."""
+    proofs = Kind.PROOF in kinds
     place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=messages.c.id).label("place")
-    waiting = sa.select(messages.c.id, place).where(queue, messages.c.servo.in_(servos))
-    if len(kinds) == 1 and Kind.PROOF not in kinds:
+    waiting = sa.select(messages.c.id, place).where(PROOFS if proofs else WORK, messages.c.servo.in_(_SERVOS))
+    if len(kinds) == 1 and not proofs:
         waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
     first = waiting.subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
     columns = *known, bodies.c.body
     joined = first.join(messages, messages.c.id == first.c.id).join(bodies, bodies.c.message == messages.c.id)
-    return sa.select(*columns).select_from(joined).where(first.c.place <= per_servo).order_by(messages.c.id)
+    within = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
+    return sa.select(*columns).select_from(joined).where(within).order_by(messages.c.id)
+
+
+_SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
+_NOW = sa.bindparam("_now", type_=sa.Double)
+
+_LEASE = (
+    sa.update(twins)
+    .where(twins.c.servo.in_(_SERVOS))
+    .values(
+        lease_owner=sa.bindparam("_owner"),
+        lease_until=sa.bindparam("_until", type_=sa.Double),
+        attempts=twins.c.attempts + 1,
+    )
+)
+_STATES = (
+    sa.select(twins.c.servo, states.c.state, twins.c.serial, twins.c.attempts)
+    .outerjoin(states, states.c.servo == twins.c.servo)
+    .where(twins.c.servo.in_(_SERVOS))
+)
+_WOKEN = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), twins.c.wake <= _NOW)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from itertools import groupby
 from typing import Any
 
 import sqlalchemy as sa
@@ -22,22 +24,26 @@ def commit(connection: sa.Connection, outcomes: Sequence[Outcome], now: float) -
     The comparison with the serial makes an effect exactly once, whoever holds the lease: of two workers that had the
     same servo the first to commit wins, and what the other made is void.
     """
-    order = sorted(range(len(outcomes)), key=lambda i: outcomes[i].servo)
-    posted = {i: _raise(connection, outcomes[i]) for i in order}
-    valid = [(outcomes[i], last) for i in order if (last := posted[i]) is not None]
+    valid = _valid(connection, outcomes)
     if valid:
-        _write(connection, valid, now)
-    return [posted[i] is not None for i in range(len(outcomes))]
+        _write(connection, [(outcomes[i], last) for i, last in valid.items()], now)
+    return [i in valid for i in range(len(outcomes))]
 
 
-def _raise(connection: sa.Connection, outcome: Outcome) -> int | None:
-    """The servo's serial raised by one; serial of its last message to the edge, None where the outcome is void."""
-    known = _summary(outcome.evidence)
-    values = known | {"wake": outcome.wake, "count": len(outcome.outgoing)}
-    statement = _RAISE.values({twins.c[name]: sa.bindparam(f"_{name}", type_=twins.c[name].type) for name in known})
-    bound = {f"_{name}": value for name, value in values.items()}
-    found = connection.execute(statement, bound | {"_servo": outcome.servo, "_serial": outcome.serial})
-    return found.scalar()
+def _valid(connection: sa.Connection, outcomes: Sequence[Outcome]) -> dict[int, int]:
+    """Of those that count, in the servos' order, the serial of the last message to the edge. Locks them."""
+    if not outcomes:
+        return {}
+    servos = sorted({outcome.servo for outcome in outcomes})
+    rows = connection.execute(_HOLD, {"_servos": servos})
+    held = {row.servo: (row.serial, row.posted) for row in rows}
+    valid: dict[int, int] = {}
+    for i in sorted(range(len(outcomes)), key=lambda i: outcomes[i].servo):
+        serial, posted = held.get(outcomes[i].servo, (None, 0))
+        if outcomes[i].serial == serial:
+            valid[i] = posted + len(outcomes[i].outgoing)
+            held[outcomes[i].servo] = serial + 1, valid[i]
+    return valid
 
 
 def pass_over(connection: sa.Connection, servo: str, serial: int) -> None:
@@ -48,12 +54,13 @@ def pass_over(connection: sa.Connection, servo: str, serial: int) -> None:
 
 def _write(connection: sa.Connection, valid: Sequence[tuple[Outcome, int]], now: float) -> None:
     outcomes = [outcome for outcome, _ in valid]
+    _raise(connection, valid)
     _states(connection, outcomes)
     _done(connection, outcomes, now)
     known = {key: text for outcome in outcomes for key, text in outcome.contexts}
     _many(
         connection,
-        insert_once(connection, contexts),
+        insert_once(connection.dialect.name, contexts),
         ({"key": key, "text": text} for key, text in sorted(known.items())),
     )
     found = [(outcome.servo, one) for outcome in outcomes for one in outcome.evidence]
@@ -61,24 +68,36 @@ def _write(connection: sa.Connection, valid: Sequence[tuple[Outcome, int]], now:
     _many(connection, sa.insert(evidence), (_found(servo, one, windows, now) for servo, one in found))
     _many(connection, sa.insert(outgoing), (row for outcome, last in valid for row in _posts(outcome, last, now)))
     put(connection, [item for outcome in outcomes for item in outcome.enqueue])
-    connection.execute(_RECKON.where(twins.c.servo.in_([outcome.servo for outcome in outcomes])))
+    connection.execute(_RECKON, {"_servos": sorted({outcome.servo for outcome in outcomes})})
+
+
+def _raise(connection: sa.Connection, valid: Sequence[tuple[Outcome, int]]) -> None:
+    """Raise the servos' serials, end their leases, and note what is newest of them; one statement for all in a row
+    that tell of the same."""
+    rows = [(_summary(outcome.evidence), outcome, last) for outcome, last in valid]
+    for names, alike in groupby(rows, lambda row: tuple(sorted(row[0]))):
+        bound = [
+            {f"_{name}": value for name, value in known.items()}
+            | {"_servo": outcome.servo, "_serial": outcome.serial + 1, "_posted": last, "_wake": outcome.wake}
+            for known, outcome, last in alike
+        ]
+        connection.execute(_raising(names), bound)
 
 
 def _states(connection: sa.Connection, outcomes: Sequence[Outcome]) -> None:
-    insert = sqlite.insert if connection.dialect.name == SQLITE else postgresql.insert
-    new = insert(states)
-    replacing = new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
-    connection.execute(replacing, [{"servo": outcome.servo, "state": outcome.state} for outcome in outcomes])
+    rows = [{"servo": outcome.servo, "state": outcome.state} for outcome in outcomes]
+    connection.execute(_replacing(connection.dialect.name), rows)
 
 
 def _done(connection: sa.Connection, outcomes: Sequence[Outcome], now: float) -> None:
-    for outcome in outcomes:
-        if outcome.done:
-            found = connection.execute(_DONE, {"_servo": outcome.servo, "_now": now, "_ids": list(outcome.done)})
-            if found.rowcount != len(set(outcome.done)):
-                raise ValueError(
-                    f"outcome of {outcome.servo}: covers a message that is not an unprocessed one of its own"
-                )
+    rows = [
+        {"_servo": outcome.servo, "_id": message, "_now": now}
+        for outcome in outcomes
+        for message in dict.fromkeys(outcome.done)
+    ]
+    if rows and connection.execute(_DONE, rows).rowcount != len(rows):
+        servos = ", ".join(sorted({outcome.servo for outcome in outcomes}))
+        raise ValueError(f"outcome of {servos}: covers a message that is not an unprocessed one of its own")
 
 
 def _many(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, Any]]) -> None:
@@ -124,29 +143,33 @@ def _summary(found: Sequence[Evidence]) -> dict[str, Any]:
     return known
 
 
-_RAISE = (
-    sa.update(twins)
-    .where(twins.c.servo == sa.bindparam("_servo"), twins.c.serial == sa.bindparam("_serial"))
-    .values(
-        serial=twins.c.serial + 1,
-        posted=twins.c.posted + sa.bindparam("_count", type_=sa.BigInteger),
-        wake=sa.bindparam("_wake", type_=sa.Double),
-        attempts=0,
-        lease_owner=None,
-        lease_until=None,
-    )
-    .returning(twins.c.posted)
+_HOLD = (
+    sa.select(twins.c.servo, twins.c.serial, twins.c.posted)
+    .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
+    .order_by(twins.c.servo)
+    .with_for_update()
 )
 
 _DONE = (
     sa.update(messages)
-    .where(
-        messages.c.id.in_(sa.bindparam("_ids", expanding=True)),
-        messages.c.servo == sa.bindparam("_servo"),
-        messages.c.done.is_(None),
-    )
+    .where(messages.c.id == sa.bindparam("_id"), messages.c.servo == sa.bindparam("_servo"), messages.c.done.is_(None))
     .values(done=sa.bindparam("_now", type_=sa.Double))
 )
+
+
+@lru_cache(maxsize=32)
+def _raising(names: tuple[str, ...]) -> sa.Update:
+    """A servo's next serial, with what is new of these columns."""
+    new = {name: sa.bindparam(f"_{name}", type_=twins.c[name].type) for name in ("serial", "posted", "wake", *names)}
+    values = {"attempts": 0, "lease_owner": None, "lease_until": None} | new
+    return sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values)
+
+
+@lru_cache(maxsize=2)
+def _replacing(dialect: str) -> Any:
+    """A servo's state, whether it had one or not."""
+    new = (sqlite.insert if dialect == SQLITE else postgresql.insert)(states)
+    return new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
 
 
 def _first(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
@@ -156,4 +179,8 @@ def _first(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
 
 # A statement of its own after the serials were raised: on PostgreSQL those rows are locked then, and what was put
 # before that is seen here, what is put after it waits and says so itself.
-_RECKON = sa.update(twins).values(ready=_first(WORK), asked=_first(PROOFS))
+_RECKON = (
+    sa.update(twins)
+    .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
+    .values(ready=_first(WORK), asked=_first(PROOFS))
+)

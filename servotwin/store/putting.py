@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -31,9 +32,10 @@ def put(connection: sa.Connection, items: Sequence[Incoming]) -> list[Put]:
     return [_became(item, item is firsts[item.servo, item.key], made, digests) for item in items]
 
 
-def insert_once(connection: sa.Connection, table: sa.Table) -> Any:
+@lru_cache(maxsize=8)
+def insert_once(dialect: str, table: sa.Table) -> Any:
     """An insertion that leaves alone what is there already."""
-    chosen = sqlite.insert if connection.dialect.name == SQLITE else postgresql.insert
+    chosen = sqlite.insert if dialect == SQLITE else postgresql.insert
     return chosen(table).on_conflict_do_nothing()
 
 
@@ -50,19 +52,22 @@ def _in_order(items: Iterable[Incoming]) -> list[Incoming]:
 
 
 def _know(connection: sa.Connection, servos: Iterable[str]) -> None:
-    connection.execute(insert_once(connection, twins), [{"servo": servo} for servo in sorted(servos)])
+    connection.execute(insert_once(connection.dialect.name, twins), [{"servo": servo} for servo in sorted(servos)])
 
 
 def _insert(connection: sa.Connection, items: Sequence[Incoming]) -> dict[Name, int]:
     """Ids of those that were not there."""
-    columns = messages.c.id, messages.c.servo, messages.c.key
-    statement = insert_once(connection, messages).returning(*columns)
-    rows = connection.execute(statement, [_row(item) for item in items])
+    rows = connection.execute(_inserting(connection.dialect.name), [_row(item) for item in items])
     made = {(servo, key): id_ for id_, servo, key in rows}
     filled = [{"message": made[i.servo, i.key], "body": i.body} for i in items if (i.servo, i.key) in made]
     if filled:
         connection.execute(sa.insert(bodies), filled)
     return made
+
+
+@lru_cache(maxsize=2)
+def _inserting(dialect: str) -> Any:
+    return insert_once(dialect, messages).returning(messages.c.id, messages.c.servo, messages.c.key)
 
 
 def _row(item: Incoming) -> dict[str, Any]:

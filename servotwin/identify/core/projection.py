@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, summed
 from servotwin.plant.signals import Array
 
 _SINGULAR = 1e-7  # of a derivative's length: what is left of it below this is rounding
@@ -48,14 +48,21 @@ def spread(derivative: Array, others: Array, singular: float = _SINGULAR) -> flo
     return 1.0 / size if size > singular * math.sqrt(float(derivative @ derivative)) else math.inf
 
 
+@summed
+def inner(one: Array, other: Array) -> float:
+    """Inner product of two rows (n,), in any order."""
+    total = 0.0
+    for i in range(other.size):
+        total += one[i] * other[i]
+    return total
+
+
 @bare
 def remove(rows: Array, known: int, column: Array) -> None:
     """Take off a column (n,) its parts along the first `known` orthonormal rows, one after the other."""
     for k in range(known):
         row = rows[k]
-        share = 0.0
-        for i in range(column.size):
-            share += row[i] * column[i]
+        share = inner(row, column)
         for i in range(column.size):
             column[i] -= share * row[i]
 
@@ -64,15 +71,12 @@ def remove(rows: Array, known: int, column: Array) -> None:
 def add_direction(rows: Array, known: int, column: Array, dependent: float) -> bool:
     """Put what is new in a column, normalised, into row `known`; False when nothing is."""
     row = rows[known]
-    before = 0.0
     for i in range(row.size):
         row[i] = column[i]
-        before += column[i] * column[i]
+    before = inner(row, row)
     remove(rows, known, row)
     remove(rows, known, row)
-    after = 0.0
-    for i in range(row.size):
-        after += row[i] * row[i]
+    after = inner(row, row)
     if not after > dependent * dependent * before:
         return False
     length = np.sqrt(after)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from servotwin.hybrid.compiled import bare, compiled
+from servotwin.hybrid.compiled import bare, compiled, inlined, summed
 from servotwin.plant.signals import Array
 
 
@@ -80,23 +80,23 @@ def _criterion(power: float, order: int, size: int) -> float:
     return size * math.log(max(power, 1e-300)) + 2.0 * count * size / max(1, size - count - 1)
 
 
-@bare
-def correlation(forward: Array, backward: Array, order: int) -> tuple[float, float]:
-    """Sums of the products of both errors, and of their squares, the backward one a sample earlier."""
+@summed
+def correlation(ahead: Array, behind: Array) -> tuple[float, float]:
+    """Sums of the products of forward and backward errors, and of their squares."""
     across = square = 0.0
-    for i in range(order, forward.size):
-        across += forward[i] * backward[i - 1]
-        square += forward[i] * forward[i] + backward[i - 1] * backward[i - 1]
+    for i in range(ahead.size):
+        across += ahead[i] * behind[i]
+        square += ahead[i] * ahead[i] + behind[i] * behind[i]
     return across, square
 
 
-@bare
-def reflect(forward: Array, backward: Array, order: int, reflection: float) -> None:
+@inlined
+def reflect(ahead: Array, behind: Array, reflection: float) -> None:
     """One stage of the lattice, in place."""
-    for i in range(forward.size - 1, order - 1, -1):
-        ahead, behind = forward[i], backward[i - 1]
-        forward[i] = ahead + reflection * behind
-        backward[i] = behind + reflection * ahead
+    for i in range(ahead.size):
+        one, two = ahead[i], behind[i]
+        ahead[i] = one + reflection * two
+        behind[i] = two + reflection * one
 
 
 @compiled
@@ -106,16 +106,17 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
     predictors, power = np.zeros((most + 1, most + 1)), np.zeros(most + 1)
     predictors[0, 0] = 1.0
     power[0] = np.sum(series * series) / (count * size)
+    # A backward error stands where the series begins that it was predicted from: beside its forward error.
     forward, backward = series.copy(), series.copy()
     for order in range(1, most + 1):
         across = square = 0.0
         for k in range(count):
-            one, two = correlation(forward[k], backward[k], order)
+            one, two = correlation(forward[k, order:], backward[k, : size - order])
             across += one
             square += two
         reflection = -2.0 * across / square if square > 0.0 else 0.0
         for k in range(count):
-            reflect(forward[k], backward[k], order, reflection)
+            reflect(forward[k, order:], backward[k, : size - order], reflection)
         for i in range(order + 1):
             last = predictors[order - 1, order - i] if i > 0 else 0.0
             predictors[order, i] = predictors[order - 1, i] + reflection * last
@@ -123,19 +124,32 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
     return predictors, power
 
 
+@inlined
+def add_four(one: float, two: float, three: float, four: float, late: Array, out: Array) -> None:
+    """Add to `out` (n,) a signal, given from three samples before, weighted now, one, two and three samples later."""
+    for i in range(out.size):
+        out[i] += (one * late[i + 3] + two * late[i + 2]) + (three * late[i + 1] + four * late[i])
+
+
 @bare
 def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None:
-    """`Autoregression.whiten` into `out`: the first samples one by one, the others one coefficient at a time."""
+    """`Autoregression.whiten` into `out`: the first samples one by one, the others four coefficients at a time."""
     most, size = spread.size - 1, columns.shape[1]
+    weights, fours = predictors[most], 4 * (most // 4)
     for k in range(len(columns)):
+        column, white = columns[k], out[k]
         for i in range(min(most, size)):
             total = 0.0
             for j in range(i + 1):
-                total += predictors[i, j] * columns[k, i - j]
-            out[k, i] = total / spread[i]
-        for i in range(most, size):
-            out[k, i] = columns[k, i] / spread[most]
-        for j in range(1, most + 1):
-            share = predictors[most, j] / spread[most]
-            for i in range(most, size):
-                out[k, i] += share * columns[k, i - j]
+                total += predictors[i, j] * column[i - j]
+            white[i] = total / spread[i]
+        left = white[most:]
+        for i in range(left.size):
+            left[i] = column[i + most]
+        for j in range(1, fours, 4):
+            add_four(weights[j], weights[j + 1], weights[j + 2], weights[j + 3], column[most - j - 3 :], left)
+        for j in range(fours + 1, most + 1):
+            for i in range(left.size):
+                left[i] += weights[j] * column[i + most - j]
+        for i in range(left.size):
+            left[i] /= spread[most]
