@@ -54,23 +54,29 @@ def estimate_carrying(
     carried : (float, float), optional
         Mean and standard deviation of the offset, rad.
     """
-    alone = whitened.estimate(window, servo, prior, settings)
-    if settings.offset is not None:
-        return alone
-    if alone.ok:
-        return replace(alone, offset=read_offset(window, servo, alone, settings))
-    if carried is None or alone.status is GapStatus.MODEL_MISMATCH or not 0.0 < carried[1] < settings.largest_std:
-        return alone
+    fitted = whitened.fit(window, servo, prior, settings)
+    known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
+    # A window of one contact can show nothing alone; looking for how little it shows takes longer than all the rest.
+    if not (known and fitted.one_sided()):
+        alone = fitted.concluded()
+        if settings.offset is None and alone.ok:
+            return replace(alone, offset=read_offset(window, servo, alone, settings))
+        if not known or alone.status is GapStatus.MODEL_MISMATCH:
+            return alone
+    assert carried is not None
     helped = whitened.estimate(window, servo, prior, replace(settings, offset=carried))
+    if helped.ok and not helped.rms > _WORSE * fitted.rms():
+        slope = _slope(_columns(window, servo, helped, settings))
+        return replace(helped, offset=CarriedOffset(*carried, slope))
+    return _refused(fitted.concluded(), helped)
+
+
+def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
+    """What a window says alone, with why nothing else is believed."""
     if not helped.ok:
         return alone
-    if helped.rms > _WORSE * alone.rms:
-        worse = (
-            f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
-        )
-        return replace(alone, reasons=(*alone.reasons, worse))
-    slope = _slope(_columns(window, servo, helped, settings))
-    return replace(helped, offset=CarriedOffset(*carried, slope))
+    worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
+    return replace(alone, reasons=(*alone.reasons, worse))
 
 
 def read_offset(

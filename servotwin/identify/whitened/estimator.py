@@ -7,7 +7,7 @@ the play operator. docs/estimator.md explains it and says how well it does.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from servotwin.identify.estimate import NORMAL_95, GapEstimate, GapStatus, Inter
 from servotwin.identify.whitened.aligned import Aligned, align_and_fit
 from servotwin.identify.whitened.channels import faults, motor_angle
 from servotwin.identify.whitened.diagnosis import likely_fault
-from servotwin.identify.whitened.gate import Evidence, judge, lower_bound
+from servotwin.identify.whitened.gate import Evidence, judge, lower_bound, one_sided
 from servotwin.identify.whitened.lostmotion import static_lost_motion
 from servotwin.identify.whitened.modelcheck import Shift, model_shift, observer_shift
 from servotwin.identify.whitened.passes import Found
@@ -28,7 +28,7 @@ from servotwin.identify.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "SHORTEST", "Settings", "estimate"]
+__all__ = ["METHOD", "SHORTEST", "Fitted", "Settings", "estimate", "fit"]
 
 METHOD = "whitened"
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
@@ -51,6 +51,56 @@ def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, se
     InvalidInput
         No theta_m, a window too short, a low-pass above half the sample rate.
     """
+    return fit(window, servo, prior, settings).concluded()
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A window's fit, before anything is held against it, which takes longer than the fit.
+
+    Attributes
+    ----------
+    window : Window
+    servo : Servo
+    prior : float or GapEstimate, optional
+    settings : Settings
+    blank : GapEstimate
+        What is known without the window; its status and reasons are final where the channels are broken.
+    angle : (n,) array
+        rad, of the motor.
+    aligned : Aligned, optional
+        None: the channels are broken.
+    """
+
+    window: Window
+    servo: Servo
+    prior: float | GapEstimate | None
+    settings: Settings
+    blank: GapEstimate
+    angle: Array
+    aligned: Aligned | None
+
+    def one_sided(self) -> str:
+        """Why the window cannot show the gap, whatever else is found: too little contact; empty: it has enough."""
+        return "" if self.aligned is None else one_sided(_travel(self.aligned.found), self.settings)
+
+    def rms(self) -> float:
+        """m, what the fit leaves."""
+        return math.nan if self.aligned is None else _left(self.aligned.found)
+
+    def concluded(self) -> GapEstimate:
+        """The estimate, judged."""
+        if self.aligned is None:
+            return self.blank
+        seen = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
+        status, reasons = judge(seen, self.settings)
+        if status is GapStatus.MODEL_MISMATCH:
+            reasons = (*likely_fault(self.window, self.angle, self.servo, seen.unexplained), *reasons)
+        return _stated(self.blank, seen, status, reasons, self.prior, self.settings)
+
+
+def fit(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> Fitted:
+    """The first half of `estimate`, with the same arguments and errors."""
     settings = settings or Settings()
     _check(window)
     assert window.theta_m is not None
@@ -58,14 +108,11 @@ def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, se
     broken = faults(window)
     if broken:
         dead = any("constant" in sentence for sentence in broken)
-        return replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
+        blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
+        return Fitted(window, servo, prior, settings, blank, window.theta_m, None)
     angle = motor_angle(window, servo.encoder_resolution, settings)
     aligned = align_and_fit(angle, window.position, window.sample_rate, servo, _start(prior), settings)
-    seen = _evidence(aligned, window, angle, servo, settings)
-    status, reasons = judge(seen, settings)
-    if status is GapStatus.MODEL_MISMATCH:
-        reasons = (*likely_fault(window, angle, servo, seen.unexplained), *reasons)
-    return _stated(blank, seen, status, reasons, prior, settings)
+    return Fitted(window, servo, prior, settings, blank, angle, aligned)
 
 
 def _check(window: Window) -> None:
@@ -98,6 +145,11 @@ def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, sett
     )
 
 
+def _left(found: Found) -> float:
+    """m rms, what the fit leaves."""
+    return float(np.sqrt(np.mean(noise_left(found) ** 2)))
+
+
 def _travel(found: Found) -> Travel:
     """Of the screw, without the end of the window, to which the last mass cannot have answered."""
     reduction, model = found.reduction, found.reduction.response
@@ -122,7 +174,7 @@ def _stated(
         blank,
         status=status,
         reasons=reasons,
-        rms=float(np.sqrt(np.mean(noise_left(found) ** 2))),
+        rms=_left(found),
         evaluations=found.evaluations,
     )
     if status is GapStatus.LOWER_BOUND:

@@ -55,10 +55,10 @@ def judge(seen: Evidence, settings: Settings) -> tuple[GapStatus, tuple[str, ...
 
     Where the screw was not pushed as it must, the fitted gap is nobody's: that other views put it elsewhere is no news.
     """
-    one_sided = _one_sided(seen, settings)
-    disagreements = () if one_sided else _disagreements(seen, settings)
+    too_little = one_sided(seen.travel, settings)
+    disagreements = () if too_little else _disagreements(seen, settings)
     mismatches = tuple(filter(None, (_unexplained(seen), _delayed(seen, settings), *disagreements)))
-    silence = tuple(filter(None, (one_sided, _spread(seen, settings))))
+    silence = tuple(filter(None, (too_little, _spread(seen, settings))))
     bound = lower_bound(seen, settings) > _SMALLEST_BOUND and math.isinf(seen.interval[1])
     if seen.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(seen.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
@@ -72,9 +72,9 @@ def lower_bound(seen: Evidence, settings: Settings) -> float:
     return max(0.0, seen.interval[0] - NORMAL_95 * settings.model_error)
 
 
-def _one_sided(seen: Evidence, settings: Settings) -> str:
+def one_sided(seen: Travel, settings: Settings) -> str:
     """Pushed both ways the screw shows the gap; pushed one way only when the encoder's offset is known."""
-    forwards, backwards = seen.travel.forwards, seen.travel.backwards
+    forwards, backwards = seen.forwards, seen.backwards
     needed = settings.contact_travel
     enough = min(forwards, backwards) if settings.offset is None else max(forwards, backwards)
     if enough >= needed:
