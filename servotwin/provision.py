@@ -28,6 +28,8 @@ from servotwin.service.twinfile import TwinFile, read_twin
 from servotwin.tomltable import did_you_mean, read_toml
 
 TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
+LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
+"""What a twin with [twin.excitation] may ask an edge for: a calm loop turns the screw back late."""
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
 
 
@@ -141,7 +143,8 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
     model = twin.fleet.model_of(wanted.servo)
     sampled = wanted.role == "control" or wanted.noise > 0.0
     law = model.servo.controller.replace(sample_rate=wanted.sample_rate if sampled else None)
-    recording = Recording(sample_rate=wanted.sample_rate)
+    longest = LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S
+    recording = Recording(sample_rate=wanted.sample_rate, longest_window=longest[0], longest_pre_trigger=longest[1])
     scenario = Scenario(
         servo=model.servo.replace(controller=law),
         duration=1.0,

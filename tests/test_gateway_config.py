@@ -49,7 +49,7 @@ def test_what_a_scenario_tells_its_edge_comes_back_bit_for_bit(preset: str) -> N
     agent = replace(scenario.agent_settings(), boot=UNBOOTED)
     law = scenario.law if scenario.law.sample_rate else scenario.law.replace(sample_rate=agent.sample_rate)
     agent = replace(agent, controller=None if agent.controller is None else law)
-    config = EdgeConfig(agent, "control", law, {"kind": "simulated", "port": 4000}, TwinLink("http://h:1", "token"))
+    config = EdgeConfig(agent, "control", law, {"kind": "simulated", "port": 4000}, TwinLink("https://h:1", "token"))
     assert again(config) == config
 
 
@@ -93,7 +93,8 @@ def test_a_short_file_is_enough(tmp_path: Path) -> None:
         ('kind = "simulated"', "", "key 'drive.kind' is missing"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\nsample_rate_hz = 5", r"controller sample_rate_hz = 5.0 Hz"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'ftp://x'", "url = 'ftp://x' is not allowed"),
-        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'http://x'", "token_file or token_env is needed"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'http://x'", "token in clear to another machine"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'https://x'", "token_file or token_env is needed"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[keep]\nwindows = 0", "outbox windows = 0"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[sensor]\nhold_s = -1", "hold_s = -1.0 s"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[limits]\nmaximum_m = -1", "limits.maximum_m = -1"),
@@ -102,6 +103,14 @@ def test_a_short_file_is_enough(tmp_path: Path) -> None:
 def test_what_is_wrong_is_refused_by_name(old: str, new: str, said: str) -> None:
     with pytest.raises(InvalidInput, match=said):
         read(parse_toml(PLAIN.replace(old, new), "edge.toml"))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost"])
+def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
+    assert TwinLink(f"http://{host}:8765", "token").url == f"http://{host}:8765"
+    for other in ("10.0.0.1", "[2001:db8::1]", "localhost.example", "127.0.0.1.example", "127.1"):
+        with pytest.raises(InvalidInput, match="in clear"):
+            TwinLink(f"http://{other}:8765", "token")
 
 
 def test_to_control_a_controller_is_needed() -> None:
@@ -115,12 +124,12 @@ def test_a_token_is_read_from_a_private_file_or_the_environment(tmp_path: Path) 
     file = tmp_path / "token"
     file.write_text("s3cret\n")
     file.chmod(0o644)
-    link = TwinLink("http://h", token_file="token")
+    link = TwinLink("https://h", token_file="token")
     with pytest.raises(InvalidInput, match="mode 0600") as refused:
         token_of(link, tmp_path)
     assert "s3cret" not in str(refused.value)
     file.chmod(0o600)
     assert token_of(link, tmp_path) == "s3cret"
-    assert token_of(TwinLink("http://h", token_env="T"), tmp_path, {"T": "other"}) == "other"
+    assert token_of(TwinLink("https://h", token_env="T"), tmp_path, {"T": "other"}) == "other"
     with pytest.raises(InvalidInput, match="variable T: holds no token"):
-        token_of(TwinLink("http://h", token_env="T"), tmp_path, {})
+        token_of(TwinLink("https://h", token_env="T"), tmp_path, {})

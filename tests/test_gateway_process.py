@@ -313,6 +313,23 @@ def test_a_wrong_configuration_ends_with_one_sentence(gateway: Gateway, machine:
     assert "Traceback" not in gateway.log()
 
 
+def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
+    gateway: Gateway, machine: StubMachine
+) -> None:
+    gateway.start()
+    until(lambda: len(machine.voltages) > 100)
+    command = [sys.executable, "-m", "servotwin.gateway", str(gateway.folder / "edge.toml")]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (second.returncode, second.stderr.count("\n")) == (2, 1)
+    assert "another edge runs on its files" in second.stderr
+    before = len(machine.voltages)
+    until(lambda: len(machine.voltages) > before + 100)
+    gateway.kill()
+    gateway.start()
+    until(lambda: len(machine.voltages) > before + 300)
+    assert gateway.signal(signal.SIGTERM) == 0
+
+
 def test_a_full_disk_stops_neither_the_controller_nor_the_link(
     gateway: Gateway, machine: StubMachine, twin: FakeTwin
 ) -> None:

@@ -82,12 +82,12 @@ def test_another_servo_s_folder_is_left_alone(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("stranger", "--url", "http://h"), "has no model"),
+        (("stranger", "--url", "https://h"), "has no model"),
         (("ax-1",), "--url"),
         (("ax-1", "--url", "ftp://h"), "url"),
-        (("ax-1", "--url", "http://h", "--role", "guess"), "control, supervise"),
-        (("ax-1", "--url", "http://h", "--drive", "no.toml"), "no.toml"),
-        (("ax 1", "--url", "http://h"), "name 'ax 1'"),
+        (("ax-1", "--url", "https://h", "--role", "guess"), "control, supervise"),
+        (("ax-1", "--url", "https://h", "--drive", "no.toml"), "no.toml"),
+        (("ax 1", "--url", "https://h"), "name 'ax 1'"),
     ],
 )
 def test_what_cannot_be_enrolled_leaves_nothing_behind(tmp_path, monkeypatch, arguments, said):
@@ -125,6 +125,8 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
         refused = run("audit", "ax-1", "--url", url)
         assert refused.exit_code == 2
         assert "token" in refused.stderr
+        clear = run("audit", "ax-1", "--url", "http://twin.example", "--token", token)
+        assert (clear.exit_code, clear.stderr.count("in clear")) == (2, 1)
     read = run("audit", "ax-1", "--config", twin, "--json")
     assert json.loads(read.stdout) == json.loads(asked.stdout)
     [link] = json.loads(read.stdout)

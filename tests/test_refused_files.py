@@ -129,10 +129,16 @@ TOKEN = 'token_file = "token"\n'
             f'[twin]\nurl = "https://h"\n{TOKEN}ca_file = "edge.toml"',
             "edge.toml: holds no certificates that can be read",
         ),
-        ('[twin]\nurl = "http://h"\ntoken_file = "none"', "none: the token cannot be read (No such file or directory)"),
-        ('[twin]\nurl = "http://h"\ntoken_file = "open"', "open: others than its owner may open it; give it mode 0600"),
         (
-            '[twin]\nurl = "http://h"\ntoken_env = "SERVOTWIN_NOT_SET"',
+            '[twin]\nurl = "https://h"\ntoken_file = "none"',
+            "none: the token cannot be read (No such file or directory)",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_file = "open"',
+            "open: others than its owner may open it; give it mode 0600",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_env = "SERVOTWIN_NOT_SET"',
             "environment variable SERVOTWIN_NOT_SET: holds no",
         ),
         (f'[twin]\nurl = "mqtt://h"\n{TOKEN}user = "u"\npassword_file = "none"', "none: the password cannot be read"),

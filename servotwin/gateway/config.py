@@ -14,6 +14,7 @@ from servotwin.control.law import LawParameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import is_mqtt
+from servotwin.link.url import in_clear
 from servotwin.tomltable import Table
 
 ROLES = ("control", "supervise")
@@ -29,7 +30,7 @@ class TwinLink:
     Parameters
     ----------
     url : str
-        http(s)://host[:port][/path], or a broker's: mqtt(s)://host[:port].
+        https://host[:port][/path], http:// on this machine itself, or a broker's: mqtt(s)://host[:port].
     token_file, token_env : str, optional
         Where the servo's token is: a file of mode 0600, or an environment variable; one of them.
     ca_file : str, optional
@@ -58,6 +59,8 @@ class TwinLink:
         if not (self.over_mqtt or _is_http(self.url)):
             allowed = "http(s)://host[:port][/path] or mqtt(s)://host[:port]"
             raise InvalidInput(f"url = {self.url!r} is not allowed; give {allowed}")
+        if in_clear(self.url):
+            raise InvalidInput(f"url = {self.url!r} would send the token in clear to another machine; give https://")
         if not self.over_mqtt and self.user is not None:
             raise InvalidInput(f"user = {self.user!r} is for a broker, mqtt(s)://host[:port]; url is {self.url!r}")
         if (self.password_file, self.password_env).count(None) != (2 if self.user is None else 1):

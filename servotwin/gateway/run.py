@@ -17,6 +17,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileStore
 from servotwin.edge.switch import Rules
 from servotwin.errors import InvalidInput
+from servotwin.gateway.alone import alone
 from servotwin.gateway.boots import next_boot
 from servotwin.gateway.checks import check
 from servotwin.gateway.child import LinkChild, starter
@@ -65,15 +66,20 @@ def run(path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InvalidInput
-        The configuration, the token or the drive is not as it must be.
+        The configuration, the token or the drive is not as it must be, or another edge runs on the same files.
     """
     config = load(path)
     check(config)
+    with alone(config):
+        _run(config, Path(path).resolve())
+
+
+def _run(config: EdgeConfig, path: Path) -> None:
     drive = control_drive(config) if config.role == "control" else supervised_drive(config)
     first = permitted(first_parameters(config.path(config.keeping.parameters)), config.agent)
     boot = next_boot(config.path(config.keeping.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
-    child = LinkChild(starter(Path(path).resolve()), outlet)
+    child = LinkChild(starter(path), outlet)
     stop = Stop()
     before = {each: signal.signal(each, stop) for each in SIGNALS if not _is_unheard(each)}
     try:

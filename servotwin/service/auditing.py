@@ -16,6 +16,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_ope
 import msgspec
 
 from servotwin.errors import InvalidInput
+from servotwin.link.url import in_clear
 from servotwin.service.audittext import SERVOS, Told, lines_of, servo_line
 from servotwin.service.command import present_store
 from servotwin.service.readapi import MOST, shown, told
@@ -148,6 +149,8 @@ def _asking(source: Source) -> Callable[[str], Any]:
     url, headers = str(source.url).rstrip("/"), {}
     if not url.startswith(("http://", "https://")):
         raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
+    if source.token is not None and in_clear(url):
+        raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
     secure = [HTTPSHandler(context=_context(source.ca))] if url.startswith("https") else []

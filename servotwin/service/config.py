@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
+from servotwin.link.url import is_here
 from servotwin.messages import MAX_BYTES
 from servotwin.service.mqttconfig import MqttConfig, mqtt
 from servotwin.service.secretfile import read_secret
@@ -115,7 +116,7 @@ class ServiceConfig:
     @property
     def local(self) -> bool:
         """Whether only this machine reaches the service."""
-        return ipaddress.ip_address(self.bind).is_loopback
+        return is_here(self.bind)
 
 
 def _address(table: Table, key: str) -> str:

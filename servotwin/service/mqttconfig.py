@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from servotwin.link.broker import Broker
+from servotwin.link.url import is_here
 from servotwin.service.secretfile import read_secret
 from servotwin.tomltable import Table, named
 
@@ -33,11 +33,7 @@ class MqttConfig:
     @property
     def local(self) -> bool:
         """Whether the broker runs on this machine."""
-        host, _ = self.broker.address
-        try:
-            return ipaddress.ip_address(host).is_loopback
-        except ValueError:
-            return host == "localhost"
+        return is_here(self.broker.address[0])
 
 
 def mqtt(table: Table, folder: Path, environment: Mapping[str, str]) -> MqttConfig:

@@ -1,0 +1,44 @@
+"""One edge at a time on its files: two would give one machine two voltages."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from servotwin.errors import InvalidInput
+from servotwin.gateway.config import EdgeConfig
+from servotwin.gateway.log import say
+
+
+@contextmanager
+def alone(config: EdgeConfig) -> Iterator[None]:
+    """Hold an edge's files for this process, however it ends; where the disk takes no lock the machine runs anyway.
+
+    Raises
+    ------
+    InvalidInput
+        Another process holds them.
+    """
+    path = config.path(f"{config.keeping.parameters}-lock")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        say("not locked", error=str(error))
+        yield
+        return
+    try:
+        _lock(descriptor, config)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, config: EdgeConfig) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InvalidInput(f"{config.source}: another edge runs on its files; end that one first") from None
+    except OSError as error:
+        say("not locked", error=str(error))
