@@ -8,6 +8,7 @@ from store_cases import bodies_of, claim, letter, outcome, proof, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
+from servotwin.store.lending import MOST_BYTES
 from servotwin.store.rows import Claim, Evidence, Kind, Posted, Put, Waiting
 from servotwin.store.schema import bodies, contexts, evidence, messages, outgoing, twins
 from servotwin.store.store import Store, open_store
@@ -100,6 +101,19 @@ def test_those_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Stor
     servos = [one.servo for one in claim(store, limit=4)]
     assert len([servo for servo in servos if servo.startswith("w")]) == 2
     assert len([servo for servo in servos if servo.startswith("m")]) == 2
+
+
+def test_large_messages_are_claimed_a_few_at_a_time(store: Store) -> None:
+    large, small = b"x" * (MOST_BYTES // 2), b"y"
+    store.put([window("a", sequence, large) for sequence in range(3)])
+    store.put([window("a", 3, small), window("b", 0, large + large + small), window("b", 1, small)])
+    one, other = store.claim("me", 10, 60.0, 200.0)
+    assert [message.key for message in one.messages] == ["boot/0", "boot/1"]
+    assert [message.key for message in other.messages] == ["boot/0"]
+    assert store.commit([outcome(one), outcome(other)], 200.0) == [True, True]
+    one, other = store.claim("me", 10, 60.0, 200.0)
+    assert [message.key for message in one.messages] == ["boot/2", "boot/3"]
+    assert [message.body for message in other.messages] == [small]
 
 
 def test_messages_from_before_a_clock_was_set_back_are_claimed(store: Store) -> None:

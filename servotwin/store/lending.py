@@ -12,6 +12,9 @@ import sqlalchemy as sa
 from servotwin.store.rows import Claim, Kind, Stored
 from servotwin.store.schema import PROOFS, WORK, bodies, messages, states, twins
 
+MOST_BYTES = 4 * 1024 * 1024
+"""Of the bodies that are lent of one servo at once, but for the first, which may be as large as any."""
+
 
 def lend(
     connection: sa.Connection,
@@ -99,15 +102,19 @@ def _oldest(kinds: frozenset[Kind]) -> sa.Select[Any]:
     """The first messages of these kinds of each servo, proofs alone or the others."""
     proofs = Kind.PROOF in kinds
     place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=messages.c.id).label("place")
-    waiting = sa.select(messages.c.id, place).where(PROOFS if proofs else WORK, messages.c.servo.in_(_SERVOS))
+    waiting = sa.select(messages.c.id, messages.c.servo, place)
+    waiting = waiting.where(PROOFS if proofs else WORK, messages.c.servo.in_(_SERVOS))
     if len(kinds) == 1 and not proofs:
         waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
     first = waiting.subquery()
+    few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
+    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.id)
+    sized = sa.select(first.c.id, first.c.place, so_far.label("so_far")).join(bodies, bodies.c.message == first.c.id)
+    some = sized.where(few).subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
-    columns = *known, bodies.c.body
-    joined = first.join(messages, messages.c.id == first.c.id).join(bodies, bodies.c.message == messages.c.id)
-    within = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
-    return sa.select(*columns).select_from(joined).where(within).order_by(messages.c.id)
+    joined = some.join(messages, messages.c.id == some.c.id).join(bodies, bodies.c.message == messages.c.id)
+    small = sa.or_(some.c.place == 1, some.c.so_far <= MOST_BYTES)
+    return sa.select(*known, bodies.c.body).select_from(joined).where(small).order_by(messages.c.id)
 
 
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
