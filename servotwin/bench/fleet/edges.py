@@ -17,15 +17,15 @@ from pathlib import Path
 import msgspec
 
 from servotwin.bench.fleet.line import Line
-from servotwin.bench.fleet.plan import Load, Report, decode_load, shares
+from servotwin.bench.fleet.plan import Load, Plan, Report, decode_load, shares
 from servotwin.link.seal import Sealed
 from servotwin.messages import Reason, Receipt, Update, Window, decode, encode
 
 TAKEN, LATER = (200, 201, 202), (429, 503)
 PAUSE = 0.2
 """s after which a request that was put off is made again."""
-PATIENCE = 600.0
-"""s that windows may wait for their answer once no more fall due."""
+PATIENCE, ANSWER_S = 600.0, 120.0
+"""s that windows may wait once no more fall due, and that a turn may take."""
 
 _sealed = msgspec.msgpack.Decoder(list[bytes])
 
@@ -106,7 +106,7 @@ class Fleet:
     def take(self, now: float) -> tuple[Edge, float] | None:
         """The next window to be sent, and when it fell due; None: not now."""
         plan, since = self.plan, now - self.begin
-        if plan.outage[0] <= since < plan.outage[1]:
+        if self.cut(now):
             return None
         if plan.rate == 0.0:
             if since >= plan.duration:
@@ -114,6 +114,10 @@ class Fleet:
             self._issued += 1
             return self.edges[(self._issued - 1) % plan.servos], now
         return self._kept.popleft() if self._kept else None
+
+    def cut(self, now: float) -> bool:
+        """Whether the link is: every connection has ended."""
+        return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
 
     def put_back(self, edge: Edge, due: float) -> None:
         """One that was put off."""
@@ -153,10 +157,10 @@ class Fleet:
                 told = Receipt(edge.name, message.version, True, 1, Reason.APPLIED, message.version, self.plan.boot)
                 edge.receipts.append(told)
 
-    def undisturbed(self, due: float) -> bool:
-        """Whether a window that fell due then has no outage behind it."""
+    def undisturbed(self, now: float) -> bool:
+        """Whether there was no outage by then."""
         begin, end = self.plan.outage
-        return begin == end or due - self.begin < begin
+        return begin == end or now - self.begin < begin
 
 
 class Turn:
@@ -194,7 +198,7 @@ class Turn:
         edge, counts = self.edge, self.fleet.counts
         self.sent = time.monotonic()
         self.body = self.fleet.window(edge, self.due)
-        if self.fleet.undisturbed(self.due):
+        if self.fleet.undisturbed(self.sent):
             counts.late.append(self.sent - self.due)
         path = f"{_servo(edge)}/windows/{self.fleet.plan.boot}/{edge.sequence}"
         self.line.ask(_head("PUT", path), self.body, self._taken)
@@ -246,16 +250,20 @@ async def run(load: Load) -> Report:
 
 
 async def _connected(fleet: Fleet, failed: list[str]) -> Turn:
-    """A connection, and whose turn it is there; where it breaks, everything ends."""
+    """A connection, and whose turn it is there."""
     done = asyncio.Event()
+    return Turn(fleet, await _line(fleet.plan, done, failed), done, failed)
+
+
+async def _line(plan: Plan, done: asyncio.Event, failed: list[str]) -> Line:
+    """A connection to the twin; where it breaks while an answer is due, everything ends."""
 
     def broken(why: str) -> None:
         failed.append(why)
         done.set()
 
-    loop = asyncio.get_running_loop()
-    _, line = await loop.create_connection(lambda: Line(broken), "127.0.0.1", fleet.plan.port)
-    return Turn(fleet, line, done, failed)
+    _, line = await asyncio.get_running_loop().create_connection(lambda: Line(broken), "127.0.0.1", plan.port)
+    return line
 
 
 async def _ticks(fleet: Fleet) -> None:
@@ -274,12 +282,17 @@ async def _serve(turn: Turn) -> None:
         if next_one is None:
             if over and (fleet.waiting == 0 or now - fleet.begin > plan.duration + PATIENCE):
                 return
+            if fleet.cut(now):
+                turn.line.close()
             await asyncio.sleep(0.01)
             continue
+        if turn.line.closed:
+            turn.line = await _line(plan, turn.done, turn.failed)
         turn.done.clear()
         before = fleet.counts.later
         turn.begin(*next_one)
-        await turn.done.wait()
+        async with asyncio.timeout(ANSWER_S):
+            await turn.done.wait()
         if fleet.counts.later > before:
             await asyncio.sleep(PAUSE)
 

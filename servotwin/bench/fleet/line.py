@@ -27,6 +27,11 @@ class Line(asyncio.Protocol):
         self._got = bytearray()
         self._wanted = -1
 
+    @property
+    def closed(self) -> bool:
+        """Whether it takes requests no more."""
+        return self._transport is None or self._transport.is_closing()
+
     def ask(self, head: bytes, body: bytes, answered: Answered) -> None:
         """Send a request; `head` lacks its length and the empty line."""
         assert self._transport is not None
@@ -44,6 +49,7 @@ class Line(asyncio.Protocol):
         self._transport = transport
 
     def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
         if self._answered is not None:
             self._broken(f"the twin closed a connection ({exc or 'at its end'})")
 
