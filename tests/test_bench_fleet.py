@@ -161,12 +161,16 @@ class Wire:
     def write(self, data: bytes) -> None:
         self.written += data
 
+    def is_closing(self) -> bool:
+        return False
+
 
 @pytest.mark.parametrize("cut", range(1, 60, 7))
 def test_a_line_reads_answers_however_they_come(cut: int) -> None:
     broken, answers = [], []
     line, wire = Line(broken.append), Wire()
     line._transport = wire
+    assert not line.closed
     whole = b"HTTP/1.1 201 Created\r\ncontent-type: x\r\nContent-Length: 5\r\n\r\nhello"
     line.ask(b"PUT /x HTTP/1.1\r\n", b"body", lambda status, body: answers.append((status, body)))
     assert wire.written == b"PUT /x HTTP/1.1\r\nContent-Length: 4\r\n\r\nbody"
@@ -174,7 +178,9 @@ def test_a_line_reads_answers_however_they_come(cut: int) -> None:
     line.data_received(whole[cut:])
     assert answers == [(201, b"hello")]
     line.connection_lost(None)
+    assert line.closed
     assert not broken
+    line._transport = wire
     line.ask(b"GET /y HTTP/1.1\r\n", b"", lambda status, body: answers.append((status, body)))
     line.connection_lost(None)
     assert broken
