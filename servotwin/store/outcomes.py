@@ -11,9 +11,9 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.address import SQLITE
-from servotwin.store.putting import insert_once, put
-from servotwin.store.rows import Evidence, Outcome
-from servotwin.store.schema import PROOFS, WINDOWS, WORK, contexts, evidence, messages, outgoing, states, twins
+from servotwin.store.putting import insert_once, named, of_names, put
+from servotwin.store.rows import Evidence, Kind, Outcome
+from servotwin.store.schema import PROOFS, WORK, contexts, evidence, messages, outgoing, states, twins
 
 _ESTIMATES = ("glance", "estimate")
 
@@ -108,12 +108,8 @@ def _many(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, An
 
 def _windows(connection: sa.Connection, found: Sequence[tuple[str, Evidence]]) -> dict[tuple[str, str], int]:
     """Ids of the windows that evidence names."""
-    names = sorted({(servo, one.window) for servo, one in found if one.window})
-    if not names:
-        return {}
-    query = sa.select(messages.c.servo, messages.c.key, messages.c.id)
-    rows = connection.execute(query.where(sa.tuple_(messages.c.servo, messages.c.key).in_(names), WINDOWS))
-    return {(row.servo, row.key): row.id for row in rows}
+    rows = named(connection, _NAMED, {(servo, one.window) for servo, one in found if one.window})
+    return {(row.servo, row.key): row.id for row in rows if row.kind == Kind.WINDOW}
 
 
 def _found(servo: str, found: Evidence, windows: Mapping[tuple[str, str], int], now: float) -> dict[str, Any]:
@@ -149,6 +145,8 @@ _HOLD = (
     .order_by(twins.c.servo)
     .with_for_update()
 )
+
+_NAMED = of_names(messages.c.id, messages.c.kind)
 
 _DONE = (
     sa.update(messages)

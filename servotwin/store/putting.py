@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -106,12 +106,26 @@ def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:
 
 
 def _digests(connection: sa.Connection, names: Iterable[Name]) -> dict[Name, bytes]:
-    wanted = sorted(names)
-    if not wanted:
-        return {}
-    query = sa.select(messages.c.servo, messages.c.key, messages.c.digest)
-    rows = connection.execute(query.where(sa.tuple_(messages.c.servo, messages.c.key).in_(wanted)))
-    return {(servo, key): digest for servo, key, digest in rows}
+    return {(row.servo, row.key): row.digest for row in named(connection, _NAMED, names)}
+
+
+def named(connection: sa.Connection, query: sa.Select[Any], names: Iterable[Name]) -> Iterator[sa.Row[Any]]:
+    """Rows of the messages that have these names, of a query for `_keys` of a `_servo`.
+
+    Servo by servo: for a list of pairs SQLite walks over all messages that there are.
+    """
+    keys: dict[str, list[str]] = {}
+    for servo, key in sorted(names):
+        keys.setdefault(servo, []).append(key)
+    for servo, of in keys.items():
+        yield from connection.execute(query, {"_servo": servo, "_keys": of})
+
+
+def of_names(*columns: sa.ColumnElement[Any]) -> sa.Select[Any]:
+    """A query for `named`."""
+    keys: sa.BindParameter[Any] = sa.bindparam("_keys", expanding=True)
+    query = sa.select(messages.c.servo, messages.c.key, *columns)
+    return query.where(messages.c.servo == sa.bindparam("_servo"), messages.c.key.in_(keys))
 
 
 def _extreme(column: sa.Column[Any], name: str, *, least: bool) -> sa.ColumnElement[Any]:
@@ -131,3 +145,5 @@ _ANNOUNCE = (
         asked=_extreme(twins.c.asked, "_asked", least=True),
     )
 )
+
+_NAMED = of_names(messages.c.digest)
