@@ -1,0 +1,95 @@
+"""No query walks over what is kept for years: SQLite's own plans of all that a store asks."""
+
+import re
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from store_cases import letter, outcome, proof, window
+
+from servotwin.store.retention import forget
+from servotwin.store.rows import Evidence, Kind
+from servotwin.store.store import Store, open_store
+
+WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|proofs)")
+"""What is not yet processed is counted, and is all that these indexes hold."""
+SMALL = re.compile(r"SCAN (chosen|anon_\d|\(subquery-\d+\)|\d+ CONSTANT ROWS?|CONSTANT ROW)")
+"""Results of a query's own parts, each of them limited."""
+AT_THE_END = "WHERE twins.lease_owner = ?"
+"""What a service that ends gives back: once, over the servos."""
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> tuple[Store, dict[str, Any]]:
+    """A store, and every statement that it made."""
+    store, statements = open_store(f"sqlite:///{tmp_path}/twin.db"), dict[str, Any]()
+
+    def note(_c: Any, _cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
+        many = bool(parameters) and isinstance(parameters[0], tuple)
+        statements.setdefault(statement, parameters[0] if many else parameters)
+
+    for engine in store.engines:
+        sa.event.listen(engine, "before_cursor_execute", note)
+    return store, statements
+
+
+def exercise(store: Store) -> None:
+    """Everything that a service, its operators and its keeping do."""
+    sent = [window("a", 1), window("a", 2), window("b", 1), letter("b"), proof("a")]
+    store.put(sent)
+    store.put([*sent, window("a", 1, b"other")])
+    for kinds in ((Kind.WINDOW, Kind.LETTER), (Kind.PROOF,), (Kind.LETTER,)):
+        for servo in (None, "a"):
+            for claim in store.claim("me", 16, 60.0, 100.0, kinds, servo=servo):
+                first = claim.messages[0].id
+                found = (
+                    Evidence("estimate", first, b"1", version=1, gap=0.1, std=0.01, status="ok", context="c"),
+                    Evidence("update", first, b"2", version=2),
+                    Evidence("receipt", 0, b"3", version=2, status="applied", window="boot/1"),
+                )
+                made = outcome(claim, *found, outgoing=(b"update",), contexts=(("c", "{}"),), wake=150.0)
+                store.write([window("c", first)], [made], 100.0)
+    store.claim("me", 16, 60.0, 300.0)
+    store.release("me", ["a"])
+    store.release("me")
+    store.outgoing("a", 0)
+    store.outgoing("a", 99)
+    store.posted(["a", "b"])
+    store.waiting(200.0)
+    store.servos()
+    store.servo("a")
+    store.window("a", "boot", 1)
+    store.windows("a", before=10)
+    store.contexts(["c"])
+    store.audit("a")
+    store.audit("a", since=0.0, before=10)
+    store.audit("a", window=("boot", 1))
+    store.events("a")
+    forget(store, 1e9)
+
+
+def plan(path: str, statement: str, parameters: Any) -> list[str]:
+    with sqlite3.connect(path) as connection:
+        return [row[3] for row in connection.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)]
+
+
+def test_no_statement_walks_over_a_table(asked: tuple[Store, dict[str, Any]]) -> None:
+    store, statements = asked
+    exercise(store)
+    path = str(store.engines.writer.url.database)
+    explained = {
+        statement: plan(path, statement, parameters)
+        for statement, parameters in statements.items()
+        if statement.startswith(("SELECT", "INSERT", "UPDATE", "DELETE", "WITH")) and not statement.endswith(AT_THE_END)
+    }
+    store.close()
+    assert len(explained) > 30
+    walks = {
+        statement: step
+        for statement, steps in explained.items()
+        for step in steps
+        if step.startswith("SCAN") and not (WAITING.match(step) or SMALL.match(step))
+    }
+    assert not walks
