@@ -22,6 +22,7 @@ from servotwin.edge.drive import Block, DriveLost, SupervisedDrive
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
+from servotwin.link.url import in_clear
 from servotwin.messages import Fallback, Gains, Message, Receipt, Window, decode, encode
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.scenario import Scenario
@@ -65,6 +66,8 @@ class HttpTwin:
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https") or parts.hostname is None:
             raise InvalidInput(f"twin url = {url!r}: must be http://HOST:PORT or https://HOST:PORT")
+        if token and in_clear(url):
+            raise InvalidInput(f"twin url = {url!r}: would send the token in clear to another machine; give https://")
         place: Any = {"host": parts.hostname, "port": parts.port, "timeout": TIMEOUT}
         self._line = HTTPConnection(**place) if parts.scheme == "http" else HTTPSConnection(**place, context=context)
         self._path = f"/v1/servos/{servo}/lockstep"

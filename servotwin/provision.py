@@ -165,8 +165,10 @@ def url_of(service: ServiceConfig) -> str:
     Raises
     ------
     InvalidInput
-        It does not: any port, or every address.
+        It does not: any port, every address, or only a proxy reaches it.
     """
+    if service.behind_proxy:
+        raise InvalidInput("behind_proxy = true: say with --url where edges reach the proxy")
     if service.port == 0 or service.bind in ("0.0.0.0", "::"):
         raise InvalidInput(f"bind = {service.bind!r}, port = {service.port}: say with --url where edges reach the twin")
     host = f"[{service.bind}]" if ":" in service.bind else service.bind

@@ -109,8 +109,9 @@ def test_what_is_wrong_is_refused_by_name(old: str, new: str, said: str) -> None
 def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
     assert TwinLink(f"http://{host}:8765", "token").url == f"http://{host}:8765"
     for other in ("10.0.0.1", "[2001:db8::1]", "localhost.example", "127.0.0.1.example", "127.1"):
-        with pytest.raises(InvalidInput, match="in clear"):
-            TwinLink(f"http://{other}:8765", "token")
+        for scheme in ("http", "HTTP"):
+            with pytest.raises(InvalidInput, match="in clear"):
+                TwinLink(f"{scheme}://{other}:8765", "token")
 
 
 def test_to_control_a_controller_is_needed() -> None:

@@ -141,6 +141,26 @@ def test_an_answer_that_never_comes_is_no_delivery() -> None:
         release(link)
 
 
+def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"HTTPS://127.0.0.1:{listener.getsockname()[1]}"
+        link = HttpTransport(url, "axis-1", "secret", timeout_s=1.0)
+        heard = []
+
+        def hear() -> None:
+            with listener.accept()[0] as line:
+                heard.append(line.recv(4096))
+
+        listening = threading.Thread(target=hear)
+        listening.start()
+        with pytest.raises(Unreachable):
+            link.deliver(parcel(0))
+        listening.join(10.0)
+        release(link)
+    assert heard[0][:1] == b"\x16"  # a TLS handshake
+    assert b"secret" not in heard[0]
+
+
 def test_nobody_there_is_unreachable() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         url = f"http://127.0.0.1:{closed.getsockname()[1]}"

@@ -109,7 +109,7 @@ def test_without_a_file_of_tokens_nobody_is_enrolled(tmp_path):
     assert "tokens" in found.stderr
 
 
-def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
+def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeypatch):
     twin, token = twin_file(tmp_path), tmp_path / "operator"
     assert run("enroll", "boss", "--operator", token, "--twin", twin).exit_code == 0
     with process(twin) as (_running, url):
@@ -127,6 +127,10 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path):
         assert "token" in refused.stderr
         clear = run("audit", "ax-1", "--url", "http://twin.example", "--token", token)
         assert (clear.exit_code, clear.stderr.count("in clear")) == (2, 1)
+        monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+        assert run("servos", "--url", url, "--token", token).stdout == everybody.stdout
+        none = run("audit", "ax-1", "--url", "http://[::1", "--token", token)
+        assert (none.exit_code, none.stderr.count("give that of a twin")) == (2, 1)
     read = run("audit", "ax-1", "--config", twin, "--json")
     assert json.loads(read.stdout) == json.loads(asked.stdout)
     [link] = json.loads(read.stdout)

@@ -237,7 +237,7 @@ def test_a_full_queue_and_a_store_that_cannot_write_are_for_later(serving):
         system.store.write = slow
         sent = [asyncio.create_task(put(client, window(0)))]
         # From here on the first one is in a transaction of its own, so that two may wait and three may not.
-        await asyncio.to_thread(writing.wait, 30.0)
+        assert await asyncio.to_thread(writing.wait, 30.0)
         sent += [asyncio.create_task(put(client, window(sequence))) for sequence in range(1, 6)]
         done: set[asyncio.Task[httpx.Response]] = set()
         async with asyncio.timeout(30.0):

@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 import postgres
+import psycopg
 import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
@@ -20,8 +21,9 @@ from servotwin.store import migrate as migrations
 from servotwin.store.address import address_of, shown
 from servotwin.store.engine import engines_of, transaction
 from servotwin.store.errors import StoreUnavailable
+from servotwin.store.outcomes import _holding
 from servotwin.store.rows import Put
-from servotwin.store.schema import REVISION, metadata
+from servotwin.store.schema import REVISION, metadata, twins
 from servotwin.store.store import open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -196,3 +198,21 @@ def test_a_server_that_cuts_its_connections_is_survived() -> None:
         assert store.put([window(sequence=2)]) == [Put.NEW]
         assert store.servo("a").windows == 2
         store.close()
+
+
+def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in() -> None:
+    """Two twins that lock rows in different orders wait for each other until the server ends one of them."""
+    names = ["ax-1", "Ax-2", "AX-3", "b", "B"]
+    with postgres.running() as server:
+        try:
+            url = server.database("sorted", "en-US")
+        except psycopg.Error as error:
+            pytest.skip(f"this PostgreSQL has no ICU: {error}")
+        store = open_store(url)
+        store.put([window(name) for name in names])
+        with store.engines.reader.connect() as connection:
+            by_people = connection.scalars(sa.select(twins.c.servo).order_by(twins.c.servo)).all()
+            held = connection.execute(_holding("postgresql"), {"_servos": names}).all()
+        store.close()
+    assert by_people != sorted(names)
+    assert [row.servo for row in held] == sorted(names)

@@ -14,6 +14,7 @@ from servotwin.store.rows import Evidence, Kind
 from servotwin.store.store import Store, open_store
 
 WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|proofs)")
+COUNTED = "count(*)"
 """What is not yet processed is counted, and is all that these indexes hold."""
 SMALL = re.compile(r"SCAN (chosen|anon_\d|\(subquery-\d+\)|\d+ CONSTANT ROWS?|CONSTANT ROW)")
 """Results of a query's own parts, each of them limited."""
@@ -90,6 +91,6 @@ def test_no_statement_walks_over_a_table(asked: tuple[Store, dict[str, Any]]) ->
         statement: step
         for statement, steps in explained.items()
         for step in steps
-        if step.startswith("SCAN") and not (WAITING.match(step) or SMALL.match(step))
+        if step.startswith("SCAN") and not (SMALL.match(step) or (COUNTED in statement and WAITING.match(step)))
     }
     assert not walks

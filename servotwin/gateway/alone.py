@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from servotwin.errors import InvalidInput
 from servotwin.gateway.config import EdgeConfig
@@ -21,22 +21,16 @@ def alone(config: EdgeConfig) -> Iterator[None]:
     InvalidInput
         Another process holds them.
     """
-    path = config.path(f"{config.keeping.parameters}-lock")
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError as error:
-        say("not locked", error=str(error))
+    with ExitStack() as held:
+        for name in dict.fromkeys((config.keeping.parameters, config.keeping.outbox)):
+            _hold(config, name, held)
         yield
-        return
-    try:
-        _lock(descriptor, config)
-        yield
-    finally:
-        os.close(descriptor)
 
 
-def _lock(descriptor: int, config: EdgeConfig) -> None:
+def _hold(config: EdgeConfig, name: str, held: ExitStack) -> None:
     try:
+        descriptor = os.open(config.path(f"{name}-lock"), os.O_RDWR | os.O_CREAT, 0o600)
+        held.callback(os.close, descriptor)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise InvalidInput(f"{config.source}: another edge runs on its files; end that one first") from None

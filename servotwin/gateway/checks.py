@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 from servotwin.errors import InvalidInput
 from servotwin.gateway.config import EdgeConfig, TwinLink, password_of, token_of
+from servotwin.link.url import is_encrypted
 
 
 def check(config: EdgeConfig) -> None:
@@ -36,7 +37,7 @@ def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
         raise InvalidInput(
             f"{config.source}: [twin]: url = {twin.url!r} needs paho-mqtt: pip install 'servotwin[mqtt]'"
         )
-    if twin.ca_file is None or not twin.url.startswith(("https:", "mqtts:")):
+    if twin.ca_file is None or not is_encrypted(twin.url):
         return
     import ssl
 

@@ -57,8 +57,8 @@ def estimate_carrying(
     fitted = whitened.fit(window, servo, prior, settings)
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
     # A window of one contact can show nothing alone; looking for how little it shows takes longer than all the rest.
-    if not (known and fitted.one_sided()):
-        alone = fitted.concluded()
+    alone = None if known and fitted.one_sided() else fitted.concluded()
+    if alone is not None:
         if settings.offset is None and alone.ok:
             return replace(alone, offset=read_offset(window, servo, alone, settings))
         if not known or alone.status is GapStatus.MODEL_MISMATCH:
@@ -68,12 +68,12 @@ def estimate_carrying(
     if helped.ok and not helped.rms > _WORSE * fitted.rms():
         slope = _slope(_columns(window, servo, helped, settings))
         return replace(helped, offset=CarriedOffset(*carried, slope))
-    return _refused(fitted.concluded(), helped)
+    return _refused(alone or fitted.concluded(), helped)
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
     """What a window says alone, with why nothing else is believed."""
-    if not helped.ok:
+    if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
         return alone
     worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
     return replace(alone, reasons=(*alone.reasons, worse))

@@ -14,6 +14,7 @@ import msgspec
 
 from servotwin.errors import InvalidInput
 from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.link.url import is_encrypted
 from servotwin.messages import MAX_BYTES, Acknowledge, InvalidMessage, Refusal, decode
 
 BODY = "application/msgpack"
@@ -158,7 +159,7 @@ class HttpTransport:
         timeout_s: float = 10.0,
         wait_s: float = 25.0,
     ) -> None:
-        context = _context(ca_file) if url.startswith("https:") else None
+        context = _context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
         self._up = Line(url, token, timeout_s, context)
         self._down = Line(url, token, timeout_s + wait_s, context)

@@ -16,6 +16,11 @@ def is_here(host: str) -> bool:
         return False
 
 
+def is_encrypted(url: str) -> bool:
+    """Whether the way there is, however the scheme is written."""
+    return urlsplit(url).scheme in ("https", "mqtts")
+
+
 def in_clear(url: str) -> bool:
     """Whether a network carries what is sent there unencrypted: a token would be read by everybody on it."""
     parts = urlsplit(url)

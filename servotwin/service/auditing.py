@@ -10,13 +10,13 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.error import HTTPError, URLError
-from urllib.parse import quote
-from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
+from urllib.parse import quote, urlsplit
+from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Request, build_opener
 
 import msgspec
 
 from servotwin.errors import InvalidInput
-from servotwin.link.url import in_clear
+from servotwin.link.url import in_clear, is_encrypted
 from servotwin.service.audittext import SERVOS, Told, lines_of, servo_line
 from servotwin.service.command import present_store
 from servotwin.service.readapi import MOST, shown, told
@@ -147,14 +147,15 @@ def _since(oldest: float) -> float:
 def _asking(source: Source) -> Callable[[str], Any]:
     """Asks the service for JSON; raises InvalidInput."""
     url, headers = str(source.url).rstrip("/"), {}
-    if not url.startswith(("http://", "https://")):
+    if not _is_address(url):
         raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
     if source.token is not None and in_clear(url):
         raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
-    secure = [HTTPSHandler(context=_context(source.ca))] if url.startswith("https") else []
-    opener = build_opener(_Stay, *secure)
+    # What goes to this machine itself goes through no proxy: it would read the token.
+    way = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
+    opener = build_opener(_Stay, way)
 
     def ask(path: str) -> Any:
         try:
@@ -166,6 +167,14 @@ def _asking(source: Source) -> Callable[[str], Any]:
             raise InvalidInput(f"{url}: cannot be asked ({getattr(error, 'reason', error)})") from None
 
     return ask
+
+
+def _is_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:
+        return False
 
 
 class _Stay(HTTPRedirectHandler):

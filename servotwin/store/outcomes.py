@@ -35,7 +35,7 @@ def _valid(connection: sa.Connection, outcomes: Sequence[Outcome]) -> dict[int, 
     if not outcomes:
         return {}
     servos = sorted({outcome.servo for outcome in outcomes})
-    rows = connection.execute(_HOLD, {"_servos": servos})
+    rows = connection.execute(_holding(connection.dialect.name), {"_servos": servos})
     held = {row.servo: (row.serial, row.posted) for row in rows}
     valid: dict[int, int] = {}
     for i in sorted(range(len(outcomes)), key=lambda i: outcomes[i].servo):
@@ -139,13 +139,6 @@ def _summary(found: Sequence[Evidence]) -> dict[str, Any]:
     return known
 
 
-_HOLD = (
-    sa.select(twins.c.servo, twins.c.serial, twins.c.posted)
-    .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
-    .order_by(twins.c.servo)
-    .with_for_update()
-)
-
 _NAMED = of_names(messages.c.id, messages.c.kind)
 
 _DONE = (
@@ -153,6 +146,16 @@ _DONE = (
     .where(messages.c.id == sa.bindparam("_id"), messages.c.servo == sa.bindparam("_servo"), messages.c.done.is_(None))
     .values(done=sa.bindparam("_now", type_=sa.Double))
 )
+
+
+@lru_cache(maxsize=2)
+def _holding(dialect: str) -> sa.Select[Any]:
+    """Serials of servos that are locked one after the other, in the order in which `put` does it: by code points,
+    whatever the database's language says. The lock lets other messages of the servo refer to it."""
+    order = twins.c.servo if dialect == SQLITE else twins.c.servo.collate("C")
+    servos: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
+    query = sa.select(twins.c.servo, twins.c.serial, twins.c.posted).where(twins.c.servo.in_(servos))
+    return query.order_by(order).with_for_update(key_share=True)
 
 
 @lru_cache(maxsize=32)

@@ -108,12 +108,14 @@ class Fleet:
         plan, since = self.plan, now - self.begin
         if self.cut(now):
             return None
+        if self._kept:
+            return self._kept.popleft()
         if plan.rate == 0.0:
             if since >= plan.duration:
                 return None
             self._issued += 1
             return self.edges[(self._issued - 1) % plan.servos], now
-        return self._kept.popleft() if self._kept else None
+        return None
 
     def cut(self, now: float) -> bool:
         """Whether the link is: every connection has ended."""
@@ -291,8 +293,11 @@ async def _serve(turn: Turn) -> None:
         turn.done.clear()
         before = fleet.counts.later
         turn.begin(*next_one)
-        async with asyncio.timeout(ANSWER_S):
-            await turn.done.wait()
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                await turn.done.wait()
+        except TimeoutError:
+            turn.failed.append(f"no answer from the twin within {ANSWER_S:g} s")
         if fleet.counts.later > before:
             await asyncio.sleep(PAUSE)
 
