@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from servotwin import outputs
+from servotwin.bench import report
 from servotwin.bench.estimator import table
 from servotwin.bench.estimator_figures import Figure
-from servotwin.bench.machine import machine
 
 SCHEMA = "servotwin-bench-estimator/1"
 NAME = "estimator"
@@ -39,8 +37,7 @@ def accuracy(
         An output that cannot be written.
     """
     console = console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     figures = []
     with console.status("estimating") as status:
         for figure in table(size):
@@ -49,8 +46,7 @@ def accuracy(
     console.print(shown(figures))
     if size < 1.0:
         console.print(f"With {size:.0%} of the windows, shares and coverages scatter about their targets.")
-    if output is not None:
-        outputs.write_and_say(output, dumps(figures, date, size), console.print)
+    report.write(output, dumps(figures, date, size), console)
     return tuple(figures)
 
 
@@ -87,13 +83,12 @@ def dumps(figures: list[Figure], date: str, size: float) -> str:
     rows = [
         {
             "name": figure.name,
-            "value": figure.value if math.isfinite(figure.value) else None,
-            "target": [end if math.isfinite(end) else None for end in figure.target],
+            "value": figure.value,
+            "target": figure.target,
             "met": figure.met if limited(figure) else None,
             "windows": figure.windows,
             "remark": figure.remark,
         }
         for figure in figures
     ]
-    document = {"schema": SCHEMA, "date": date, "size": size, "machine": dict(machine()), "figures": rows}
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return report.text(SCHEMA, date, size=size, figures=rows)

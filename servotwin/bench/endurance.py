@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,11 +10,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from servotwin import outputs
-from servotwin.bench import hostile
+from servotwin.bench import hostile, report
 from servotwin.bench.hostile import Outcome
 from servotwin.bench.hostiletwin import Kind
-from servotwin.bench.machine import machine
 from servotwin.maps.pool import shared, workplace
 
 SCHEMA = "servotwin-bench-hostile/1"
@@ -55,8 +52,7 @@ def endurance(
         An output that cannot be written.
     """
     console = console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     tasks = [(seed, kinds[seed % len(kinds)], False) for seed in range(count)]
     tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // RUBBING)]
     with workplace(), warnings.catch_warnings():
@@ -67,8 +63,7 @@ def endurance(
     outcomes = tuple(found[task] for task in tasks)
     console.print(shown(outcomes))
     console.print(verdict(outcomes), highlight=False)
-    if output is not None:
-        outputs.write_and_say(output, dumps(outcomes, date), console.print)
+    report.write(output, dumps(outcomes, date), console)
     return outcomes
 
 
@@ -118,6 +113,5 @@ def dumps(outcomes: Sequence[Outcome], date: str) -> str:
         }
         for outcome in outcomes
     ]
-    head = {"schema": SCHEMA, "date": date, "machine": dict(machine())}
     limits = {"error_m": band.error, "settling_s": band.settling}
-    return json.dumps({**head, "band": limits, "outcomes": rows}, indent=1, allow_nan=False) + "\n"
+    return report.text(SCHEMA, date, band=limits, outcomes=rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -13,9 +12,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from servotwin import outputs
+from servotwin.bench import report
 from servotwin.bench.estimator_windows import Case, paper_loop_cases
-from servotwin.bench.machine import machine
 from servotwin.identify.whitened.quick import quick_fit
 from servotwin.messages import Channel, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.messages import Window as WindowMessage
@@ -79,13 +77,10 @@ def triage(
         An output that cannot be written.
     """
     console = console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     rows = tuple(_row(name, floor, gaps) for name, floor in CONDITIONS.items())
     console.print(_table(rows), highlight=False)
-    if output is not None:
-        found = {"schema": SCHEMA, "date": date, "machine": machine(), "rows": [row._asdict() for row in rows]}
-        outputs.write_and_say(output, json.dumps(found, indent=1) + "\n", console.print)
+    report.write(output, report.text(SCHEMA, date, rows=[row._asdict() for row in rows]), console)
     return rows
 
 

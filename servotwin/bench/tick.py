@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from servotwin import outputs
-from servotwin.bench.machine import cores, machine
+from servotwin.bench import report
+from servotwin.bench.machine import cores
 
 SCHEMA = "servotwin-bench-tick/1"
 NAME = "tick"
@@ -49,16 +49,13 @@ def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, 
         An output that cannot be written.
     """
     console = console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     cases = [(rate, busy, hurried) for hurried in (False, True) for rate in RATES for busy in (False, True)]
     runs = [measured(case, seconds) for case in track(cases, "ticking", console=console, transient=True)]
     console.print(shown(runs))
     for line in said(runs):
         console.print(line, highlight=False, soft_wrap=True)
-    if output is not None:
-        document = {"schema": SCHEMA, "date": date, "machine": dict(machine()), "seconds": seconds, "runs": runs}
-        outputs.write_and_say(output, json.dumps(document, indent=1) + "\n", console.print)
+    report.write(output, report.text(SCHEMA, date, seconds=seconds, runs=runs), console)
 
 
 def measured(case: Case, seconds: float) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -13,15 +12,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from servotwin import outputs
+from servotwin.bench import report
 from servotwin.bench.fleet import runs
 from servotwin.bench.fleet.processes import check_system
 from servotwin.bench.fleet.setting import TABLE, Scale, prove
 from servotwin.bench.fleet.stock import Place, stock
 from servotwin.bench.fleet.tables import document, show
 from servotwin.bench.fleet.watch import Sample
-from servotwin.bench.machine import machine
 
+SCHEMA = "servotwin-bench-fleet/1"
 NAME = "fleet"
 
 
@@ -51,16 +50,13 @@ def fleet(
     """
     console, scale = console or Console(), scale or Scale()
     check_system()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     with _folder() as folder, _progress(console) as progress:
         places = _prepared(folder, scale, progress)
         alone = _ingest(folder, scale, places, progress)
         whole = _fleet(folder, scale, places, progress)
     show(scale, alone, whole, console)
-    if output is not None:
-        found = {**document(scale, alone, whole), "date": date, "machine": machine(), "scale": asdict(scale)}
-        outputs.write_and_say(output, json.dumps(found, indent=1) + "\n", console.print)
+    report.write(output, report.text(SCHEMA, date, scale=asdict(scale), **document(scale, alone, whole)), console)
     return alone, whole
 
 

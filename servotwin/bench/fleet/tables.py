@@ -97,7 +97,6 @@ def _says(whole: Ran) -> str:
 def document(scale: Scale, alone: Ran, whole: Ran) -> dict[str, Any]:
     """The same for machines to read."""
     return {
-        "schema": "servotwin-bench-fleet/1",
         "lines": [line._asdict() for line in lines(scale, alone, whole)],
         "samples": [
             {"time_s": one.time, "waiting": one.waiting, "age_s": one.age, **_sizes(one.used)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from array import array
@@ -15,10 +14,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from servotwin import outputs
+from servotwin.bench import report
 from servotwin.bench.accuracy import limited, target
 from servotwin.bench.estimator_figures import ANY, Figure
-from servotwin.bench.machine import machine
 from servotwin.bench.novelty import loops
 from servotwin.bench.novelty.loops import Account, Case
 from servotwin.bench.novelty.sequences import Delays, delays, one_window, run_length, wearing
@@ -72,8 +70,7 @@ def novelty(
         An output that cannot be written.
     """
     size, console = size or Size(), console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     figures: list[Figure] = []
     with console.status("judging windows") as status, workplace():
         for condition in CONDITIONS:
@@ -84,8 +81,7 @@ def novelty(
         sent = list(loops.accounts(size.loops))
     console.print(shown(figures))
     console.print(saved(sent))
-    if output is not None:
-        outputs.write_and_say(output, dumps(figures, sent, date), console.print)
+    report.write(output, dumps(figures, sent, date), console)
     return tuple(figures)
 
 
@@ -172,7 +168,7 @@ def dumps(figures: Sequence[Figure], sent: Sequence[tuple[Case, str, Account]], 
     rows = [
         {
             "name": figure.name,
-            "value": figure.value if math.isfinite(figure.value) else None,
+            "value": figure.value,
             "met": figure.met if limited(figure) else None,
             "windows": figure.windows,
             "remark": figure.remark,
@@ -182,5 +178,4 @@ def dumps(figures: Sequence[Figure], sent: Sequence[tuple[Case, str, Account]], 
     closed = [
         {**dict(zip(Case._fields[:3], case, strict=False)), "sent is": name, **a._asdict()} for case, name, a in sent
     ]
-    document = {"schema": SCHEMA, "date": date, "machine": dict(machine()), "figures": rows, "loops": closed}
-    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+    return report.text(SCHEMA, date, figures=rows, loops=closed)

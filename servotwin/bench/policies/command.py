@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from servotwin import outputs
-from servotwin.bench.machine import machine
+from servotwin.bench import report
 from servotwin.bench.policies.machines import BLOCKS
 from servotwin.bench.policies.table import Row, compare
 from servotwin.bench.policies.trial import Scores
@@ -66,8 +64,7 @@ def policies(
         An output that cannot be written.
     """
     console = console or Console()
-    if output is not None:
-        outputs.check_file(output, (".json",))
+    report.check(output)
     rows = []
     with console.status("simulating") as status, workplace():
         for row in compare(Servo.preset("paper"), STATED, count, blocks=blocks):
@@ -75,8 +72,7 @@ def policies(
             status.update(f"simulating, {row.block} block: {row.name} is done")
     console.print(shown(rows))
     console.print(chosen(rows))
-    if output is not None:
-        outputs.write_and_say(output, dumps(rows, date), console.print)
+    report.write(output, dumps(rows, date), console)
     return tuple(rows)
 
 
@@ -128,6 +124,4 @@ def dumps(rows: Sequence[Row], date: str) -> str:
         }
         for row in rows
     ]
-    return (
-        json.dumps({"schema": SCHEMA, "date": date, "machine": dict(machine()), "rows": found}, allow_nan=False) + "\n"
-    )
+    return report.text(SCHEMA, date, rows=found)
