@@ -258,13 +258,19 @@ def block(first: int, count: int, reference: float = 1e-3) -> Block:
 SUPERVISED = replace(CONFIG, role="supervise")
 
 
-def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
+def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, Edge, ScriptedDrive, Supervising]:
+    """A connected edge that has supervised a first block."""
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box, SUPERVISED)
-    drive = ScriptedDrive([block(5 * k, 5) for k in range(12)])
+    drive = ScriptedDrive([block(5 * k, 5) for k in range(blocks)])
     role = Supervising(edge, drive)
     role.step()
+    return box, edge, drive, role
+
+
+def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
+    box, _, drive, role = supervising(far, 12)
     assert [p.version for p in drive.voltages] == [0]
     far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
@@ -284,12 +290,7 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far)
 
 def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> None:
     """The agent runs on what the drive runs on, under a version of its own; the twin hears of it after the receipt."""
-    box = PipeOutlet(True)
-    box.connect(far.near)
-    edge = edge_of(box, SUPERVISED)
-    drive = ScriptedDrive([block(5 * k, 5) for k in range(40)])
-    role = Supervising(edge, drive)
-    role.step()
+    box, edge, drive, role = supervising(far, 40)
     drive.refuse = True
     far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
