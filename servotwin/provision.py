@@ -143,8 +143,9 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
     model = twin.fleet.model_of(wanted.servo)
     sampled = wanted.role == "control" or wanted.noise > 0.0
     law = model.servo.controller.replace(sample_rate=wanted.sample_rate if sampled else None)
-    longest = LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S
-    recording = Recording(sample_rate=wanted.sample_rate, longest_window=longest[0], longest_pre_trigger=longest[1])
+    recording = Recording(
+        sample_rate=wanted.sample_rate, longest_window=LONGEST_WINDOW_S, longest_pre_trigger=LONGEST_PRE_TRIGGER_S
+    )
     scenario = Scenario(
         servo=model.servo.replace(controller=law),
         duration=1.0,
