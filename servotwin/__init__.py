@@ -9,40 +9,40 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Controller": "servotwin.control",
-    "GapEstimate": "servotwin.identify.estimate",
-    "GapStatus": "servotwin.identify.estimate",
+    "GapEstimate": "servotwin.estimation.estimate",
+    "GapStatus": "servotwin.estimation.estimate",
     "InvalidInput": "servotwin.errors",
     "Noise": "servotwin.plant.noise",
     "PiecewiseCubic": "servotwin.plant.signals",
     "Run": "servotwin.simulation.run",
     "SCurve": "servotwin.plant.signals",
     "Samples": "servotwin.plant.signals",
-    "Scenario": "servotwin.scenario",
+    "Scenario": "servotwin.cosim.scenario",
     "Servo": "servotwin.plant.servo",
     "Simulation": "servotwin.simulation",
     "SquareWave": "servotwin.plant.signals",
     "Step": "servotwin.plant.signals",
-    "Trend": "servotwin.identify.trend",
-    "Window": "servotwin.identify.window",
+    "Trend": "servotwin.estimation.trend",
+    "Window": "servotwin.estimation.window",
     "cosimulate": "servotwin.cosim",
-    "estimate_gap": "servotwin.identify.gap",
-    "estimate_jointly": "servotwin.identify.joint.estimator",
+    "estimate_gap": "servotwin.estimation.gap",
+    "estimate_jointly": "servotwin.estimation.joint.estimator",
     "simulate": "servotwin.simulation",
 }
 
 if TYPE_CHECKING:
     from servotwin.control import Controller
     from servotwin.cosim import cosimulate
+    from servotwin.cosim.scenario import Scenario
     from servotwin.errors import InvalidInput
-    from servotwin.identify.estimate import GapEstimate, GapStatus
-    from servotwin.identify.gap import estimate_gap
-    from servotwin.identify.joint.estimator import estimate_jointly
-    from servotwin.identify.trend import Trend
-    from servotwin.identify.window import Window
+    from servotwin.estimation.estimate import GapEstimate, GapStatus
+    from servotwin.estimation.gap import estimate_gap
+    from servotwin.estimation.joint.estimator import estimate_jointly
+    from servotwin.estimation.trend import Trend
+    from servotwin.estimation.window import Window
     from servotwin.plant.noise import Noise
     from servotwin.plant.servo import Servo
     from servotwin.plant.signals import PiecewiseCubic, Samples, SCurve, SquareWave, Step
-    from servotwin.scenario import Scenario
     from servotwin.simulation import Simulation, simulate
     from servotwin.simulation.run import Run
 

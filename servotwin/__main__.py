@@ -1,6 +1,6 @@
 """``python -m servotwin`` is the `servotwin` command."""
 
-from servotwin.cli import main
+from servotwin.cli.app import main
 
 if __name__ == "__main__":
     main()

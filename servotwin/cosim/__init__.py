@@ -2,8 +2,8 @@
 
 from servotwin.cosim.driver import Cosimulation, Machine, cosimulate
 from servotwin.cosim.loop import Loop, Transmission
+from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.quantisation import Quantisation, quantisation
-from servotwin.machine import simulation_of
 
 __all__ = [
     "Cosimulation",

@@ -16,22 +16,22 @@ from typing import Protocol
 
 import numpy as np
 
-from servotwin.clock import Event, VirtualClock
 from servotwin.control.controller import Controller
 from servotwin.cosim.loop import Loop, Transmission
+from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import SimulatedLink
-from servotwin.machine import simulation_of
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, decode, encode
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
-from servotwin.scenario import Scenario
+from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
 from servotwin.simulation.splice import shifted
 from servotwin.twin.estimating import Estimator
-from servotwin.twin.inforce import InForce
+from servotwin.twin.in_force import InForce
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
 

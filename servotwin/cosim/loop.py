@@ -6,15 +6,15 @@ import hashlib
 from collections import Counter
 from dataclasses import dataclass
 
-from servotwin.identify.disturbance import Disturbance
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.passage import Passage
-from servotwin.identify.trend import Trend
+from servotwin.cosim.scenario import Scenario
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.passage import Passage
+from servotwin.estimation.trend import Trend
 from servotwin.link.simulated import Fate
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, Window, decode
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
-from servotwin.scenario import Scenario
 from servotwin.simulation import Run
 
 TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", "tolerance")

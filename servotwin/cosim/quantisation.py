@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servotwin.cosim.loop import Loop
-from servotwin.identify.window import Window as NumericWindow
+from servotwin.estimation.window import Window as NumericWindow
 from servotwin.messages import Window
 from servotwin.simulation import Run
 from servotwin.twin.decode import decode_window

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from servotwin.config.table import Table, named
 from servotwin.edge.drive import ControlDrive, SupervisedDrive
-from servotwin.tomltable import Table, named
 
 _Drive = TypeVar("_Drive")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from servotwin.edge.cut import Cut
-from servotwin.edge.novelty import Novelty
+from servotwin.edge.novelty.judge import Novelty
 from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox, Outbox

@@ -6,7 +6,7 @@ from math import inf, isfinite
 
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
-from servotwin.edge.noveltyrules import NoveltySettings
+from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.verdict import FallbackSet

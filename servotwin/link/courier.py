@@ -7,7 +7,7 @@ from math import inf
 
 from servotwin.link.outbox import Key
 from servotwin.link.session import Retry
-from servotwin.link.sqliteoutbox import SqliteOutbox
+from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Backoff, Parcel, Refused, Transport, Unreachable
 from servotwin.messages import Refusal
 

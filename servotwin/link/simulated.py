@@ -9,8 +9,8 @@ from hashlib import blake2b
 from math import inf, isfinite
 from random import Random
 
-from servotwin.clock import VirtualClock
 from servotwin.errors import InvalidInput
+from servotwin.runtime.clock import VirtualClock
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,16 +16,16 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear, servofile
+from servotwin.plant import linear, servo_file
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import motor_matrices
 from servotwin.plant.sampled import sampled_poles
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
-from servotwin.tomltable import Table, did_you_mean, parse_toml, read_toml
 
 PerMass: TypeAlias = float | tuple[float, ...]
 PRESETS = ("paper", "table1", "paper-gain2")
@@ -135,7 +135,7 @@ class Servo:
 
     @classmethod
     def _from_table(cls, table: Table) -> Servo:
-        values, gains = servofile.read(table)
+        values, gains = servo_file.read(table)
         try:
             servo = cls(controller=Controller(**gains), **values)
             servo.check_loop()
@@ -145,7 +145,7 @@ class Servo:
 
     def dumps(self) -> str:
         """The servo as TOML that `load` reads back to an equal servo."""
-        return servofile.write(self._plant_values(), dataclasses.asdict(self.controller))
+        return servo_file.write(self._plant_values(), dataclasses.asdict(self.controller))
 
     def replace(self, **changes: Any) -> Servo:
         """A copy with some values changed; the controller's own names (Kp, Ki, Kd, Tf, voltage_limit, ...) go to it."""
@@ -192,7 +192,7 @@ class Servo:
     @property
     def version(self) -> str:
         """Twelve hexadecimal digits that name this plant's numbers (the controller's do not count)."""
-        return hashlib.sha256(servofile.write(self._plant_values(), {}).encode()).hexdigest()[:12]
+        return hashlib.sha256(servo_file.write(self._plant_values(), {}).encode()).hexdigest()[:12]
 
     def chain(self) -> Chain:
         """Matrices of the structure (Eqs 9-13)."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servotwin.control.controller import Controller
-from servotwin.identify.disturbance import Disturbance, nothing_known
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend
+from servotwin.estimation.disturbance import Disturbance, nothing_known
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend
 
 UNASKED = nothing_known(float("nan"), "nobody looked")
 

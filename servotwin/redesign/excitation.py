@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapStatus
+from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Outcome, Probe
 
 _ROUNDING = 1e-6  # s: windows are whole numbers of samples

@@ -10,9 +10,9 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certificate import Certificate
+from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.region import Region
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.region import Region
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.analysis.maps.axes import RatioAxes
+from servotwin.analysis.maps.measures import joined, measured
+from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
-from servotwin.redesign.map import joined, measured
-from servotwin.redesign.mapaxes import RatioAxes
-from servotwin.redesign.mapsettings import MapSettings
 
 # In units of p gap, the screw's lost motion: two of the map's own.
 _K_DZ, _STEPS = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.outputs import written
+from servotwin.runtime.files import written
 from servotwin.store.address import POSTGRESQL, address_of, file_of, shown
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.schema import REVISION, metadata

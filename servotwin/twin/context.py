@@ -22,9 +22,9 @@ import msgspec
 
 import servotwin
 from servotwin.errors import InvalidInput
-from servotwin.identify.gap import METHODS
+from servotwin.estimation.gap import METHODS
 from servotwin.plant.servo import Servo
-from servotwin.redesign.lookupfile import spelled
+from servotwin.redesign.certified.lookup_file import spelled
 from servotwin.twin.settings import TwinSettings
 
 SOURCES = ("control", "hybrid", "identify", "messages", "plant", "redesign", "simulation", "twin")

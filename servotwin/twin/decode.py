@@ -6,7 +6,7 @@ import numpy as np
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
-from servotwin.identify.window import CHANNELS, Window
+from servotwin.estimation.window import CHANNELS, Window
 from servotwin.plant.signals import Array
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from servotwin.control.gains import gains_of
-from servotwin.identify.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Update, Window, finite
 from servotwin.redesign.policy import Redesign
 from servotwin.twin.proof import proof_of

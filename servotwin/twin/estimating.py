@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from servotwin.errors import InvalidInput
-from servotwin.identify import whitened
-from servotwin.identify.disturbance import Disturbance, nothing_known
-from servotwin.identify.estimate import GapEstimate, no_estimate
-from servotwin.identify.gap import estimate_gap, settings_of
-from servotwin.identify.offset import estimate_carrying
-from servotwin.identify.window import Window
+from servotwin.estimation import whitened
+from servotwin.estimation.disturbance import Disturbance, nothing_known
+from servotwin.estimation.estimate import GapEstimate, no_estimate
+from servotwin.estimation.gap import estimate_gap, settings_of
+from servotwin.estimation.offset import estimate_carrying
+from servotwin.estimation.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.evidence import UNASKED

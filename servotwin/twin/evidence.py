@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from servotwin.identify.disturbance import Disturbance
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend, TrendSettings
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -25,7 +25,7 @@ from servotwin.messages import (
     encode,
     finite,
 )
-from servotwin.redesign.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Refusal
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.rows import Evidence

@@ -26,24 +26,24 @@ from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
+from servotwin.config.table import Reader, Table, did_you_mean, given, named, parse_toml, part
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN
-from servotwin.plant import servofile
+from servotwin.plant import servo_file
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
-from servotwin.tomltable import Reader, Table, did_you_mean, given, named, parse_toml, part
-from servotwin.twin import settingsfile
+from servotwin.twin import settings_file as settingsfile
 from servotwin.twin.estimating import Estimator, estimator_of
-from servotwin.twin.inforce import InForce
+from servotwin.twin.in_force import InForce
 from servotwin.twin.policies import certified, policy_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 from servotwin.twin.twin import Twin
 
 MOST_MODELS = 256
-_CONTROLLER: dict[str, Reader] = {key.name: (key.symbol, key.read) for key in servofile.CONTROLLER}
+_CONTROLLER: dict[str, Reader] = {key.name: (key.symbol, key.read) for key in servo_file.CONTROLLER}
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ import math
 import msgspec
 from msgspec import Struct
 
-from servotwin.identify.disturbance import quick_bias
-from servotwin.identify.whitened.quick import Quick, quick_fit
-from servotwin.identify.window import Window
+from servotwin.estimation.disturbance import quick_bias
+from servotwin.estimation.whitened.quick import Quick, quick_fit
+from servotwin.estimation.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.twin.triagesettings import TriageSettings
+from servotwin.twin.triage_settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")
 """Reasons of windows that come anyway; any other says that something is new, or was asked for."""

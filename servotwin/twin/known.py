@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from servotwin.identify.estimate import GapEstimate, GapStatus
-from servotwin.identify.window import Window
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.window import Window
 from servotwin.plant.signals import SignalLike, as_nonnegative
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.wear import Expectation

@@ -10,13 +10,13 @@ from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Update
-from servotwin.redesign.certificate import Refusal
+from servotwin.redesign.certified.certificate import Refusal
+from servotwin.redesign.certified.lookup import TablePolicy
+from servotwin.redesign.certified.region import Region
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.lookup import TablePolicy
 from servotwin.redesign.policy import Redesign
-from servotwin.redesign.region import Region
 from servotwin.redesign.setting import Setting
-from servotwin.twin.inforce import InForce
+from servotwin.twin.in_force import InForce
 
 if TYPE_CHECKING:
     from servotwin.twin.store import Store

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certifiedpolicy import CertifiedPolicy
-from servotwin.redesign.deadzones import HysteresisPolicy, MarginPolicy
-from servotwin.redesign.lookup import TablePolicy
-from servotwin.redesign.lookupfile import load
+from servotwin.redesign.certified.lookup import TablePolicy
+from servotwin.redesign.certified.lookup_file import load
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy, Policy
 from servotwin.twin.settings import TwinSettings
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from servotwin.messages import Proof
-from servotwin.redesign.certificate import Certificate
+from servotwin.redesign.certified.certificate import Certificate
 
 
 def proof_of(certificate: Certificate) -> Proof:

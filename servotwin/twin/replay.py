@@ -8,7 +8,7 @@ import msgspec
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
-from servotwin.identify.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import InvalidMessage, Window
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.estimating import estimate_from, estimator_of

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from servotwin.identify.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Answer, Outcome, Probe, Request, Window
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, Memory, Seen, long_enough
-from servotwin.twin.inforce import InForce
+from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 

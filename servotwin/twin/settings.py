@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
-from servotwin.identify import whitened
-from servotwin.identify.gap import settings_of
-from servotwin.identify.trend import TrendSettings
-from servotwin.redesign.certificate import Demands
+from servotwin.estimation import whitened
+from servotwin.estimation.gap import settings_of
+from servotwin.estimation.trend import TrendSettings
+from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.redesign.uncertainty import Uncertainty
-from servotwin.tomltable import did_you_mean
-from servotwin.twin.triagesettings import TriageSettings
+from servotwin.twin.triage_settings import TriageSettings
 
 POLICIES = ("certified", "margin", "hysteresis", "paper")
 _OWNERS = {"table": "certified", "k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}

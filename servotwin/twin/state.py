@@ -14,13 +14,13 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.trend import Trend, TrendSettings
+from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.messages import Request, Update
 from servotwin.redesign.excitation import Memory
 from servotwin.redesign.policy import Policy
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.glance import Watch
-from servotwin.twin.inforce import InForce, Settings
+from servotwin.twin.in_force import InForce, Settings
 from servotwin.twin.lookups import Lookups
 from servotwin.twin.lookups import Memory as LookupMemory
 from servotwin.twin.requests import Requests

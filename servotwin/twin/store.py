@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from servotwin.identify.disturbance import Disturbance
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend
 from servotwin.messages import Answer, Fallback, Hello, Receipt, Request, Update, Window
-from servotwin.redesign.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Refusal
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.twin.glance import Glance

@@ -10,17 +10,17 @@ import math
 import msgspec
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.disturbance import quick_bias
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend
-from servotwin.identify.whitened.quick import Quick, quick_fit
+from servotwin.estimation.disturbance import quick_bias
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend
+from servotwin.estimation.whitened.quick import Quick, quick_fit
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.twin.decode import decode_window
 from servotwin.twin.glance import Glance, Watch, allowed, glance
 from servotwin.twin.requests import Requests
 from servotwin.twin.store import Store
-from servotwin.twin.triagesettings import TriageSettings
+from servotwin.twin.triage_settings import TriageSettings
 from servotwin.twin.wear import Expectation
 
 _FADES = 0.95  # of the usual misfit, per window: steps to one side may leave more than those to the other

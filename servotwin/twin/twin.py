@@ -6,9 +6,9 @@ import math
 from functools import partial
 
 from servotwin.errors import InvalidInput
-from servotwin.identify.disturbance import Disturbance, disturbance
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend
+from servotwin.estimation.disturbance import Disturbance, disturbance
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend
 from servotwin.messages import (
     Acknowledge,
     Answer,
@@ -21,13 +21,13 @@ from servotwin.messages import (
 )
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.lookup import TablePolicy
 from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.drafting import draft
 from servotwin.twin.estimating import UNUSABLE, Estimator, Observer, estimate_from, estimator_of, observed
-from servotwin.twin.inforce import InForce, Settings
+from servotwin.twin.in_force import InForce, Settings
 from servotwin.twin.lookups import Lookups, Question, question_of
 from servotwin.twin.policies import policy_of
 from servotwin.twin.requests import Requests, requests_of

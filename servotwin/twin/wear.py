@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from servotwin.identify.estimate import GapEstimate
-from servotwin.identify.trend import Trend, TrendSettings
+from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.trend import Trend, TrendSettings
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from servotwin.up.paced import Mark, Paced
 from servotwin.up.plan import SERVOS
 from servotwin.up.reading import Reader
 from servotwin.up.site import Site, Stopped
-from servotwin.up.twinwatch import Twin, TwinWatch
+from servotwin.up.twin_watch import Twin, TwinWatch
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PIECE_S, SHOW_S, SAY_S, ADAPT_S = 0.1, 0.5, 5.0, 3.0

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from servotwin.up.pacing import CORES, LIMIT, SLOWEST
 from servotwin.up.reading import Judged, View
-from servotwin.up.twinwatch import OK, Twin
+from servotwin.up.twin_watch import OK, Twin
 
 NONE = "-"
 HOUR = 3600.0

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import msgspec
 
-from servotwin import provision
 from servotwin.drives.simulated.diary import MachineState, read_state
+from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
-from servotwin.gateway.configfile import edge_toml, load
 from servotwin.link.session import Retry
-from servotwin.outputs import write_text
-from servotwin.service.tokens import Verifiers, write_tokens
+from servotwin.runtime.files import write_text
+from servotwin.twin_service.tokens import Verifiers, write_tokens
+from servotwin.up import enrolment
 from servotwin.up.pacing import FASTEST
 from servotwin.up.plan import PRE_TRIGGER_S, RATE, SERVOS, WINDOW_S, ServoPlan, machine_toml, twin_toml
 
@@ -113,7 +113,7 @@ def _check(path: Path) -> None:
     except (OSError, msgspec.MsgspecError):
         allowed = "choose another with --folder, or one that is empty or not there yet"
         raise InvalidInput(f"folder {path}: was not made by servotwin up; {allowed}") from None
-    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in found for file in (EDGE, MACHINE, provision.TOKEN))]
+    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in found for file in (EDGE, MACHINE, enrolment.TOKEN))]
     missing = [name for name in needed if not (path / name).is_file()]
     if found != [servo.name for servo in SERVOS] or missing:
         what = f"{missing[0]} is missing" if missing else f"its servos are {', '.join(found)}"
@@ -135,13 +135,13 @@ def _make(path: Path) -> None:
 def _fill(path: Path) -> None:
     write_tokens(path / "tokens.toml", Verifiers())
     write_text(path / TWIN, twin_toml(SERVOS, FASTEST))
-    provision.enroll_operator(path / TWIN, "up", path / OPERATOR)
+    enrolment.enroll_operator(path / TWIN, "up", path / OPERATOR)
     for servo in SERVOS:
         folder, drive = path / servo.name, {"kind": "simulated", "address": f"unix:{DRIVE}"}
-        wanted = provision.Enrolment(
+        wanted = enrolment.Enrolment(
             servo.name, folder, servo.role, RATE, drive, _PLACEHOLDER, noise=servo.noise_mm * 1e-3
         )
-        provision.enroll(path / TWIN, wanted)
+        enrolment.enroll(path / TWIN, wanted)
         config = load(folder / EDGE)
         agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
         write_text(folder / EDGE, edge_toml(replace(config, agent=agent)))

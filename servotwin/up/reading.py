@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from servotwin.drives.simulated.diary import MachineState, read_state
 from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.edge_process.status import read_status
 from servotwin.errors import InvalidInput
-from servotwin.gateway.status import read_status
 from servotwin.up.folder import MACHINE
 from servotwin.up.plan import ServoPlan
-from servotwin.up.twinwatch import Estimated
+from servotwin.up.twin_watch import Estimated
 
 
 class Judged(NamedTuple):

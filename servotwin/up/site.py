@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 
-from servotwin.up.child import Child
+from servotwin.runtime.child_process import Child
 from servotwin.up.folder import EDGE, MACHINE, TWIN, Folder
 from servotwin.up.outages import Forwarder, Outages
 from servotwin.up.plan import SERVOS
@@ -110,7 +110,7 @@ class Site:
         return self._child(f"machine {servo}", ("servotwin.drives.simulated", str(file)), "ready ")
 
     def _edge(self, servo: str) -> Child:
-        return self._child(f"edge {servo}", ("servotwin.gateway", str(self._folder.path / servo / EDGE)), "")
+        return self._child(f"edge {servo}", ("servotwin.edge_process", str(self._folder.path / servo / EDGE)), "")
 
     def _await(self, children: list[Child]) -> None:
         end = time.monotonic() + READY_S

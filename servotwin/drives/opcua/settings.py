@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from servotwin.config.table import Table
 from servotwin.drives.opcua.model import OBJECT
 from servotwin.errors import InvalidInput
-from servotwin.tomltable import Table
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 
+from servotwin.cosim.machine import compile_ahead
 from servotwin.drives.simulated.control import ControlServer
 from servotwin.drives.simulated.diary import Diary
 from servotwin.drives.simulated.pace import Pace
@@ -16,7 +17,6 @@ from servotwin.drives.simulated.server import Ending, Server, Tend, address_in_u
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.simulated.supervise import SuperviseServer
 from servotwin.errors import InvalidInput
-from servotwin.machine import compile_ahead
 
 
 def main(path: str, ending: Ending) -> None:

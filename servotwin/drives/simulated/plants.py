@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin import machine
 from servotwin.control.gains import with_gains
+from servotwin.cosim import machine
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput

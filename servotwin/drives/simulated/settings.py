@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from servotwin.config.table import Table, named, read_toml
+from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.diary import read_speed, read_state
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
-from servotwin.scenario import PRESETS, Scenario
-from servotwin.tomltable import Table, named, read_toml
 
 
 @dataclass(frozen=True)

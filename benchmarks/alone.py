@@ -1,0 +1,80 @@
+"""Benches that stand alone: they measure how good something is, not how fast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from benchmarks import accuracy, endurance, glances, tick
+from benchmarks.fleet import command as whole
+from benchmarks.fleet.setting import QUICK, Scale
+from benchmarks.novelty import command as worth_sending
+from benchmarks.policies import command as side_by_side
+from servotwin.errors import InvalidInput
+
+QUICK_SIZE = 0.02
+
+
+def _estimator(date: str, output: Path | None, quick: bool) -> None:
+    accuracy.accuracy(date, output, QUICK_SIZE if quick else 1.0)
+
+
+def _hostile(date: str, output: Path | None, quick: bool) -> None:
+    endurance.endurance(date, output, endurance.QUICK if quick else endurance.MACHINES)
+
+
+def _policies(date: str, output: Path | None, quick: bool) -> None:
+    side_by_side.policies(date, output, side_by_side.QUICK if quick else side_by_side.MACHINES)
+
+
+def _novelty(date: str, output: Path | None, quick: bool) -> None:
+    worth_sending.novelty(date, output, worth_sending.QUICK if quick else None)
+
+
+def _fleet(date: str, output: Path | None, quick: bool) -> None:
+    whole.fleet(date, output, QUICK if quick else Scale())
+
+
+def _triage(date: str, output: Path | None, quick: bool) -> None:
+    glances.triage(date, output, glances.QUICK if quick else glances.GAPS)
+
+
+def _tick(date: str, output: Path | None, quick: bool) -> None:
+    tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
+
+
+ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
+    accuracy.NAME: _estimator,
+    endurance.NAME: _hostile,
+    whole.NAME: _fleet,
+    glances.NAME: _triage,
+    side_by_side.NAME: _policies,
+    tick.NAME: _tick,
+    worth_sending.NAME: _novelty,
+}
+
+
+def run_alone(
+    names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool, full: bool = False
+) -> bool:
+    """Run the one that is named, if one is; `others`: whether options were given that only the speeds take.
+
+    `full` is for the fleet alone: as long as the figures that are stated of it took.
+
+    Raises
+    ------
+    InvalidInput
+        It is not alone.
+    """
+    name = next((name for name in names if name in ALONE), None)
+    if full and (tuple(names) != (whole.NAME,) or quick):
+        raise InvalidInput(f"--full: only bench {whole.NAME} takes it, and not with --quick")
+    if name is None:
+        return False
+    if len(names) > 1 or others:
+        raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
+    if full:
+        whole.fleet(date, output, Scale().full())
+    else:
+        ALONE[name](date, output, quick)
+    return True

@@ -1,0 +1,197 @@
+"""The workloads by name, each with its contestants and checks, in full or small size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from benchmarks import decisions, fits, hold, ours, solver, startup, taylor
+from benchmarks.alone import ALONE
+from benchmarks.contest import Check, Contestant, Workload
+from benchmarks.machine import cores
+from benchmarks.workloads import UNIT, Noisy, Sweep, Wear
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+
+MILLIMETRE = "/ 1 mm"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure: small workloads (`quick`), contestants of many seconds (`slow`), positions of W1 to compare
+    with."""
+
+    quick: bool = False
+    slow: bool = False
+    reference: Path | None = None
+
+    @property
+    def wear(self) -> Wear:
+        """In full 200 s with 10 reference steps; small 8 s with 4."""
+        return Wear(duration=8.0, period=4.0) if self.quick else Wear()
+
+    @property
+    def sweep(self) -> Sweep:
+        """In full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
+        return Sweep(side=3, duration=1.0) if self.quick else Sweep()
+
+
+Build: TypeAlias = Callable[[Options], Workload]
+
+
+def w1(options: Options) -> Workload:
+    """One long run."""
+    wear = options.wear
+    slow = (solver.wearing(wear),) if options.slow else ()
+    return Workload(
+        "W1",
+        f"one run of {wear.duration:g} s, gap 0 to 60 deg, 5 kHz",
+        (ours.wearing(wear), *_holds(wear), taylor.wearing(wear), *slow),
+        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_wear(wear))), *_against_file(options)),
+        lambda seconds: f"{wear.duration / seconds:,.0f} x real time",
+    )
+
+
+def _holds(wear: Wear) -> tuple[Contestant, ...]:
+    return hold.wearing(wear, wear.sample_rate), hold.wearing(wear, 4.0 * wear.sample_rate)
+
+
+def _against_file(options: Options) -> tuple[Check, ...]:
+    """The check against positions at a divisor of the sample rate, under the key q3 of an npz file."""
+    if options.reference is None:
+        return ()
+    if options.quick:
+        raise InvalidInput("--reference belongs to the full W1; leave out --quick")
+    wear, wanted = options.wear, read_reference(options.reference)
+    every, rest = divmod(wear.samples - 1, wanted.size - 1)
+    if rest or every == 0:
+        raise InvalidInput(
+            f"reference {options.reference}: q3 has {wanted.size} samples, which do not lie on W1's {wear.samples}"
+        )
+    return (Check("to reference", MILLIMETRE, lambda q: _largest(q[::every] - wanted)),)
+
+
+def read_reference(path: Path) -> Array:
+    """Positions (n,) in m.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read or has no one-dimensional q3 of at least two samples.
+    """
+    try:
+        with np.load(path) as file:
+            wanted = np.asarray(file["q3"], dtype=float)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InvalidInput(f"reference {path}: is not an npz file with positions q3 in m") from None
+    if wanted.ndim != 1 or wanted.size < 2:
+        raise InvalidInput(f"reference {path}: q3 has shape {wanted.shape}; it must be (n,) with n of at least 2")
+    return wanted
+
+
+def w2(options: Options) -> Workload:
+    """An ensemble of short runs."""
+    sweep, threads = options.sweep, cores()
+    runs = sweep.side**2
+
+    def error(q: Array) -> float:
+        return _largest((q - ours.refined_sweep(sweep))[ours.comparable(sweep)])
+
+    return Workload(
+        "W2",
+        f"{sweep.side} x {sweep.side} runs of {sweep.duration:g} s, gaps x tolerances, 100 Hz",
+        (*_sweepers(sweep, threads), *(_sweepers(sweep, 1)[:1] if threads > 1 else ())),
+        (Check("error", MILLIMETRE, error),),
+        lambda seconds: f"{seconds / runs * 1e3:.3g} ms a run",
+    )
+
+
+def _sweepers(sweep: Sweep, threads: int) -> tuple[Contestant, ...]:
+    return (
+        ours.sweeping(sweep, threads),
+        hold.sweeping(sweep, 5e3, threads),
+        hold.sweeping(sweep, 20e3, threads),
+        taylor.sweeping(sweep, 1, 1),
+        taylor.sweeping(sweep, taylor.BATCH, threads),
+    )
+
+
+def w3(options: Options) -> Workload:
+    """The gap from windows."""
+    wear = options.wear
+    return Workload(
+        "W3",
+        f"the gap from {wear.turns} windows of 1 s at 5 kHz",
+        (
+            fits.ours(wear),
+            fits.scipy_fits(wear, "scipy BFGS, numba loop", fits.with_loop),
+            fits.scipy_fits(wear, "scipy BFGS, scipy.signal", fits.with_lfilter),
+            fits.ours(wear, "whitened"),
+        ),
+        (
+            Check("error", "deg", lambda gaps: fits.typical_error(wear, gaps)),
+            Check("wrong", "> 1 deg", lambda gaps: fits.wrong_answers(wear, gaps)),
+        ),
+        lambda seconds: f"{seconds / wear.turns * 1e3:.3g} ms a window",
+    )
+
+
+def sampled(options: Options) -> Workload:
+    """The deployed loop, in noise."""
+    noisy = Noisy(options.wear)
+    return Workload(
+        "sampled",
+        f"{noisy.wear.duration:g} s, law sampled at 5 kHz, noise, loop filter",
+        (ours.noisy(noisy), hold.noisy(noisy)),
+        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_noisy(noisy))),),
+        lambda seconds: f"{noisy.wear.duration / seconds:,.0f} x real time",
+    )
+
+
+def decision(options: Options) -> Workload:
+    """What the certified policy takes to decide."""
+    size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
+    return Workload(
+        "decision",
+        f"settings proved on {size} each",
+        decisions.decisions(options.quick),
+        (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
+        lambda _: "",
+    )
+
+
+def start(options: Options) -> Workload:
+    """A process's first run."""
+    return Workload(
+        "start", "a fresh process to the end of its first run of 1 s", startup.starters(options.slow), (), lambda _: ""
+    )
+
+
+WORKLOADS: dict[str, Build] = {"W1": w1, "W2": w2, "W3": w3, "sampled": sampled, "decision": decision, "start": start}
+
+
+def chosen(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of workloads in their usual order, whatever their case; none means all.
+
+    Raises
+    ------
+    InvalidInput
+        A name that is none.
+    """
+    known = {name.lower(): name for name in WORKLOADS}
+    for name in names:
+        if name.lower() not in known:
+            hint = did_you_mean(name, (*WORKLOADS, *ALONE))
+            known_ones = f"{', '.join(WORKLOADS)}, or {' or '.join(ALONE)} alone"
+            raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {known_ones}")
+    wanted = {known[name.lower()] for name in names} or set(WORKLOADS)
+    return tuple(name for name in WORKLOADS if name in wanted)
+
+
+def _largest(difference: Array) -> float:
+    return float(np.max(np.abs(difference))) / UNIT if difference.size else 0.0

@@ -1,0 +1,41 @@
+"""The command line of the benchmarks: `python -m benchmarks`, or `servotwin bench` in a source checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def bench(
+    workloads: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies, tick, "
+            "novelty, fleet."
+        ),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small workloads, to see that all works.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten.")] = False,
+    slow: Annotated[bool, typer.Option("--slow", help="Also what takes many seconds a run: scipy, compiling.")] = False,
+    reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
+) -> None:
+    """Speed and accuracy beside what one would use instead, side by side."""
+    from datetime import UTC, datetime
+
+    from benchmarks.alone import run_alone
+
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    others = slow or runs is not None or reference is not None
+    if run_alone(tuple(workloads or ()), date, json, quick, others, full):
+        return
+    from benchmarks.catalogue import Options
+    from benchmarks.command import bench as run
+
+    run(tuple(workloads or ()), date, json, runs, Options(quick, slow, reference))

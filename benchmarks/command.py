@@ -1,0 +1,111 @@
+"""`servotwin bench`: measure, show a table, write JSON."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from benchmarks.catalogue import WORKLOADS, Options, chosen
+from benchmarks.contest import Check, Workload
+from benchmarks.document import Result, dumps
+from benchmarks.machine import machine
+from benchmarks.measure import Clock, Row, race, turns
+from servotwin.runtime import files
+
+RUNS, QUICK_RUNS = 7, 2
+BLOCK = 0.1  # s that a short job is repeated for within its turn
+
+
+def bench(
+    names: Sequence[str] = (),
+    date: str = "",
+    json: Path | None = None,
+    runs: int | None = None,
+    options: Options | None = None,
+    console: Console | None = None,
+    clock: Clock = time.perf_counter,
+) -> tuple[Result, ...]:
+    """Measure workloads and show what was found.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of workloads; empty: all.
+    date : str
+        Written into the JSON.
+    json : Path, optional
+        File to write, suffix .json.
+    runs : int, optional
+        Rounds; None: 7, or 2 when quick.
+    options : Options, optional
+    console : Console, optional
+        Where progress and tables go.
+    clock : callable
+        Seconds.
+
+    Raises
+    ------
+    InvalidInput
+        An unknown workload, an output that cannot be written, a reference that cannot be read.
+    """
+    options, console = options or Options(), console or Console()
+    if json is not None:
+        files.check_file(json, (".json",))
+    workloads = [WORKLOADS[name](options) for name in chosen(names)]
+    rounds = runs or (QUICK_RUNS if options.quick else RUNS)
+    results = tuple(_measured(w, rounds, 0.0 if options.quick else BLOCK, clock, console) for w in workloads)
+    found = machine()
+    console.print(f"{found['cpu']}, {found['cores']} cores, {found['python']}", highlight=False)
+    if json is not None:
+        files.write_and_say(json, dumps(results, found, date, options.quick), console.print)
+    return results
+
+
+def _measured(workload: Workload, runs: int, block: float, clock: Clock, console: Console) -> Result:
+    """One workload, under a progress bar that goes when the table comes."""
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True) as progress:
+        bar = progress.add_task(workload.name, total=turns(workload, runs))
+
+        def notice(what: str) -> None:
+            progress.update(bar, advance=1, description=f"{workload.name}, {what}")
+
+        result = Result(workload, race(workload, runs, block, clock, notice))
+    console.print(table(result))
+    return result
+
+
+def table(result: Result) -> Table:
+    """One workload's table for the terminal."""
+    workload = result.workload
+    shown = Table(title=f"{workload.name}: {workload.title}", title_justify="left", box=None, pad_edge=False)
+    shown.add_column("contestant")
+    for heading in ("median", "ratio", *(f"{check.name}\n{check.unit}" for check in workload.checks)):
+        shown.add_column(heading, justify="right")
+    shown.add_column("notes")
+    for row in result.rows:
+        shown.add_row(row.name, *_numbers(result, row, workload.checks), escape(result.note(row)))
+    return shown
+
+
+def _numbers(result: Result, row: Row, checks: Sequence[Check]) -> list[str]:
+    if row.missing:
+        return ["-"] * (2 + len(checks))
+    errors = [f"{row.errors[check.name]:.2g}" for check in checks]
+    return [duration(row.median), figure(result.ratio(row)), *errors]
+
+
+def figure(ratio: float) -> str:
+    """Three digits, or all before the point."""
+    return f"{ratio:,.0f}" if ratio >= 100.0 else f"{ratio:.3g}"
+
+
+def duration(seconds: float) -> str:
+    """A time with three digits and its unit."""
+    return f"{seconds:.3g} s" if seconds >= 1.0 else f"{seconds * 1e3:.3g} ms"

@@ -1,0 +1,41 @@
+"""Decisions of the certified policy as workloads: from what is known to a setting proved on 256 machines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.contest import Contestant
+from servotwin.hybrid.automaton import Array
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.assess import Trial
+from servotwin.redesign.certified.certificate import Certificate, Demands
+from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.uncertainty import Uncertainty
+
+KNOWN_BIAS = (-2e-4, 2e-4)  # V
+
+
+def decisions(quick: bool) -> tuple[Contestant, ...]:
+    """Narrow gaps with a known input bias, and the whole stated range; `quick`: fewer and shorter runs."""
+    return (
+        _decision("gap of 10 deg", (9.9, 10.1), KNOWN_BIAS, quick),
+        _decision("gap of 40 deg", (39.9, 40.1), KNOWN_BIAS, quick),
+        _decision("fallback set", (0.0, 60.0), (-0.1, 0.1), quick),
+    )
+
+
+def _decision(name: str, gap_deg: tuple[float, float], bias: tuple[float, float], quick: bool) -> Contestant:
+    servo, demands, trial = Servo.preset("paper"), Demands(), Trial()
+    if quick:
+        demands, trial = replace(demands, plants=4, conditions=4, screened=2), replace(trial, duration=30.0)
+    known = Uncertainty(gap=(math.radians(gap_deg[0]), math.radians(gap_deg[1])), input_bias=bias)
+
+    def job() -> Array:
+        found = certify(servo, known, demands, trial)
+        settled = found.settled if isinstance(found, Certificate) else 0.0
+        return np.array([settled, found.members if isinstance(found, Certificate) else 0.0])
+
+    return Contestant(name, lambda: job)

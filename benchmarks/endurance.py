@@ -1,0 +1,117 @@
+"""`servotwin bench hostile`: does the loop stay in its certified band, whatever its twin does?"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from benchmarks import hostile, report
+from benchmarks.hostile import Outcome
+from benchmarks.hostiletwin import Kind
+from servotwin.analysis.maps.pool import shared, workplace
+
+SCHEMA = "servotwin-bench-hostile/1"
+NAME = "hostile"
+MACHINES, QUICK = 200, 8
+RUBBING = 5  # for so many machines one more, with friction
+FRICTION = "any, and friction"
+HEADS = ("twin", "machines", "worst, bands", "outside", "updates applied", "fell back")
+
+Task = tuple[int, Kind, bool]
+"""Seed, twin, and whether the machine rubs."""
+
+
+def endurance(
+    date: str = "",
+    output: Path | None = None,
+    count: int = MACHINES,
+    kinds: Sequence[Kind] = hostile.KINDS,
+    console: Console | None = None,
+) -> tuple[Outcome, ...]:
+    """Let machines endure their twins, show what came of it, and write JSON when asked to.
+
+    Parameters
+    ----------
+    date : str
+        Written into the JSON.
+    output : Path, optional
+        File to write, suffix .json.
+    count : int
+        Machines within what is stated of them; the kinds of twins take turns. A fifth as many more have friction.
+    kinds : sequence of Kind
+    console : Console, optional
+
+    Raises
+    ------
+    InvalidInput
+        An output that cannot be written.
+    """
+    console = console or Console()
+    report.check(output)
+    tasks = [(seed, kinds[seed % len(kinds)], False) for seed in range(count)]
+    tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // RUBBING)]
+    with workplace(), warnings.catch_warnings():
+        # A process whose caches have grown is replaced by another; its jobs are not lost.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+        running = track(shared(endured, tasks), "enduring", len(tasks), console=console, transient=True)
+        found = dict(running)
+    outcomes = tuple(found[task] for task in tasks)
+    console.print(shown(outcomes))
+    console.print(verdict(outcomes), highlight=False)
+    report.write(output, dumps(outcomes, date), console)
+    return outcomes
+
+
+def endured(task: Task) -> Outcome:
+    """One machine with its twin."""
+    seed, kind, rubs = task
+    return hostile.endured(seed, kind, rubs=rubs)
+
+
+def verdict(outcomes: Sequence[Outcome]) -> str:
+    """One sentence."""
+    stated = [outcome for outcome in outcomes if not outcome.case.friction]
+    band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in stated)
+    limit = f"{band.error * 1e3:.3f} mm from {band.settling:g} s after each step on"
+    return f"{inside} of {len(stated)} machines as stated stay within {limit}."
+
+
+def shown(outcomes: Sequence[Outcome]) -> Table:
+    """A row for each kind of twin, and one for machines with friction."""
+    result = Table(title="hostile: what the edge endures", title_justify="left", box=None, pad_edge=False)
+    for head in HEADS:
+        result.add_column(head, justify="left" if head == HEADS[0] else "right")
+    for row in dict.fromkeys(map(_row, outcomes)):
+        some = [outcome for outcome in outcomes if _row(outcome) == row]
+        numbers = f"{max(o.worst for o in some):.2f}", sum(o.worst > 1.0 for o in some), sum(o.applied for o in some)
+        result.add_row(row, str(len(some)), *map(str, numbers), str(sum(bool(o.fallbacks) for o in some)))
+    return result
+
+
+def _row(outcome: Outcome) -> str:
+    return FRICTION if outcome.case.friction else outcome.kind.value
+
+
+def dumps(outcomes: Sequence[Outcome], date: str) -> str:
+    """The document: schema, date, machine, band, and every outcome."""
+    band = hostile.band()
+    rows = [
+        {
+            "twin": outcome.kind.value,
+            "friction_n_m": outcome.case.friction,
+            "worst_bands": outcome.worst,
+            "outside_s": outcome.outside,
+            "recovered": outcome.recovered,
+            "applied": outcome.applied,
+            "fallbacks": [cause.value for cause in outcome.fallbacks],
+            "refused": {reason.value: number for reason, number in sorted(outcome.refused.items())},
+        }
+        for outcome in outcomes
+    ]
+    limits = {"error_m": band.error, "settling_s": band.settling}
+    return report.text(SCHEMA, date, band=limits, outcomes=rows)

@@ -1,0 +1,68 @@
+"""What a run left in the store: how long windows waited, and what was made of them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks.fleet.plan import shares
+
+
+class Done(NamedTuple):
+    """Of windows that came in some time.
+
+    Attributes
+    ----------
+    windows, undone : int
+        How many came, and how many of these were not worked on when it was looked.
+    age : tuple of float
+        s from a window's commit to that of its outcome: median, 99 % and largest.
+    """
+
+    windows: int
+    undone: int
+    age: tuple[float, float, float]
+
+
+@contextmanager
+def reading(file: Path) -> Iterator[sqlite3.Connection]:
+    """The store's file, to be read beside the twin."""
+    with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as connection:
+        yield connection
+
+
+def waiting(connection: sqlite3.Connection, now: float) -> tuple[int, float]:
+    """Windows and letters that wait, and the age (s) of the oldest."""
+    query = "SELECT count(*) FROM messages WHERE done IS NULL AND kind != 'proof'"
+    (count,) = connection.execute(query).fetchone()
+    (oldest,) = connection.execute("SELECT min(ready) FROM twins WHERE ready IS NOT NULL").fetchone()
+    return int(count), 0.0 if oldest is None else max(0.0, now - float(oldest))
+
+
+def stored(connection: sqlite3.Connection) -> int:
+    """Windows that were ever committed."""
+    (count,) = connection.execute("SELECT coalesce(sum(windows), 0) FROM twins").fetchone()
+    return int(count)
+
+
+def done(connection: sqlite3.Connection, since: float, until: float) -> Done:
+    """Of the windows that came between two times (s since the epoch)."""
+    query = "SELECT received, done FROM messages WHERE kind = 'window' AND received >= ? AND received < ?"
+    rows = connection.execute(query, (since, until)).fetchall()
+    ages = [end - begin for begin, end in rows if end is not None]
+    return Done(len(rows), len(rows) - len(ages), shares(ages))
+
+
+def made(connection: sqlite3.Connection, since: float) -> dict[str, int]:
+    """How much of each kind of evidence was made since then (s since the epoch)."""
+    query = "SELECT kind, count(*) FROM evidence WHERE made >= ? GROUP BY kind"
+    return {str(kind): int(count) for kind, count in connection.execute(query, (since,))}
+
+
+def failures(connection: sqlite3.Connection) -> list[str]:
+    """Why work failed, a few of the reasons."""
+    query = "SELECT DISTINCT status FROM evidence WHERE status LIKE 'failed%' LIMIT 3"
+    return [str(status) for (status,) in connection.execute(query)]

@@ -1,0 +1,148 @@
+"""The two runs: as many windows as the twin takes, and a fleet at its cadence with an outage."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from benchmarks.fleet import findings
+from benchmarks.fleet.findings import Done
+from benchmarks.fleet.plan import Load, Plan, Report, encode_load
+from benchmarks.fleet.processes import service
+from benchmarks.fleet.setting import STORE, Scale, commission, write_file
+from benchmarks.fleet.stock import BOOT, COMMISSIONED, Place
+from benchmarks.fleet.watch import Sample, Watch
+from servotwin.messages import encode
+from servotwin.store.store import open_store
+
+LOOK_S = 1.0
+LONGEST_DRAIN = 1800.0
+"""s that a twin is given to work off what waits at the end."""
+_RAMP = 0.1  # of the steady time that is not counted: caches fill, code is compiled
+
+
+class Ran(NamedTuple):
+    """A run as it was seen.
+
+    Attributes
+    ----------
+    report : Report
+        The edges' own.
+    watch : Watch
+    steady : Done
+        Of the windows that came in undisturbed time.
+    made : dict of str to int
+        Evidence by kind.
+    behind : float
+        Windows that waited when the link came back: kept by the edges, and at the twin.
+    drained : float
+        s from then until no more than a second's windows waited; NaN: never.
+    """
+
+    report: Report
+    watch: Watch
+    steady: Done
+    made: dict[str, int]
+    behind: float
+    drained: float
+
+
+def ingest(folder: Path, scale: Scale, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+    """Windows as fast as they are taken, into a twin that estimates nothing."""
+    write_file(folder, scale, enabled=False)
+    open_store(f"sqlite:///{folder / STORE}").close()
+    plan = Plan(0, scale.servos, BOOT, scale.connections, scale.ingest, start=COMMISSIONED)
+    return _run(folder, plan, places, tell)
+
+
+def fleet(folder: Path, scale: Scale, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+    """Steady time, an outage, and time after it."""
+    known = write_file(folder, scale)
+    version = commission(folder, known, scale, places)
+    begin = scale.steady
+    plan = Plan(
+        0,
+        scale.servos,
+        BOOT,
+        scale.connections,
+        scale.steady + scale.outage + scale.after,
+        scale.rate,
+        scale.news,
+        polls=True,
+        version=version,
+        sequence=1000,
+        start=COMMISSIONED,
+        outage=(begin, begin + scale.outage),
+    )
+    return _run(folder, plan, places, tell)
+
+
+def _run(folder: Path, plan: Plan, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+    with service(folder) as twin, findings.reading(folder / STORE) as store:
+        plan = msgspec.structs.replace(plan, port=twin.port)
+        before, since = findings.stored(store), time.time()
+        with _edges(folder, plan, places) as edges:
+            watch = Watch(twin.process.pid, edges.pid, lambda: findings.waiting(store, time.time()))
+            behind = _watched(edges, watch, plan, tell, lambda: findings.stored(store) - before)
+            report = _reported(edges)
+        steady = plan.outage[0] or plan.duration
+        found = findings.done(store, since + _RAMP * steady, since + steady)
+        broken = findings.failures(store)
+        if broken or twin.process.poll() is not None:
+            raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
+        return Ran(report, watch, found, findings.made(store, since), *behind)
+
+
+def _watched(
+    edges: subprocess.Popen[bytes],
+    watch: Watch,
+    plan: Plan,
+    tell: Callable[[Sample], None],
+    stored: Callable[[], int],
+) -> tuple[float, float]:
+    """Look on until the edges are done and nothing waits; (windows behind when the link came back, s until not)."""
+    behind, drained, back = 0.0, float("nan"), plan.outage[1]
+    quiet = max(plan.rate * LOOK_S, 1.0)
+    while True:
+        sample = watch.look()
+        tell(sample)
+        due = plan.rate * min(sample.time, plan.duration)
+        backlog = max(0.0, due - stored()) + sample.waiting
+        if back > 0.0 and sample.time < back + LOOK_S:
+            behind = backlog
+        elif back > 0.0 and drained != drained and backlog <= quiet:
+            drained = sample.time - back
+        running = edges.poll() is None
+        if not running and (sample.waiting == 0 or plan.rate == 0.0 or sample.time > plan.duration + LONGEST_DRAIN):
+            return behind, drained
+        time.sleep(LOOK_S)
+
+
+@contextmanager
+def _edges(folder: Path, plan: Plan, places: Sequence[Place]) -> Iterator[subprocess.Popen[bytes]]:
+    """The edges' process, at work."""
+    load = Load(plan, tuple(tuple(encode(window) for window in place.windows) for place in places))
+    path = folder / "edges.load"
+    path.write_bytes(encode_load(load))
+    command = [sys.executable, "-m", "benchmarks.fleet.edges", str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ)) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+def _reported(edges: subprocess.Popen[bytes]) -> Report:
+    said, complaint = edges.communicate()
+    if edges.returncode != 0:
+        raise RuntimeError(f"the edges failed: {complaint.decode(errors='replace').strip().splitlines()[-1:]}")
+    return msgspec.json.decode(said, type=Report)

@@ -1,0 +1,177 @@
+"""What stands ready before the clock starts: the twin's file, its table of proofs, a store that knows the servos."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from pathlib import Path
+
+import msgspec
+
+from benchmarks.fleet.stock import BOOT, COMMISSIONED, RATE, Known, Place, commissioned
+from servotwin.config.table import parse_toml
+from servotwin.messages import Hello, encode
+from servotwin.redesign.certified.lookup import Grid
+from servotwin.redesign.certified.lookup_file import build
+from servotwin.store.rows import Incoming, Kind, Outcome
+from servotwin.store.store import Store, open_store
+from servotwin.twin.fleet import Fleet, models_of
+from servotwin.twin.policies import certified
+from servotwin.twin.state import TwinState
+
+STORE, TABLE = "fleet.db", "axis.table"
+GRID = Grid(math.radians(4.0), (1e-3, 1e-2), (0.0,))
+_TOGETHER = 256
+_FILE = """
+[service]
+port = 0
+store = "sqlite:///{store}"
+workers = {workers}
+proofs_per_minute = {proofs}
+speed = 1e6
+rate_limit_per_s = 1000.0
+log_level = "warning"
+
+[models.axis]
+servo = "paper"
+
+[models.axis.twin]
+enabled = {enabled}
+table = "{table}"
+
+[models.axis.twin.uncertainty]
+gap_deg = [0.0, 30.0]
+
+[models.axis.twin.triage]
+every = {every}
+
+[servos]
+"ax-*" = "axis"
+"""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large a bench is.
+
+    Attributes
+    ----------
+    servos : int
+    rate : float
+        Windows/s of all of them: each one's turn comes every servos / rate s.
+    news : float
+        Share of windows with which the gap has moved.
+    steady, outage, after : float
+        s: how long it goes on undisturbed, without the link, and with it again.
+    ingest : float
+        s, for the rate of ingest alone.
+    places, windows : int
+        Of the stock: gaps, and windows of each.
+    workers, connections : int
+    proofs : float
+        Per minute at most.
+    every : int
+        At least every so many windows of a servo one is estimated.
+    """
+
+    servos: int = 10_000
+    rate: float = 500.0
+    news: float = 0.05
+    steady: float = 60.0
+    outage: float = 20.0
+    after: float = 40.0
+    ingest: float = 10.0
+    places: int = 12
+    windows: int = 16
+    workers: int = 2
+    connections: int = 64
+    proofs: float = 6.0
+    every: int = 50
+
+    def full(self) -> Scale:
+        """Five minutes, and an outage of ten."""
+        return replace(self, steady=300.0, outage=600.0, after=600.0)
+
+
+QUICK = Scale(200, 20.0, 0.1, 3.0, 1.0, 2.0, 1.0, 2, 2, 1, 4)
+
+
+def prove(folder: Path, scale: Scale) -> None:
+    """Write the table of proofs that every twin of the bench looks up."""
+    text = _text(scale, enabled=True)
+    (model,) = models_of(parse_toml(text, "twin.toml"), folder, checked=False)
+    for _ in build(folder / TABLE, certified(model.servo, model.settings), GRID):
+        pass
+
+
+def write_file(folder: Path, scale: Scale, enabled: bool = True) -> Fleet:
+    """Write the twin's file, beside the table; the fleet that it says."""
+    text = _text(scale, enabled)
+    (folder / "twin.toml").write_text(text, encoding="utf-8")
+    return Fleet.loads(text, "twin.toml", folder)
+
+
+def commission(folder: Path, fleet: Fleet, scale: Scale, places: Sequence[Place]) -> int:
+    """A store in which every servo's twin knows it already; the version of the parameters that all run.
+
+    One twin of each place learns; the others are told what it knows.
+    """
+    known = [commissioned(fleet, "ax-00000", place) for place in places]
+    version = max(one.version for one in known)
+    store = open_store(f"sqlite:///{folder / STORE}")
+    try:
+        for first in range(0, scale.servos, _TOGETHER):
+            _introduce(store, range(first, min(first + _TOGETHER, scale.servos)), scale, known)
+    finally:
+        store.close()
+    return version
+
+
+def _introduce(store: Store, numbers: range, scale: Scale, known: Sequence[Known]) -> None:
+    """Some servos say hello, and their twins know them."""
+    now = time.time()
+    states = {f"ax-{n:05d}": known[n % len(known)].state for n in numbers}
+    ages = _ages(scale, numbers)
+    store.put([_hello(servo, now) for servo in states])
+    claims = store.claim("bench", len(states), 60.0, now)
+    made = [
+        Outcome(
+            claim.servo,
+            claim.serial,
+            _named(states[claim.servo], claim.servo, ages[claim.servo]),
+            None,
+            tuple(message.id for message in claim.messages),
+        )
+        for claim in claims
+    ]
+    if not all(store.commit(made, now)) or len(made) < len(states):
+        raise RuntimeError("servos could not be commissioned")
+
+
+def _ages(scale: Scale, numbers: range) -> dict[str, int]:
+    """How many windows each has been glanced at since its last estimate, as if the bench had run for hours."""
+    chance, since = random.Random(numbers.start), range(scale.every - 1)
+    likely = [(1.0 - scale.news) ** count for count in since]
+    return {f"ax-{n:05d}": chance.choices(since, likely)[0] for n in numbers}
+
+
+def _named(state: TwinState, servo: str, glances: int) -> bytes:
+    """A twin's state as another servo's."""
+    assert state.watch is not None
+    watch = msgspec.structs.replace(state.watch, glances=glances)
+    return msgspec.msgpack.encode(msgspec.structs.replace(state, servo=servo, watch=watch))
+
+
+def _hello(servo: str, now: float) -> Incoming:
+    body = encode(Hello(servo, BOOT, COMMISSIONED, RATE, 0, 0.0, "axis"))
+    digest = blake2b(body, digest_size=16).digest()
+    return Incoming(servo, Kind.LETTER, digest.hex(), body, "", digest, now)
+
+
+def _text(scale: Scale, enabled: bool) -> str:
+    told = {"store": STORE, "table": TABLE, "workers": scale.workers, "proofs": scale.proofs, "every": scale.every}
+    return _FILE.format(**told, enabled=str(enabled).lower())

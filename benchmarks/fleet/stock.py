@@ -1,0 +1,113 @@
+"""Windows made beforehand, of the deployed loop at several gaps; and what a twin knows of a servo by then."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+
+from servotwin.cosim import cosimulate
+from servotwin.cosim.scenario import Scenario
+from servotwin.messages import Update, Window, decode, encode
+from servotwin.plant.noise import Noise
+from servotwin.store.rows import Claim, Kind, Stored
+from servotwin.twin.fleet import Fleet
+from servotwin.twin.state import TwinState
+from servotwin.twin.triage_settings import TriageSettings
+from servotwin.twin.work import work
+
+RATE = 1000.0
+"""Hz: 2 s of five channels are 20 kB."""
+PERIOD = 20.0
+"""s from one change of the reference to the next: the paper's cadence."""
+FIRST_GAP, GAP_STEP = math.radians(5.0), math.radians(1.0)
+SETTLED = 4
+"""Windows of a run that only the twin's commissioning sees: the first steps, and the first updates."""
+NOISE = Noise(1e-6, (1.0, 400.0))
+BOOT = "boot-1"
+COMMISSIONED = 10 * PERIOD
+"""s of sample time, at which a servo joins the bench; its twin is told of the windows before."""
+
+
+class Place(NamedTuple):
+    """One gap of the stock.
+
+    Attributes
+    ----------
+    gap : float
+        rad.
+    first : tuple of Window
+        From the loop's start on: the twin learns of the encoder's offset in these, if the later ones show one contact.
+    windows : tuple of Window
+        One after the other in the same steady loop; steps to one side and to the other take turns.
+    """
+
+    gap: float
+    first: tuple[Window, ...]
+    windows: tuple[Window, ...]
+
+
+def stock(places: int, windows: int, seed: int = 0) -> list[Place]:
+    """Steady loops at `places` gaps, `windows` (an even number) of each, with a bias and a little noise."""
+    return [_place(number, windows, seed + number) for number in range(places)]
+
+
+def _place(number: int, windows: int, seed: int) -> Place:
+    base = Scenario.preset("certified")
+    gap = FIRST_GAP + number * GAP_STEP
+    scenario = base.replace(
+        gap=gap,
+        seed=seed,
+        duration=PERIOD * (SETTLED + windows) - 0.5 * PERIOD,
+        recording=replace(base.recording, sample_rate=RATE),
+        controller=base.law.replace(sample_rate=RATE),
+        noise=NOISE,
+        twin=base.twin.replace(triage=TriageSettings()),
+        name="axis",
+    )
+    found = cosimulate(scenario).windows
+    return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
+
+
+def readdressed(window: Window, servo: str, sequence: int, start: float, version: int) -> Window:
+    """The same measurements as another servo's, at another time; the checksum is over the channels, and stays."""
+    shift = start - window.start
+    return msgspec.structs.replace(
+        window,
+        servo=servo,
+        boot=BOOT,
+        sequence=sequence,
+        start=start,
+        parameter_version=version,
+        reference_changes=tuple((time + shift, value) for time, value in window.reference_changes),
+    )
+
+
+class Known(NamedTuple):
+    """What the twin of a servo knows that has been watched for a while, and the version of its parameters."""
+
+    state: TwinState
+    version: int
+
+
+def commissioned(fleet: Fleet, servo: str, place: Place) -> Known:
+    """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
+    state, version = b"", 0
+    learnt = (*place.first, *place.windows)[: SETTLED + 2]
+    for number, recorded in enumerate(learnt):
+        start = COMMISSIONED + (number - len(learnt)) * PERIOD
+        window = readdressed(recorded, servo, number, start, version)
+        outcome = work(fleet, _claim(servo, state, number, Kind.WINDOW, encode(window)), start)
+        state = outcome.state
+        sent = [decode(body) for body in outcome.outgoing]
+        # That the next window is cut under an update tells the twin as much as its receipt.
+        version = max([version, *(update.version for update in sent if isinstance(update, Update))])
+        for asked in outcome.enqueue:
+            state = work(fleet, _claim(servo, state, number, Kind.PROOF, asked.body), start).state
+    return Known(msgspec.msgpack.decode(state, type=TwinState), version)
+
+
+def _claim(servo: str, state: bytes, serial: int, kind: Kind, body: bytes) -> Claim:
+    return Claim(servo, state, serial, (Stored(serial + 1, kind, body, "", 0.0),))

@@ -1,0 +1,140 @@
+"""Twins that mean harm, or that fail: what an edge must endure."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import partial
+
+from msgspec import structs
+
+from servotwin.cosim.scenario import Scenario
+from servotwin.estimation.disturbance import disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.window import Window as NumericWindow
+from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Update, Window
+from servotwin.twin.in_force import InForce
+from servotwin.twin.policies import policy_of
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+from servotwin.twin.wear import Expectation
+
+HONEST = 2  # windows that are answered before a twin falls silent
+FACTOR = 3.0  # of a lie, either way
+SPREAD = math.radians(0.05)  # of an estimate, so it says
+UNBOUNDED = Band(1.0, 1.0, 10.0, 1e6)
+
+
+class Kind(StrEnum):
+    """What is wrong with a twin."""
+
+    NONE = "no twin"
+    SILENT = "falls silent"
+    LIES_HIGH = "gap times three"
+    LIES_LOW = "gap by three"
+    REPLAYS = "replays old updates"
+    WANTON = "anything in bounds"
+
+
+_LIES = {Kind.LIES_HIGH: FACTOR, Kind.LIES_LOW: 1.0 / FACTOR}
+
+
+def deceived(scenario: Scenario, gap: float) -> Twin:
+    """The scenario's own twin with its certified policy, but that its estimator always says `gap` (rad)."""
+
+    def estimate(window: NumericWindow, _expected: Expectation) -> GapEstimate:
+        interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
+        return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="told")
+
+    start = InForce(scenario.start_law, scenario.start_tolerance)
+    policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
+    return Twin(scenario.name, estimate, policy, MemoryStore(), scenario.twin, observer, start)
+
+
+@dataclass
+class HostileTwin:
+    """A twin that is right in everything but one.
+
+    Attributes
+    ----------
+    kind : Kind
+    twin : Twin
+        What it would say otherwise.
+    own : Gains
+        The servo's own.
+    draw : random.Random
+    """
+
+    kind: Kind
+    twin: Twin
+    own: Gains
+    draw: random.Random
+    version: int = 0
+    in_force: int = 0
+    windows: int = 0
+    said: list[Update] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, kind: Kind, scenario: Scenario, gap: float, draw: random.Random) -> HostileTwin:
+        """For a scenario whose machine has this gap (rad)."""
+        twin = deceived(scenario, gap * _LIES.get(kind, 1.0))
+        return cls(kind, twin, gains(scenario), draw)
+
+    def receive(self, message: Message, now: float) -> list[Message]:
+        """What it says to a message."""
+        self.windows += isinstance(message, Window)
+        if self.kind is Kind.NONE or (self.kind is Kind.SILENT and self.windows > HONEST):
+            return []
+        if isinstance(message, Receipt | Fallback):
+            self.in_force = max(self.in_force, message.parameter_version)
+        if self.kind is Kind.WANTON:
+            return self._wanton(message) if isinstance(message, Window) else []
+        answer = self.twin.receive(message, now)
+        repeated = self._repeated() if isinstance(message, Window) else ()
+        self.said += [each for each in answer if isinstance(each, Update)]
+        return [*repeated, *answer]
+
+    def next_wake(self) -> float | None:
+        """It never speaks first."""
+        return None
+
+    def wake(self, _now: float) -> list[Message]:
+        """Nothing."""
+        return []
+
+    def _repeated(self) -> Iterable[Update]:
+        """An old update as it was, and one with the next number, on what is in force."""
+        if self.kind is not Kind.REPLAYS or not self.said:
+            return ()
+        again, renumbered = self.draw.choice(self.said), self.draw.choice(self.said)
+        return again, structs.replace(renumbered, version=self._next(), base_version=self.in_force)
+
+    def _next(self) -> int:
+        self.version = max(self.version, self.in_force) + 1
+        return self.version
+
+    def _wanton(self, window: Window) -> list[Message]:
+        """Each value by itself anywhere in its range and a little beyond; its prediction cannot be held against it."""
+        draw, own, none = self.draw, self.own, (None, None)
+        kp, kd, tf = (
+            own.Kp * draw.uniform(0.66, 1.04),
+            own.Kd * draw.uniform(0.66, 1.04),
+            own.Tf * draw.uniform(0.8, 1.2),
+        )
+        ki, feedforward, leave = own.Ki * draw.uniform(0.0, 0.052), draw.uniform(-0.104, 0.104), draw.uniform(0.0, 1.55)
+        setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
+        version, identity = self._next(), (window.boot, window.sequence)
+        end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
+        known = (None, None, none, "OK", tolerance, end, setting, UNBOUNDED)
+        update = Update(window.servo, version, self.in_force, identity, window.start, *known)
+        self.said.append(update)
+        return [Acknowledge(window.servo, window.boot, window.sequence), update]
+
+
+def gains(scenario: Scenario) -> Gains:
+    """The servo's own."""
+    own = scenario.law
+    return Gains(own.Kp, own.Ki, own.Kd, own.Tf)

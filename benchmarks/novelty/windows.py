@@ -1,0 +1,138 @@
+"""Scores of many windows of the paper's loop, closed on its noise: what sequences are drawn from."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.estimator_figures import FLOOR
+from servotwin.analysis.maps.pool import shared
+from servotwin.commissioning.novelty import model_of
+from servotwin.edge.novelty.score import score
+from servotwin.estimation.window import Window
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array, SquareWave
+from servotwin.simulation import simulate
+
+RATE, SECONDS = 5000.0, 1.0
+STEP, AMPLITUDE = 5.0, 1e-3  # s from one change of the reference to the next, m
+CHUNK = 20  # windows of one run
+TOLD = math.radians(10.0)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the machine is beside what the edge takes it for.
+
+    Attributes
+    ----------
+    name : str
+    noise : Noise or None
+        On the measured position, in the loop; a white floor of 1 um comes on top.
+    k, c : float
+        Stiffness and damping of the machine over those of the edge's model.
+    """
+
+    name: str
+    noise: Noise | None
+    k: float = 1.0
+    c: float = 1.0
+
+
+PAPER_NOISE = Noise(0.22e-3)
+CONDITIONS = (
+    Condition("paper's noise", PAPER_NOISE),
+    Condition("paper's noise, k + 1 %, c + 20 %", PAPER_NOISE, 1.01, 1.2),
+    Condition("1 um", None),
+    Condition("1 um, k + 1 %, c + 20 %", None, 1.01, 1.2),
+)
+
+
+class Task(NamedTuple):
+    """So many windows of one machine at a gap (rad)."""
+
+    condition: Condition
+    gap: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Scores at one gap, those after steps up and those after steps down.
+
+    Attributes
+    ----------
+    gap : float
+        rad, the true one.
+    scores : (2, n, 2) array
+        Estimate and standard deviation, rad.
+    silent : int
+        Windows that said nothing.
+    """
+
+    gap: float
+    scores: Array
+    silent: int
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Array:
+        """(count, 2) with replacement, steps up and down in turns."""
+        which = rng.integers(0, self.scores.shape[1], count)
+        return np.asarray(self.scores[np.arange(count) % 2, which])
+
+
+def pools(condition: Condition, gaps: Sequence[float], counts: Sequence[int], seed: int) -> Iterator[Pool]:
+    """One pool for each gap (rad), of at least so many windows."""
+    tasks = [
+        Task(condition, gap, seed + 1000 * place + chunk)
+        for place, (gap, count) in enumerate(zip(gaps, counts, strict=True))
+        for chunk in range(-(-count // CHUNK))
+    ]
+    found = dict(shared(scored, tasks))
+    for gap in gaps:
+        rows = [row for task in tasks if task.gap == gap for row in found[task]]
+        said = [[s[1:] for s in rows if s[0] == way and math.isfinite(s[1])] for way in (0, 1)]
+        few = min(map(len, said))
+        yield Pool(gap, np.array([way[:few] for way in said]), len(rows) - sum(map(len, said)))
+
+
+def scored(task: Task) -> list[tuple[int, float, float]]:
+    """Of each window: after which kind of step, estimate, standard deviation; NaN where it says nothing."""
+    known = Servo.preset("paper")
+    model, rng = model_of(known, RATE), np.random.default_rng(task.seed)
+    rows = []
+    for number, window in enumerate(recorded(task, known)):
+        assert window.theta_m is not None
+        position = window.position + FLOOR * rng.standard_normal(window.position.size)
+        found = score(array("d", window.theta_m), array("d", position), model, TOLD)
+        rows.append((number % 2, math.nan, math.nan) if found is None else (number % 2, found.gap, found.std))
+    return rows
+
+
+def recorded(task: Task, known: Servo) -> Iterator[Window]:
+    """The windows after the steps of one run, in a dead zone for what the twin was told."""
+    condition = task.condition
+    plant = known.replace(k=_times(known.k, condition.k), c=_times(known.c, condition.c))
+    law = known.controller
+    run = simulate(
+        plant,
+        STEP * (CHUNK + 1) + SECONDS,
+        controller=law if condition.noise is None else law.replace(sample_rate=RATE, loop_filter_hz=20.0),
+        reference=SquareWave(AMPLITUDE, 2.0 * STEP),
+        gap=task.gap,
+        tolerance=known.tolerance_for(TOLD),
+        noise=condition.noise,
+        seed=task.seed,
+        theta_d0=float(np.random.default_rng(task.seed).uniform(-0.5, 0.5)) * task.gap,
+    )
+    for number in range(CHUNK):
+        yield Window.from_run(run, STEP * (number + 1), SECONDS)
+
+
+def _times(values: float | tuple[float, ...], factor: float) -> float | tuple[float, ...]:
+    return tuple(factor * value for value in values) if isinstance(values, tuple) else factor * values

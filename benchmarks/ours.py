@@ -1,0 +1,125 @@
+"""servotwin as a contestant, and its finer runs that all answers are compared with."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.contest import Contestant
+from benchmarks.workloads import Noisy, Sweep, Wear
+from servotwin.hybrid.automaton import Array
+from servotwin.simulation import Run, Simulation, simulate
+from servotwin.simulation.continuous import ContinuousEngine
+from servotwin.simulation.ensemble import simulate_ensemble
+
+NAME = "servotwin"
+REFINED = 4  # how much finer the reference runs search for events
+PERTURBATION = 1e-12  # of the step
+SENSITIVE = 1e-9  # of the step: members that the perturbation moves farther than this are not compared
+
+
+def run_wear(workload: Wear) -> Run:
+    """W1's run."""
+    return simulate(
+        workload.servo,
+        workload.duration,
+        reference=workload.reference,
+        gap=workload.gap,
+        tolerance=workload.tolerance,
+        sample_rate=workload.sample_rate,
+    )
+
+
+def run_noisy(workload: Noisy, sample_rate: float | None = None) -> Run:
+    """The sampled run, recorded at its own rate or at a multiple of it."""
+    wear = workload.wear
+    return simulate(
+        wear.servo,
+        wear.duration,
+        controller=workload.controller,
+        reference=wear.reference,
+        gap=wear.gap,
+        tolerance=wear.tolerance,
+        sample_rate=sample_rate or wear.sample_rate,
+        noise=workload.noise,
+        seed=workload.seed,
+    )
+
+
+def wearing(workload: Wear) -> Contestant:
+    """W1."""
+
+    def remark() -> str:
+        return f"{int(run_wear(workload).events.state_triggered.sum())} events"
+
+    return Contestant(NAME, lambda: lambda: run_wear(workload).position, remark=remark)
+
+
+def noisy(workload: Noisy) -> Contestant:
+    """The sampled run."""
+    return Contestant(NAME, lambda: lambda: run_noisy(workload).position)
+
+
+def sweeping(workload: Sweep, threads: int) -> Contestant:
+    """W2."""
+    gaps, tolerances = workload.members
+    servo, duration = workload.servo, workload.duration
+
+    def job() -> Array:
+        return simulate_ensemble(
+            servo, duration, workload.step, gaps, tolerances, sample_rate=workload.sample_rate, threads=threads
+        )
+
+    return Contestant(f"{NAME}, {threads} thread{'s' * (threads > 1)}", lambda: job)
+
+
+@cache
+def refined_wear(workload: Wear) -> Array:
+    """W1's positions (N,) m from a search for events in steps `REFINED` times shorter."""
+    simulation = Simulation(
+        workload.servo,
+        workload.duration,
+        reference=workload.reference,
+        gap=workload.gap,
+        tolerance=workload.tolerance,
+        sample_rate=workload.sample_rate,
+    )
+    return _refined(simulation)
+
+
+@cache
+def refined_noisy(workload: Noisy) -> Array:
+    """The sampled run's positions (N,) m with `REFINED` base steps a tick."""
+    return run_noisy(workload, REFINED * workload.wear.sample_rate).position[::REFINED]
+
+
+@cache
+def refined_sweep(workload: Sweep) -> Array:
+    """W2's positions (K, N) m, each member run by itself and searched `REFINED` times finer."""
+    servo, duration, rate = workload.servo, workload.duration, workload.sample_rate
+    members = zip(*(values.tolist() for values in workload.members), strict=True)
+    runs = [
+        Simulation(servo, duration, reference=workload.step, gap=gap, tolerance=tolerance, sample_rate=rate)
+        for gap, tolerance in members
+    ]
+    return np.array([_refined(run) for run in runs])
+
+
+@cache
+def comparable(workload: Sweep) -> NDArray[np.bool_]:
+    """(K,) members of W2 that a perturbation of the step leaves where they are."""
+    gaps, tolerances = workload.members
+    runs = [
+        simulate_ensemble(workload.servo, workload.duration, step, gaps, tolerances, sample_rate=workload.sample_rate)
+        for step in (workload.step, workload.step * (1.0 + PERTURBATION))
+    ]
+    moved = np.max(np.abs(runs[1] - runs[0]), axis=1)
+    return np.asarray(moved <= SENSITIVE * workload.step)
+
+
+def _refined(simulation: Simulation) -> Array:
+    engine = ContinuousEngine(simulation.servo, simulation.controller, simulation.inputs, refine=REFINED)
+    engine.advance(simulation.samples - 1)
+    return engine.channel("position", 0, simulation.samples)

@@ -1,0 +1,49 @@
+"""Who competes: the policies, and constant controllers among which the best is chosen with hindsight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+from benchmarks.policies.trial import Told
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
+from servotwin.redesign.policy import PaperPolicy
+from servotwin.redesign.setting import Setting
+
+POLICIES = ("no dead zone", "paper", "margin", "hysteresis", "certified")
+_NOT_BOUND = 100.0
+
+
+@cache
+def contender(name: str, model: Servo, known: Uncertainty) -> Told:
+    """A policy by name, with the model and what is stated of it."""
+    own = Setting(model.controller)
+    if name == "no dead zone":
+        return Told(None, own)
+    if name == "paper":
+        return Told(PaperPolicy(model), own)
+    if name == "margin":
+        return Told(MarginPolicy(model, known.step), own)
+    if name == "hysteresis":
+        return Told(HysteresisPolicy(model), own)
+    certified = CertifiedPolicy(model, known)
+    return Told(certified, certified.fallback().setting)
+
+
+def constants(model: Servo, known: Uncertainty) -> dict[str, Setting]:
+    """Constant settings by name: what `certified` chooses from, without its bound on Ms, and the paper's gains with
+    dead zones for gaps of 10, 30 and 60 deg."""
+    policy = CertifiedPolicy(model, known)
+    demands = replace(policy.demands, Ms=_NOT_BOUND)
+    own, found = model.controller, {}
+    for setting in candidates_of(model, demands, 0.0, disturbed=True, noisy=False):
+        law = setting.controller
+        found[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
+    for share in (1.0 / 6.0, 0.5, 1.0):
+        width = model.tolerance_for(share * known.gap[1], 1.5)
+        found[f"own gains, dead zone {width * 1e3:.3g} mm"] = Setting(own, width)
+    return found

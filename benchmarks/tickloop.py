@@ -1,0 +1,160 @@
+"""The gateway's real control loop against a drive that keeps to the clock, in a process of its own; prints JSON.
+
+`python -m benchmarks.tickloop RATE SECONDS MOVING PRIORITY FOLDER`: nothing of numpy is imported, as at a gateway.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from math import sin
+from pathlib import Path
+from typing import Any
+
+from servotwin.control.controller import Controller
+from servotwin.edge.cut import Cut
+from servotwin.edge.drive import Sample
+from servotwin.edge.packing import CHANNELS, pack
+from servotwin.edge.recorder import as_floats
+from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.edge.verdict import FallbackSet
+from servotwin.edge.watch import WatchSettings
+from servotwin.edge_process.child import LinkChild, starter
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.edge_process.config_file import edge_toml
+from servotwin.edge_process.control import Controlling
+from servotwin.edge_process.edge import Edge
+from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.edge_process.run import calm, hurry
+from servotwin.edge_process.ticks import Counts, summary
+from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.messages import Band
+
+STEP_S = 2.0
+_REPEATS = 20
+
+
+class PacedDrive:
+    """Samples at fixed instants; an instant that is missed by a whole period is a sample missed, as at a machine.
+
+    Parameters
+    ----------
+    rate : float
+        Hz.
+    seconds : float
+    moving : bool
+        Whether the reference always moves, so that windows are cut one after the other; or steps now and then.
+    """
+
+    machine, lag = "paced", 0.0
+
+    def __init__(self, rate: float, seconds: float, moving: bool) -> None:
+        self.rate = rate
+        self.wake, self.answer, self.whole = Counts(), Counts(), Counts()
+        self.overruns = self.missed = 0
+        self._end, self._moving = round(rate * seconds), moving
+        self._number, self._position, self._zero, self._woken = 0, 0.0, 0.0, 0.0
+
+    def connect(self) -> None:
+        """The clock starts."""
+        self._zero = time.perf_counter()
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+    def read(self) -> Sample | None:
+        """Wait for the next instant."""
+        now = time.perf_counter()
+        if self._number > 0:
+            self.whole.add(now - self._woken)
+            self.overruns += now - self._woken > 1.0 / self.rate
+        due = self._zero + self._number / self.rate
+        if due > now:
+            time.sleep(due - now)
+        self._woken = time.perf_counter()
+        self.wake.add(self._woken - due)
+        late = int((self._woken - due) * self.rate)
+        self.missed += late
+        number = self._number + late
+        self._number = number + 1
+        return None if number >= self._end else Sample(number, self._wanted(number), self._position, self._position)
+
+    def write(self, voltage: float) -> None:
+        """A machine that follows its voltage."""
+        self.answer.add(time.perf_counter() - self._woken)
+        self._position += 1e-6 * voltage
+
+    def _wanted(self, number: int) -> float:
+        time_s = number / self.rate
+        return 1e-3 * sin(time_s) if self._moving else 1e-3 * (int(time_s / STEP_S) % 2)
+
+
+def config(rate: float, folder: Path) -> EdgeConfig:
+    """An edge that watches its loop, as a certified one does, and has no twin."""
+    law = Controller(500.0, 0.0, -50.0, 0.1, voltage_limit=10.0, sample_rate=rate)
+    watched = Supervision(FallbackSet(1e-4, band=Band(1.0, 1.0, 100.0, 3.0)), WatchSettings())
+    agent = AgentSettings("axis-1", UNBOOTED, rate, supervision=watched, fine_angle=True)
+    return EdgeConfig(agent, "control", law, {"kind": "simulated"}, folder=folder)
+
+
+def measured(rate: float, seconds: float, moving: bool, priority: int, folder: Path) -> dict[str, Any]:
+    """One run."""
+    settings = config(rate, folder)
+    file = folder / "edge.toml"
+    file.write_text(edge_toml(settings), encoding="utf-8")
+    drive, outlet = PacedDrive(rate, seconds, moving), PipeOutlet(False)
+    child = LinkChild(starter(file), outlet)
+    edge = Edge(settings, "bench", outlet, child, None, time.perf_counter, time.sleep)
+    role = Controlling(edge, drive)
+    child.tend(edge.clock())
+    time.sleep(1.0)  # until it listens: its start is not what is measured
+    calm()
+    hurried = hurry(priority)
+    drive.connect()
+    while role.step():
+        pass
+    edge.finish(10.0)
+    child.close()
+    windows = edge.agent.windows_cut
+    told = {"rate_hz": rate, "moving": moving, "realtime": hurried, "windows": windows}
+    return {**told, **_result(drive, edge), "load": os.getloadavg()[0]}
+
+
+def _result(drive: PacedDrive, edge: Edge) -> dict[str, Any]:
+    times = {"wake": drive.wake, "answer": drive.answer, "whole": drive.whole}
+    told = {name: summary(counts.dumps(), counts.longest) for name, counts in times.items()}
+    return {**told, "overruns": drive.overruns, "missed": drive.missed, "dropped": dict(edge.agent.dropped)}
+
+
+def handling(rate: float, folder: Path) -> dict[str, float]:
+    """Median times, s, of what the link process does with a window of 1 s."""
+    settings = config(rate, folder)
+    samples = round(rate)
+    values = {
+        name: as_floats([1e-3 * sin(k * (3 + m) * 1e-3) for k in range(samples)]) for m, name in enumerate(CHANNELS)
+    }
+    box = SqliteOutbox(folder / "put.sqlite", "axis-1")
+    packs, puts = [], []
+    for k in range(_REPEATS):
+        begin = time.perf_counter()
+        window = pack(Cut(0, k, "reference", 0, 0.0, values), replace(settings.agent, boot="bench"))
+        middle = time.perf_counter()
+        box.put(window)
+        packs.append(middle - begin)
+        puts.append(time.perf_counter() - middle)
+    box.close()
+    return {"pack_s": sorted(packs)[_REPEATS // 2], "put_s": sorted(puts)[_REPEATS // 2]}
+
+
+def main(arguments: list[str]) -> None:
+    """Measure, print."""
+    rate, seconds, moving, priority = float(arguments[0]), float(arguments[1]), arguments[2] == "1", int(arguments[3])
+    folder = Path(arguments[4])
+    print(json.dumps({**measured(rate, seconds, moving, priority, folder), **handling(rate, folder)}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,1 @@
+"""Limit cycles, stability maps and controller tuning."""

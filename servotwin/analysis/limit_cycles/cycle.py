@@ -1,0 +1,199 @@
+"""Limit cycles of the loop with backlash, exact, with or without a dead zone: shooting on the hybrid automaton.
+
+Three things keep Newton's method on solid ground. Lengths are divided by the gap, since the loop is homogeneous: so
+the amplitude is exactly proportional to the gap. Neutral directions are removed: states that no flow changes stay
+fixed, and a constant reference is shifted away where the loop allows it. And a symmetric orbit is closed after half a
+period by its mirror image. What is found is then flown for a period by the event simulation, on half its search step:
+only an orbit that closes there is returned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from servotwin.analysis.limit_cycles.orbit import Orbit
+from servotwin.analysis.limit_cycles.poincare import Firing, LostOrbit, Section, fired
+from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
+from servotwin.analysis.limit_cycles.shooting import Found, closed_orbit
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.trajectory import Trajectory, ZenoError
+from servotwin.plant.servo import Servo
+
+# The first look takes so many of the loop's own times, every further one twice as many, since with little integral
+# action a cycle is that slow.
+_FIRST_LOOK, _LOOKS = 32, 8
+# Motion below this part of the gap (or of the tolerance) is rest; above this part it runs away.
+_REST, _AWAY = 1e-9, 1e9
+# Without integral action the motor crosses the gap ever more slowly, and never rests. It counts as settling when the
+# position moves by less than this part of p gap in the later half of all looks, and by less than a quarter of before.
+_CREEP = 1e-3
+# Distance, in parts of each state's size, from which a stable orbit is taken for where the tail goes; and at which the
+# tail is on an orbit that does not attract.
+_NEAR, _ON_IT = 0.1, 1e-6
+
+
+class CycleStatus(Enum):
+    """How a search ended."""
+
+    CYCLE = "limit cycle"
+    SETTLES = "settles"
+    DIVERGES = "diverges"
+    IRREGULAR = "does not repeat"
+    CHATTERS = "chatters"
+
+
+@dataclass(frozen=True)
+class CycleResult:
+    """What a search found.
+
+    Attributes
+    ----------
+    status : CycleStatus
+    orbit : Orbit or None
+        Only with `CycleStatus.CYCLE`.
+    reason : str
+        Why there is no orbit; empty otherwise.
+    """
+
+    status: CycleStatus
+    orbit: Orbit | None
+    reason: str
+
+
+def limit_cycle(
+    servo: Servo,
+    gap: float,
+    tolerance: float | None = None,
+    controller: Controller | None = None,
+    step: float = 1e-3,
+) -> CycleResult:
+    """The limit cycle that the loop ends on after a reference step from rest, if it does.
+
+    Parameters
+    ----------
+    servo : Servo
+    gap : float
+        rad, total gap, constant.
+    tolerance : float, optional
+        m, half-width of the dead zone; None or 0: no dead zone.
+    controller : Controller, optional
+        Continuous; the servo's own by default.
+    step : float
+        m, size of the step; the reference is constant after it. With a dead zone the loop has several ends, and
+        which one is reached depends on it.
+
+    Returns
+    -------
+    CycleResult
+
+    Raises
+    ------
+    InvalidInput
+        The controller is sampled or has a rate limit, or a number is outside its range.
+    """
+    if not (math.isfinite(step) and step != 0.0):
+        raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
+    loop = scaled_loop(servo, gap, tolerance, controller, step)
+    law = servo.controller if controller is None else controller
+    if gap == 0.0 and not tolerance and law.voltage_limit is None:
+        return _linear(servo, law)
+    try:
+        return _searched(loop)
+    except ZenoError as error:
+        return CycleResult(CycleStatus.CHATTERS, None, str(error))
+
+
+def _linear(servo: Servo, controller: Controller) -> CycleResult:
+    """Without gap, dead zone and limit there is nothing to run: the poles tell."""
+    if servo.closed_loop(controller).is_stable():
+        return CycleResult(CycleStatus.SETTLES, None, "without gap, dead zone and limit the loop is linear and stable")
+    return CycleResult(CycleStatus.DIVERGES, None, "without gap, dead zone and limit the loop is linear and not stable")
+
+
+def _searched(loop: ScaledLoop) -> CycleResult:
+    reason, elapsed, moved = "", 0.0, []
+    for run, swing, travel in _tails(loop):
+        elapsed += run.time
+        moved.append(travel)
+        if not np.isfinite(swing):
+            reason = f"the motion grows beyond any bound within {elapsed:.4g} s"
+            return CycleResult(CycleStatus.DIVERGES, None, reason)
+        if swing <= _REST * loop.extent:
+            return CycleResult(CycleStatus.SETTLES, None, f"motor and position rest after at most {elapsed:.4g} s")
+        try:
+            found = _followed(loop, run)
+        except LostOrbit as error:
+            reason = str(error)
+            continue
+        if (found.orbit.stable and found.distance < _NEAR) or found.distance < _ON_IT:
+            return CycleResult(CycleStatus.CYCLE, found.orbit, "")
+        kind = "a stable" if found.orbit.stable else "an unstable"
+        reason = f"{kind} orbit at {found.orbit.frequency:.6g} Hz is {found.distance:.2g} of its size away"
+    late = max(moved[_LOOKS // 2 :])
+    if late < _CREEP * loop.extent and late < 0.25 * max(moved[1 : _LOOKS // 2]):
+        reason = f"the motor still creeps across the gap, but the position moves by {late * loop.unit:.2g} m at last"
+        return CycleResult(CycleStatus.SETTLES, None, reason)
+    return CycleResult(CycleStatus.IRREGULAR, None, f"no orbit is reached within {elapsed:.4g} s: {reason}")
+
+
+def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
+    """Stretch after stretch of one run, each with the half peak-to-peak in its second half of the position or of the
+    motor's travel, the larger (while the motor crosses the gap the position rests, but not for good), and with the
+    half peak-to-peak of the position."""
+    state, mode = loop.state, loop.mode
+    for look in range(_LOOKS):
+        run = Trajectory(loop.loop.automaton, state, mode, loop.sample_step)
+        samples = _FIRST_LOOK * 2**look * LOOKS
+        for part in range(1, _FIRST_LOOK + 1):
+            run.advance(samples // _FIRST_LOOK * part)
+            if not float(np.max(np.abs(run.state))) <= _AWAY * float(np.max(np.abs(loop.state))):
+                yield run, np.inf, np.inf
+                return
+        position = 0.5 * run.sampled(loop.loop.rows["position"])
+        motor = 0.5 * loop.extent * run.sampled(loop.loop.rows["theta_m"], samples // 2)
+        yield run, float(max(np.ptp(position[samples // 2 :]), np.ptp(motor))), float(np.ptp(position))
+        state, mode = run.state, run.mode
+
+
+def _followed(loop: ScaledLoop, run: Trajectory) -> Found:
+    """The orbit that the events of a tail suggest."""
+    times, firings = fired(run)
+    length = _repeating(firings)
+    last, last_times = firings[-length - 1 :], times[-length - 1 :]
+    # An event set off by another at the same instant has no guard of its own to section the flow with.
+    own = [last[i] for i in range(1, length + 1) if last_times[i] > last_times[i - 1]]
+    first = min(own, key=last[1:].count)
+    horizon = 3.0 * (last_times[-1] - last_times[0]) + loop.time
+    section = Section(loop.loop.automaton, first, first, last[1:].count(first), loop.sample_step, horizon)
+    start = section.approach(run.state, run.mode)
+    states = run.record.state[: run.record.size[0]]
+    scale = np.max(np.abs(states[len(states) // 2 :]), axis=0)
+    scale[scale == 0.0] = 1.0
+    half = loop.mirror is not None and _mirrored(last[1:], loop.mirror.firings)
+    try:
+        found = closed_orbit(loop, section, start, scale, half)
+        if found.orbit.stable or not half:
+            return found
+    except LostOrbit:
+        if not half:
+            raise
+    return closed_orbit(loop, section, start, scale, False)
+
+
+def _repeating(firings: list[Firing]) -> int:
+    """Length of the shortest pattern that the last events repeat twice after its first time."""
+    for length in range(1, len(firings) // 3 + 1):
+        if firings[-length:] == firings[-2 * length : -length] == firings[-3 * length : -2 * length]:
+            return length
+    raise LostOrbit(f"the last {len(firings)} events do not repeat")
+
+
+def _mirrored(pattern: list[Firing], firings: dict[Firing, Firing]) -> bool:
+    half, odd = divmod(len(pattern), 2)
+    return not odd and [firings[firing] for firing in pattern[:half]] == pattern[half:]

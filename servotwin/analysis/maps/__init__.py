@@ -1,0 +1,1 @@
+"""Stability maps: which dead zones settle, over gap, tolerance and amplitude."""

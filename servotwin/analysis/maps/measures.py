@@ -1,0 +1,156 @@
+"""Stability maps: ensembles of initial states in every cell, each run exact, reduced to what one wants to know."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.analysis.limit_cycles.scaled import characteristic_time
+from servotwin.analysis.maps.axes import Cells
+from servotwin.analysis.maps.settings import SHORT_WINDOW, MapSettings
+from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.ensemble import run_ensemble
+from servotwin.hybrid.trajectory import ZenoError
+from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
+from servotwin.simulation.continuous import controller_constants
+
+# Around where the position ends, in parts of the reference step: the usual five per cent.
+SETTLING_BAND = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """What the members of each cell did, (N,) each.
+
+    Attributes
+    ----------
+    settled : array
+        Share of the members whose half peak-to-peak in the final window is below `MapSettings.still`.
+    settled_short : array
+        The same of the last ten seconds only (of the final window, if that is shorter). Where it is larger, there are
+        members that rest and move on.
+    error : array
+        m, largest absolute error of any member in the final window: the steady error of those that settled.
+    swing : array
+        m, largest half peak-to-peak in the final window.
+    settling : array
+        s, the latest time from which a member's position stays within 5 % of the step about its mean in the final
+        window; inf where one does not through all of that window.
+    effort : array
+        V, root mean square of the voltage over all members and the whole run.
+    """
+
+    settled: Array
+    settled_short: Array
+    error: Array
+    swing: Array
+    settling: Array
+    effort: Array
+
+
+MEASURES = tuple(field.name for field in fields(Measures))
+
+
+def measured(settings: MapSettings, chunk: range) -> Measures:
+    """Run all members of some cells, in this thread; the same numbers however the cells are put together."""
+    cells = Cells(*(values[chunk.start : chunk.stop] for values in settings.axes.cells(settings.servo)))
+    position, voltage = trajectories(settings, cells, chunk)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
+        return _reduced(settings, cells.amplitude[:, None, None], position, voltage)
+
+
+def joined(parts: list[Measures]) -> Measures:
+    """Measures of cells that follow one another."""
+    return Measures(*(np.concatenate([getattr(part, name) for part in parts]) for name in MEASURES))
+
+
+def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Array, Array]:
+    """Position (m) and voltage (V), each (cells, members, samples)."""
+    loop = automaton(settings)
+    states = starts(settings, loop, cells, chunk).reshape(-1, len(loop.automaton.names))
+    modes, rows = _modes(settings, loop, states), np.array([loop.rows["position"], loop.rows["voltage"]])
+    try:
+        found, _ = run_ensemble(
+            loop.automaton, states, modes, 1.0 / settings.sample_rate, settings.samples, rows, threads=1
+        )
+    except ZenoError as error:
+        raise InvalidInput(f"map cells {chunk.start} to {chunk.stop - 1}: {error}") from None
+    position, voltage = np.moveaxis(found.reshape(len(chunk), settings.members, 2, -1), 2, 0)
+    return position, voltage
+
+
+def automaton(settings: MapSettings) -> ServoAutomaton:
+    """Plant and law together, with a dead zone."""
+    law = settings.law
+    return continuous_loop(settings.servo, law, Shape(feedforward=law.feedforward != 0.0))
+
+
+def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: range) -> Array:
+    """(cells, members, n) initial states."""
+    servo, index = settings.servo, loop.automaton.index
+    draws = np.array([_draws(settings, cell) for cell in chunk])
+    step, omega = cells.amplitude[:, None], 2.0 * math.pi / characteristic_time(servo, settings.law)
+    states = np.zeros((*draws.shape[:2], len(loop.automaton.names)))
+    screw = 0.5 * cells.gap[:, None] * draws[:, :, 0]
+    states[:, :, index("theta_d")] = screw
+    rest = servo.chain().equilibrium(servo.p)
+    states[:, :, index("chain0") : index("chain0") + rest.size] = screw[:, :, None] * rest
+    states[:, :, index("speed")] = settings.motion * draws[:, :, 1] * step * omega / servo.p
+    states[:, :, index("integral")] = settings.motion * draws[:, :, 2] * step * settings.law.Ki / omega
+    for name, value in zip(("gap", "tolerance", "reference"), cells, strict=True):
+        states[:, :, index(name)] = value[:, None]
+    for name, constant in controller_constants(settings.law).items():
+        if name in loop.automaton.names:
+            states[:, :, index(name)] = constant
+    if settings.law.loop_filter_hz is not None:
+        states[:, :, index("filtered")] = states @ loop.rows["position"][0]
+    return states
+
+
+def _draws(settings: MapSettings, cell: int) -> Array:
+    """(members, 3) in -1 .. 1: screw in the gap, motor speed, integral."""
+    # What SeedSequence(seed).spawn(...)[cell] would be: a cell's numbers do not depend on which others are computed.
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(cell,)))
+    draws = rng.uniform(-1.0, 1.0, (settings.members, 3))
+    draws[0] = 0.0
+    draws[1::2, 1:] = 0.0
+    return draws
+
+
+def _modes(settings: MapSettings, loop: ServoAutomaton, states: Array) -> NDArray[np.int64]:
+    """(K,) modes at time 0: closed, unless the error is already small enough to open the loop."""
+    error = states @ loop.rows["error"][0]
+    inside = np.abs(error) <= settings.law.enter * states[:, loop.automaton.index("tolerance")]
+    return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))
+
+
+def _reduced(settings: MapSettings, step: Array, position: Array, voltage: Array) -> Measures:
+    """`step` is (cells, 1, 1)."""
+    tail = _tail(position, settings.window * settings.sample_rate)
+    short = _tail(tail, SHORT_WINDOW * settings.sample_rate)
+    swing, swing_short = (0.5 * np.ptp(each, axis=2) for each in (tail, short))
+    inside = np.abs(position - tail.mean(axis=2, keepdims=True)) <= SETTLING_BAND * step
+    since = _since(inside) / settings.sample_rate
+    settling = np.where(since <= settings.duration - settings.window, since, np.inf)
+    return Measures(
+        np.mean(swing < settings.still, axis=1),
+        np.mean(swing_short < settings.still, axis=1),
+        np.abs(step - tail).max(axis=(1, 2)),
+        swing.max(axis=1),
+        settling.max(axis=1),
+        np.sqrt(np.mean(voltage**2, axis=(1, 2))),
+    )
+
+
+def _tail(values: Array, samples: float) -> Array:
+    return values[:, :, -(round(samples) + 1) :]
+
+
+def _since(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Index along the last axis from which on all is True; its length where the last one is not."""
+    count = inside.shape[-1]
+    return np.where(inside.all(axis=-1), 0, count - np.argmin(inside[..., ::-1], axis=-1))

@@ -1,0 +1,72 @@
+"""A finished map: its measures on the grid, and its files of numbers."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.analysis.maps.axes import RatioAxes, Values, axis_names, axis_values
+from servotwin.analysis.maps.measures import MEASURES, Measures
+from servotwin.analysis.maps.settings import MapSettings
+from servotwin.hybrid.automaton import Array
+from servotwin.runtime import files
+
+_UNITS = {"error": "_m", "swing": "_m", "settling": "_s", "effort": "_v"}
+_AXIS_UNITS = {"gap": "_rad", "estimate": "_rad", "k_dz": "", "amplitude": "_m"}
+
+
+@dataclass(frozen=True, eq=False)
+class StabilityMap:
+    """Settings and measures."""
+
+    settings: MapSettings
+    measures: Measures
+
+    def grid(self, name: str) -> Array:
+        """A measure, shaped as the axes."""
+        values: Array = getattr(self.measures, name)
+        return values.reshape(self.settings.axes.shape)
+
+    @property
+    def slow(self) -> NDArray[np.bool_]:
+        """Cells in which ten seconds call more members settled than the final window does."""
+        return self.grid("settled_short") > self.grid("settled")
+
+    @property
+    def axes(self) -> tuple[tuple[str, Values], ...]:
+        """Every axis: its name and its values."""
+        axes = self.settings.axes
+        return tuple((name, axis_values(axes, name)) for name in axis_names(axes))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the axes and of the measures, with units."""
+        if isinstance(self.settings.axes, RatioAxes):
+            axes = ["tolerance_per_pb", "amplitude_per_pb"]
+        else:
+            axes = [name + _AXIS_UNITS[name] for name, _ in self.axes]
+        return (*axes, *(name + _UNITS.get(name, "") for name in MEASURES))
+
+
+def write_numbers(found: StabilityMap, directory: Path) -> None:
+    """map.npz, the axes and the measures shaped as they are, and map.csv, one line per cell."""
+    names, count = found.columns, len(found.axes)
+    arrays = {name: np.array(values) for name, (_, values) in zip(names, found.axes, strict=False)}
+    arrays |= {name: found.grid(measure) for name, measure in zip(names[count:], MEASURES, strict=True)}
+    with files.written(directory / "map.npz") as temporary:
+        np.savez(temporary, allow_pickle=False, fingerprint=np.array(found.settings.fingerprint), **arrays)
+    with files.written(directory / "map.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([names, *_lines(found)])
+
+
+def _lines(found: StabilityMap) -> Iterator[list[str]]:
+    cells = product(*(values for _, values in found.axes))
+    measures = zip(*(getattr(found.measures, name).tolist() for name in MEASURES), strict=True)
+    for cell, row in zip(cells, measures, strict=True):
+        yield [repr(value) for value in (*cell, *row)]

@@ -1,0 +1,144 @@
+"""What a stability map is made of: servo, controller, axes, initial states, durations."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from servotwin.analysis.limit_cycles.scaled import characteristic_time
+from servotwin.analysis.maps.axes import Axes, as_lists, axis_names
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+
+# To be raised whenever the same settings would give other numbers.
+FORMAT = 1
+SHORT_WINDOW = 10.0
+MAX_SAMPLES = 200_000
+# Of all members of a chunk: a quarter of a second's work, 16 MB of position and voltage.
+_SAMPLES_PER_CHUNK = 1_000_000
+# Per turn at the loop's crossover: a limit cycle's peak is missed by half a per cent at most.
+_LOOKS = 32
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """A stability map.
+
+    Parameters
+    ----------
+    servo : Servo
+    axes : RatioAxes or PhysicalAxes
+    controller : Controller, optional
+        Continuous; the servo's own by default.
+    members : int
+        Initial states in each cell. The first is at rest with the screw in the middle of the gap (the paper's); all
+        others have the screw anywhere in the gap, and every second of those is in motion.
+    motion : float
+        Extent of that motion: uniform within this many step * crossover / p of motor speed and Ki * step / crossover
+        of integral action, what an error of one step makes in one radian of the crossover. 0: all start from rest.
+    seed : int
+        Of the initial states; each cell has a generator of its own.
+    duration : float
+        s, of every run.
+    window : float
+        s, the end of the run in which it is looked at. A loop with integral action may rest for more than ten seconds
+        and move on, in cycles of 27 s.
+    still : float
+        m; a run has settled when half the peak-to-peak of the position in the window is below this.
+
+    Raises
+    ------
+    InvalidInput
+        A value is outside its range, the controller is sampled or does not even stabilise the servo without a gap.
+    """
+
+    servo: Servo
+    axes: Axes
+    controller: Controller | None = None
+    members: int = 16
+    motion: float = 1.0
+    seed: int = 0
+    duration: float = 120.0
+    window: float = 40.0
+    still: float = 1e-6
+
+    def __post_init__(self) -> None:
+        _check_law(self.law)
+        self.servo.check_loop(self.law)
+        for name, least in (("members", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise InvalidInput(f"map {name} = {value!r}: must be an integer of {least} or more")
+        for name, unit in (("duration", "s"), ("window", "s"), ("still", "m")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InvalidInput(f"map {name} = {value!r} {unit}: must be finite and greater than 0")
+        if not (math.isfinite(self.motion) and self.motion >= 0.0):
+            raise InvalidInput(f"map motion = {self.motion!r}: must be finite and 0 or more")
+        if self.window > self.duration:
+            raise InvalidInput(f"map window = {self.window:g} s: must be at most the duration, {self.duration:g} s")
+        if self.samples > MAX_SAMPLES:
+            raise InvalidInput(
+                f"map duration = {self.duration:g} s: is {self.samples} samples of this loop, at"
+                f" {self.sample_rate:g} Hz; at most {MAX_SAMPLES} are allowed"
+            )
+
+    @property
+    def law(self) -> Controller:
+        """The controller that runs."""
+        return self.servo.controller if self.controller is None else self.controller
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return math.prod(self.axes.shape)
+
+    @property
+    def sample_rate(self) -> float:
+        """Hz, of what the measures are taken from; events are located exactly whatever it is."""
+        return math.ceil(_LOOKS / characteristic_time(self.servo, self.law))
+
+    @property
+    def samples(self) -> int:
+        """Of a run, both ends included."""
+        return round(self.duration * self.sample_rate) + 1
+
+    @property
+    def chunks(self) -> tuple[range, ...]:
+        """The cells in pieces that are computed, and kept, together."""
+        size = max(1, _SAMPLES_PER_CHUNK // (self.members * self.samples))
+        return tuple(range(first, min(first + size, self.count)) for first in range(0, self.count, size))
+
+    def described(self) -> dict[str, Any]:
+        """Everything that the numbers depend on, as plain values with their units in the keys."""
+        return {
+            "format": FORMAT,
+            "servo": self.servo.dumps(),
+            "controller": asdict(self.law),
+            "axes": list(axis_names(self.axes)),
+            **{f"axis_{name}": values for name, values in as_lists(self.axes).items()},
+            "members": self.members,
+            "motion": self.motion,
+            "seed": self.seed,
+            "duration_s": self.duration,
+            "window_s": self.window,
+            "still_m": self.still,
+        }
+
+    @property
+    def fingerprint(self) -> str:
+        """Sixteen hexadecimal digits that name these settings."""
+        return hashlib.sha256(json.dumps(self.described(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _check_law(law: Controller) -> None:
+    for name in ("sample_rate", "rate_limit"):
+        if getattr(law, name) is not None:
+            value = getattr(law, name)
+            raise InvalidInput(
+                f"controller {name} = {value:g}: maps are those of the continuous law; give {name} = None"
+            )

@@ -1,0 +1,103 @@
+"""Finished pieces of a map on the disk, so that an interrupted map goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servotwin.analysis.maps.measures import MEASURES, Measures
+from servotwin.analysis.maps.settings import MapSettings
+from servotwin.errors import InvalidInput
+from servotwin.runtime import files
+
+
+@dataclass(frozen=True)
+class Store:
+    """The folder of one map: settings.json and chunks/NNNNNN.npz, each with the fingerprint of its settings.
+
+    Parameters
+    ----------
+    directory : Path
+        Made if missing.
+    settings : MapSettings
+
+    Raises
+    ------
+    InvalidInput
+        The folder cannot be written, or holds a map with other settings.
+    """
+
+    directory: Path
+    settings: MapSettings
+
+    def __post_init__(self) -> None:
+        files.make_directory(self.directory)
+        files.make_directory(self._folder)
+        path = self.directory / "settings.json"
+        # As it is read back: tuples have become lists.
+        described = json.loads(json.dumps(self.settings.described()))
+        if path.exists():
+            _compare(path, described)
+        else:
+            files.write_text(path, json.dumps(described, indent=2) + "\n")
+
+    @property
+    def _folder(self) -> Path:
+        return self.directory / "chunks"
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.npz"
+
+    def keep(self, number: int, measures: Measures) -> None:
+        """Write one piece, whole or not at all."""
+        values = {name: getattr(measures, name) for name in MEASURES}
+        with files.written(self._path(number)) as temporary:
+            np.savez(temporary, allow_pickle=False, fingerprint=np.array(self.settings.fingerprint), **values)
+
+    def kept(self, number: int) -> Measures | None:
+        """A piece, if it is there and whole.
+
+        Raises
+        ------
+        InvalidInput
+            It belongs to a map with other settings.
+        """
+        path = self._path(number)
+        try:
+            with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+                fingerprint = str(file["fingerprint"])
+                measures = Measures(*(file[name] for name in MEASURES))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        if fingerprint != self.settings.fingerprint:
+            raise InvalidInput(f"{path}: belongs to a map with other settings; choose another --out")
+        return measures if len(measures.settled) == len(self.settings.chunks[number]) else None
+
+    def missing(self) -> tuple[int, ...]:
+        """Numbers of the pieces that are still to be computed."""
+        return tuple(number for number in range(len(self.settings.chunks)) if self.kept(number) is None)
+
+
+def _compare(path: Path, wanted: dict[str, Any]) -> None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InvalidInput(f"{path}: cannot be read as the settings of a map; choose another --out") from None
+    for key, value in wanted.items():
+        there = found.get(key) if isinstance(found, dict) else None
+        if there != value:
+            raise InvalidInput(
+                f"{path}: this folder holds a map with {_shown(key, there, value)};"
+                " give the same settings to go on with it, or choose another --out"
+            )
+
+
+def _shown(key: str, there: object, value: object) -> str:
+    """What differs, where it is short enough to be said."""
+    words = [json.dumps(each) for each in (there, value)]
+    return f"{key} = {words[0]}, not {words[1]}" if max(map(len, words)) <= 40 else f"another {key}"

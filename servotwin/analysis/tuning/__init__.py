@@ -1,0 +1,1 @@
+"""Tune a controller to a crossover and a phase margin."""

@@ -1,0 +1,160 @@
+"""Tuning a controller to a crossover and a phase margin: what pidtune does, for the law of this package.
+
+Every candidate has the wanted crossover and margin exactly: the angles be and al of `factors` are free, phz follows
+from the phase and K from the modulus of the plant there. Of all stable ones those with the smallest Ms are kept, and of
+these the one with the largest Ki; or, if that is preferred, simply the largest Ki within a bound on Ms.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.analysis.tuning.candidates import Candidate, search
+from servotwin.analysis.tuning.factors import KINDS, Factors
+from servotwin.analysis.tuning.response import FrequencyData, Plant, circled, seen_margins
+from servotwin.config.table import did_you_mean
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.linear import LinearSystem, feedback, gain, pidf, series
+from servotwin.plant.margins import Margins, margins
+
+# Candidates whose Ms is this close to the smallest count as equal, and the largest Ki wins.
+_EQUAL = 1.01
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What is wanted.
+
+    Parameters
+    ----------
+    crossover : float
+        rad/s, where abs(L) = 1.
+    phase_margin : float
+        rad, there; of a P controller, which cannot choose it, the least.
+    kind : str
+        P, PI, PD, PDF, PID or PIDF. PD and PID get the filter 0.01 / crossover, since the law cannot do without.
+    Ms_max : float
+        Largest sensitivity peak that is accepted.
+    prefer : str
+        "Ms": the smallest Ms, then the largest Ki. "Ki": the largest Ki (Kp without integral action) within Ms_max.
+
+    Raises
+    ------
+    InvalidInput
+        A value is outside its range.
+    """
+
+    crossover: float
+    phase_margin: float
+    kind: str = "PIDF"
+    Ms_max: float = math.inf
+    prefer: str = "Ms"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            hint = did_you_mean(self.kind, tuple(KINDS))
+            raise InvalidInput(f"controller type {self.kind!r} does not exist{hint}; give one of {', '.join(KINDS)}")
+        if self.prefer not in ("Ms", "Ki"):
+            raise InvalidInput(f"prefer = {self.prefer!r}: must be 'Ms' or 'Ki'")
+        if not (math.isfinite(self.crossover) and self.crossover > 0.0):
+            raise InvalidInput(f"crossover = {self.crossover!r} rad/s: must be positive and finite")
+        if not 0.0 < self.phase_margin < math.pi:
+            degrees = math.degrees(self.phase_margin)
+            raise InvalidInput(f"phase margin = {degrees:g} deg: must be above 0 and below 180 deg")
+        if not self.Ms_max > 1.0:
+            raise InvalidInput(
+                f"Ms_max = {self.Ms_max!r}: must be above 1, the sensitivity of every loop at high frequency"
+            )
+
+    def cost(self, candidate: Candidate) -> float:
+        """What the search makes small; a candidate beyond Ms_max is worse than any within."""
+        if self.prefer == "Ki" and candidate.Ms <= self.Ms_max:
+            return -candidate.integral
+        return candidate.Ms
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """A controller and what it achieves.
+
+    Attributes
+    ----------
+    controller : Controller
+        Kp, Ki, Kd, Tf; everything else as in the controller that was given, or default.
+    factors : Factors
+        Its phases at the crossover.
+    margins : Margins
+        All crossovers and margins, Ms and bandwidth.
+    candidates, stable : int
+        Candidates looked at, and how many of them were stable.
+    """
+
+    controller: Controller
+    factors: Factors
+    margins: Margins
+    candidates: int
+    stable: int
+
+
+def tune(
+    system: LinearSystem | FrequencyData,
+    specification: Specification,
+    delay: float = 0.0,
+    like: Controller | None = None,
+) -> Tuning:
+    """The best controller of a type with a given crossover and phase margin.
+
+    Parameters
+    ----------
+    system : LinearSystem or FrequencyData
+        Controller output to measurement: ``servo.plant()``, with a loop filter in series where there is one. Stable but
+        for integrators.
+    specification : Specification
+    delay : float
+        s, in series with it.
+    like : Controller, optional
+        Where the dead zone, limits and filter of the result come from.
+
+    Raises
+    ------
+    InvalidInput
+        The plant is unstable, the type cannot give this margin at this crossover, no candidate is stable, or none has
+        Ms_max; one sentence with what can be reached.
+    """
+    plant = Plant(system, delay)
+    wanted = specification
+    found = search(plant, wanted.kind, wanted.crossover, wanted.phase_margin, wanted.cost)
+    best = min(found.kept, key=lambda one: one.Ms)
+    if not best.Ms <= wanted.Ms_max:
+        reached = f"the smallest Ms that a {wanted.kind} controller reaches there is {best.Ms:.3f}"
+        raise InvalidInput(f"Ms_max = {wanted.Ms_max:g}: {reached}; lower the crossover or change the margin")
+    limit = wanted.Ms_max if wanted.prefer == "Ki" else min(_EQUAL * best.Ms, wanted.Ms_max)
+    eager = sorted((one for one in found.kept if one.Ms <= limit), key=lambda one: -one.integral)
+    for candidate in [*eager, best]:
+        law = candidate.factors.controller()
+        achieved = judged(system, law, delay)
+        # The looks of the search may just miss a peak; the exact Ms decides.
+        if achieved.Ms <= wanted.Ms_max:
+            break
+    if like is not None:
+        law = like.replace(Kp=law.Kp, Ki=law.Ki, Kd=law.Kd, Tf=law.Tf)
+    return Tuning(law, candidate.factors, achieved, found.looked_at, found.stable)
+
+
+def judged(system: LinearSystem | FrequencyData, controller: Controller, delay: float = 0.0) -> Margins:
+    """All crossovers and margins, Ms and bandwidth of a controller on a plant: from roots of polynomials where there
+    are any, from a dense response otherwise."""
+    law = pidf(controller)
+    if isinstance(system, LinearSystem) and delay == 0.0:
+        loop = series(law, system)
+        return margins(loop, feedback(loop, gain(1.0)))
+    plant = Plant(system, delay)
+    at_one = plant.looks(1.0)
+    omega = plant.looks(float(at_one[np.argmin(np.abs(np.log(np.abs(law.response(at_one) * plant.response(at_one)))))]))
+    loops = law.response(omega) * plant.response(omega)
+    stable = bool(circled(loops[None, :], plant.integrators + (controller.Ki != 0.0))[0])
+    return seen_margins(lambda w: np.asarray(law.response(w) * plant.response(w)), omega, stable)

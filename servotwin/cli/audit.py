@@ -1,0 +1,200 @@
+"""`servotwin audit`: the evidence chain of a servo, asked of a twin's store or of its service."""
+
+from __future__ import annotations
+
+import json as jsons
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.error import HTTPError, URLError
+from urllib.parse import quote, urlsplit
+from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Request, build_opener
+
+import msgspec
+
+from servotwin.cli.audit_text import SERVOS, Told, lines_of, servo_line
+from servotwin.errors import InvalidInput
+from servotwin.link.url import in_clear, is_encrypted
+from servotwin.twin_service.command import present_store
+from servotwin.twin_service.read_api import MOST, shown, told
+from servotwin.twin_service.secret_file import read_secret
+from servotwin.twin_service.twin_file import service_of
+
+TIMEOUT_S = 30.0
+BEFORE_S = 60.0
+"""Of what belongs to no window, so much is shown from before the first one."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Whom to ask: the store of a twin's file, or, where there is a URL, a service.
+
+    Attributes
+    ----------
+    config : Path
+        The twin's file.
+    url : str or None
+        https://twin:8765
+    token, ca : Path or None
+        A file with an operator's token; certificates that the service's is checked against.
+    """
+
+    config: Path
+    url: str | None = None
+    token: Path | None = None
+    ca: Path | None = None
+
+
+class Story(NamedTuple):
+    """What is known of a servo, as the API tells it: as it stands, its windows, what belongs to none."""
+
+    servo: Told
+    links: list[Told]
+    events: list[Told]
+
+
+def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> None:
+    """Print a servo's newest windows and what followed from them.
+
+    Parameters
+    ----------
+    servo : str
+    source : Source
+    limit : int
+        Windows at most.
+    changes : bool
+        Leave out windows from which nothing followed.
+    json : bool
+        The links of the chain as JSON, as the API tells them.
+
+    Raises
+    ------
+    InvalidInput
+        Nothing is known of the servo, or whoever should know cannot be asked.
+    """
+    story = _of_store(servo, source.config, limit) if source.url is None else _of_service(servo, source, limit)
+    if not story.links:
+        raise InvalidInput(f"servo {servo!r}: no window of it was ever stored")
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(story.links)).decode())
+        return
+    for line in lines_of(*story, changes=changes):
+        print(line)
+
+
+def servos(source: Source, json: bool) -> None:
+    """Print every servo that was heard of, at a glance.
+
+    Raises
+    ------
+    InvalidInput
+        Whoever should know cannot be asked.
+    """
+    if source.url is not None:
+        ask = _asking(source)
+        found = _pages(lambda after: ask(f"/v1/servos?limit={MOST}&after={quote(after, safe='')}"))
+    else:
+        store = present_store(service_of(source.config))
+        try:
+            found = _pages(lambda after: [each._asdict() for each in store.servos(after)])
+        finally:
+            store.close()
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    print(SERVOS)
+    for each in found:
+        print(servo_line(each))
+
+
+def _pages(page: Callable[[str], list[Told]]) -> list[Told]:
+    """All servos; a page holds those after a name."""
+    found: list[Told] = []
+    while more := page(found[-1]["servo"] if found else ""):
+        found += more
+    return found
+
+
+def _of_store(servo: str, config: Path, limit: int) -> Story:
+    store = present_store(service_of(config))
+    try:
+        links, found = store.audit(servo, limit=limit), store.servo(servo)
+        if found is None or not links:
+            return Story({}, [], [])
+        events = store.events(servo, _since(links[-1].window.received), MOST)
+        return Story(found._asdict(), [told(link) for link in links], [shown(each) for each in events])
+    finally:
+        store.close()
+
+
+def _of_service(servo: str, source: Source, limit: int) -> Story:
+    ask, name = _asking(source), quote(servo, safe="")
+    links = ask(f"/v1/servos/{name}/audit?limit={limit}")
+    if not links:
+        return Story({}, [], [])
+    since = _since(links[-1]["window"]["received"])
+    return Story(ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MOST}"))
+
+
+def _since(oldest: float) -> float:
+    """A start comes before its first window."""
+    return max(0.0, oldest - BEFORE_S)
+
+
+def _asking(source: Source) -> Callable[[str], Any]:
+    """Asks the service for JSON; raises InvalidInput."""
+    url, headers = str(source.url).rstrip("/"), {}
+    if not _is_address(url):
+        raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
+    if source.token is not None and in_clear(url):
+        raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
+    if source.token is not None:
+        headers["Authorization"] = f"Bearer {read_secret(source.token)}"
+    # What goes to this machine itself goes through no proxy: it would read the token.
+    way = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
+    opener = build_opener(_Stay, way)
+
+    def ask(path: str) -> Any:
+        try:
+            with opener.open(Request(url + path, headers=headers), timeout=TIMEOUT_S) as answer:
+                return jsons.load(answer)
+        except HTTPError as error:
+            raise InvalidInput(f"{url}: {_refusal(error)}") from None
+        except (URLError, HTTPException, OSError, ValueError) as error:
+            raise InvalidInput(f"{url}: cannot be asked ({getattr(error, 'reason', error)})") from None
+
+    return ask
+
+
+def _is_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:
+        return False
+
+
+class _Stay(HTTPRedirectHandler):
+    """Goes nowhere else: the token is for this service alone."""
+
+    def redirect_request(self, *_args: Any) -> None:
+        """Nothing: the answer that says where to go is a refusal."""
+
+
+def _context(ca: Path | None) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=None if ca is None else str(ca))
+    except (OSError, ssl.SSLError) as error:
+        raise InvalidInput(f"{ca}: holds no certificates that can be read ({error})") from None
+
+
+def _refusal(error: HTTPError) -> str:
+    """What a refusal says."""
+    with error:
+        try:
+            return str(jsons.load(error)["detail"])
+        except (ValueError, KeyError, TypeError):
+            return f"answers {error.code}"

@@ -1,0 +1,148 @@
+"""`servotwin certify`: settings proved beforehand, cell by cell, for the twins that look them up."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from servotwin.config.table import Table, did_you_mean, read_toml
+from servotwin.cosim.scenario import Scenario
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.lookup import CertifiedTable, Grid
+from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.twin.fleet import models_of
+from servotwin.twin.policies import certified
+from servotwin.twin.settings import TwinSettings
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A table to be proved: for which model, with which policy, into which file."""
+
+    name: str
+    policy: CertifiedPolicy
+    path: Path
+
+
+def certify(
+    file: Path,
+    model: str | None = None,
+    out: Path | None = None,
+    grid: Grid | None = None,
+    console: Console | None = None,
+) -> tuple[CertifiedTable, ...]:
+    """Prove the tables that a twin's file or a scenario names, or go on with them.
+
+    Parameters
+    ----------
+    file : Path
+    model : str, optional
+        One of a twin's file; all that have a `table` without.
+    out : Path, optional
+        Instead of the file that `table` names; for one model.
+    grid : Grid, optional
+    console : Console, optional
+        Where progress and summary are shown.
+
+    Raises
+    ------
+    InvalidInput
+        There is nothing to be proved, a file belongs to another model or grid or cannot be written, or there is no
+        fallback set.
+    KeyboardInterrupt
+        With a sentence on what is finished and how to go on.
+    """
+    console = console or Console()
+    return tuple(_proved(wanted, grid or Grid(), console) for wanted in _wanted(file, model, out))
+
+
+def grid_of(finest_deg: float, bias_mv: str, noise_um: str) -> Grid:
+    """The grid of the command's options.
+
+    Raises
+    ------
+    InvalidInput
+        An option is no number, or they make no grid.
+    """
+    biases, noises = _numbers("--bias-mv", bias_mv, 1e-3), _numbers("--noise-um", noise_um, 1e-6)
+    return Grid(math.radians(finest_deg), biases, noises)
+
+
+def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:
+    try:
+        return tuple(unit * float(part) for part in text.split(","))
+    except ValueError:
+        raise InvalidInput(f"{option} {text!r}: give VALUE,VALUE,...") from None
+
+
+def _wanted(file: Path, model: str | None, out: Path | None) -> list[Wanted]:
+    """What a file asks for."""
+    table = read_toml(file)
+    known = _described(table, file)
+    if model is not None and model not in known:
+        raise InvalidInput(f"--model {model!r}: {file} has no such model{did_you_mean(model, known)}")
+    chosen = {name: what for name, what in known.items() if name == (model or name)}
+    if out is None:
+        chosen = {name: what for name, what in chosen.items() if what[1].table is not None}
+    if not chosen:
+        raise InvalidInput(f'{file}: no model has a key table = "NAME{SUFFIX}" in [twin]: give it, or --out')
+    if out is not None and len(chosen) > 1:
+        raise InvalidInput(f"--out {out}: {file} has {len(chosen)} models; say which with --model")
+    return [_one(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
+
+
+def _described(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
+    """Model and settings by name: of a twin's file, or of a scenario, whose table need not be there yet."""
+    if "models" in table.values:
+        found = models_of(table, file.parent, checked=False)
+        return {model.name: (model.servo, model.settings) for model in found}
+    twin = dict(table.values.get("twin") or {})  # type: ignore[call-overload]
+    name = twin.pop("table", None)
+    scenario = Scenario.from_table(Table(table.source, {**table.values, "twin": twin}), file.parent)
+    path = None if name is None else str(file.parent / str(name))
+    return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
+
+
+def _one(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> Wanted:
+    if settings.policy != "certified":
+        raise InvalidInput(f"model {name!r}: policy {settings.policy!r} proves nothing; only 'certified' does")
+    return Wanted(name, certified(servo, settings), out or Path(settings.table or ""))
+
+
+def _proved(wanted: Wanted, grid: Grid, console: Console) -> CertifiedTable:
+    """One table, under a progress bar."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    done = total = 0
+    try:
+        with (
+            Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress,
+            closing(build(wanted.path, wanted.policy, grid)) as steps,
+        ):
+            bar = progress.add_task(f"proving {wanted.name}", total=None)
+            for done, total in steps:
+                progress.update(bar, completed=done, total=total)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"interrupted: {done} of {total} cells are in {wanted.path}; the same command goes on from there"
+        ) from None
+    found = load(wanted.path, wanted.policy)
+    console.print(_summary(wanted, found), soft_wrap=True, highlight=False)
+    return found
+
+
+def _summary(wanted: Wanted, found: CertifiedTable) -> str:
+    shares = Counter(cell is not None for cell in found.cells.values())
+    settings = {cell.setting for cell in found.cells.values() if cell is not None}
+    low, high = (math.degrees(gap) for gap in found.stated)
+    return (
+        f"written: {wanted.path}: {shares[True]} of {len(found.cells)} cells of gaps from {low:g} to {high:g} deg are"
+        f" proved, with {len(settings)} different settings; where none is, the fallback set is sent"
+    )

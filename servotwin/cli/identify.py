@@ -1,0 +1,276 @@
+"""`servotwin identify`: the gap from a recorded log, window by window, and its trend."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.passage import Passage
+from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.window import Window
+from servotwin.logs.reader import Log, read_log
+from servotwin.plant.servo import Servo
+from servotwin.twin.estimating import estimator_of
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.wear import Wear
+
+WINDOW = 1.0  # s
+_ROUNDING = 1e-6  # of a sample
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to identify; times in s, angles in deg. None: as the log or the default says."""
+
+    log: Path
+    servo: str | None = None
+    start: float | None = None
+    duration: float | None = None
+    window: float | None = None
+    pre_trigger: float | None = None
+    method: str = "whitened"
+    wear_deg: float | None = None
+    wear_over_s: float | None = None
+    gap_limit_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a log shows.
+
+    Attributes
+    ----------
+    servo : Servo
+        The model.
+    windows : tuple of Window
+    estimates : tuple of GapEstimate
+        One for each window.
+    trend : Trend or None
+        After the last window; None without an estimate that is OK.
+    until_limit : Passage or None
+        From `trend.time` on.
+    """
+
+    servo: Servo
+    windows: tuple[Window, ...]
+    estimates: tuple[GapEstimate, ...]
+    trend: Trend | None
+    until_limit: Passage | None
+
+
+def identify(request: Request) -> Identified:
+    """Read, cut, estimate, follow.
+
+    Raises
+    ------
+    InvalidInput
+        The log, the servo or an option is not valid, or no window fits into the log.
+    """
+    settings = _settings(request)
+    log = read_log(request.log)
+    servo = _servo(request, log)
+    windows = cut(log, request)
+    estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap, settings.trend)
+    estimates = []
+    for window in windows:
+        now = window.mid_time
+        estimates.append(estimator(window, wear.expect("log", now, now)))
+        wear.learn("log", estimates[-1], now)
+    limit, trend = settings.gap_limit, wear.trend
+    until = None if limit is None or trend is None else trend.time_until(limit)
+    return Identified(servo, windows, tuple(estimates), trend, until)
+
+
+def cut(log: Log, request: Request) -> tuple[Window, ...]:
+    """One window as asked for, or one after each change of the reference, as an edge cuts them: never overlapping."""
+    whole = log.whole
+    if request.start is not None or request.duration is not None:
+        if request.window is not None or request.pre_trigger is not None:
+            raise InvalidInput(
+                "--window and --pre-trigger cut at the steps: leave them out with --start and --duration"
+            )
+        return (_one(whole, request),)
+    if whole.reference is None:
+        raise InvalidInput(
+            f"{whole.where}without column 'reference_m' there is no telling the steps: give --start and --duration"
+        )
+    length = _option("window", request.window, log.metadata.get("window_s"), WINDOW)
+    before = _option("pre-trigger", request.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
+    if not 0.0 <= before < length:
+        raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")
+    firsts = opened(whole.reference, round(length * whole.sample_rate), round(before * whole.sample_rate))
+    if not firsts:
+        shown = f"no change of reference_m is followed by {length:g} s"
+        raise InvalidInput(f"{whole.where}{shown}; give --start and --duration")
+    return tuple(whole.slice(whole.start + first / whole.sample_rate, length) for first in firsts)
+
+
+def opened(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:
+    """First samples of the windows that changes of the reference (a start away from 0 included) open, in samples."""
+    steps = np.flatnonzero(np.diff(np.asarray(reference), prepend=0.0))
+    firsts: list[int] = []
+    for step in steps:
+        first = max(0, int(step) - before)
+        if first + length <= len(reference) and not (firsts and step < firsts[-1] + length):
+            firsts.append(first)
+    return firsts
+
+
+def _one(whole: Window, request: Request) -> Window:
+    start = whole.start if request.start is None else request.start
+    end = float(whole.start + whole.position.size / whole.sample_rate)
+    duration = end - start if request.duration is None else request.duration
+    if not (math.isfinite(start) and math.isfinite(duration) and duration > 0.0):
+        shown = f"--start {start!r} s, --duration {duration!r} s"
+        raise InvalidInput(f"{whole.where}{shown}: the log goes from {whole.start:g} s to {end:g} s")
+    return whole.slice(start, duration)
+
+
+def _option(name: str, given: float | None, noted: Any, default: float) -> float:
+    """What was given, else what the log notes, else the default."""
+    value = given if given is not None else (noted if isinstance(noted, int | float) else default)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise InvalidInput(f"--{name} {value!r} s: must be a finite number of at least 0")
+    return float(value)
+
+
+def _servo(request: Request, log: Log) -> Servo:
+    if request.servo is not None:
+        return Servo.resolve(request.servo)
+    text = log.metadata.get("servo")
+    if not isinstance(text, str):
+        raise InvalidInput(f"{log.whole.where}it does not say of which servo it is: give --servo, a preset or a TOML")
+    return Servo.loads(text, f"log {request.log}, servo")
+
+
+def _settings(request: Request) -> TwinSettings:
+    wear, over, limit = request.wear_deg, request.wear_over_s, request.gap_limit_deg
+    if (wear is None) != (over is None):
+        raise InvalidInput("--wear-deg and --wear-over-s belong together: give both, or neither")
+    known = wear is not None and over is not None
+    trend = TrendSettings.for_wear(math.radians(wear), over) if known else TrendSettings()  # type: ignore[arg-type]
+    if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
+        raise InvalidInput(f"--gap-limit-deg {limit!r}: must be a finite number of at least 0")
+    return TwinSettings(method=request.method, trend=trend, gap_limit=None if limit is None else math.radians(limit))
+
+
+def tell(request: Request, as_json: bool) -> None:
+    """The command: tables, or one JSON object, on the standard output."""
+    found = identify(request)
+    if as_json:
+        print(json.dumps(as_dict(found, request), indent=2, allow_nan=False))
+        return
+    console = Console()
+    count = sum(estimate.ok for estimate in found.estimates)
+    console.print(
+        f"{request.log}: {len(found.windows)} windows, {count} OK, model {found.servo.version}", highlight=False
+    )
+    console.print(_table(found), highlight=False)
+    for line in _trend_lines(found, request):
+        console.print(line, highlight=False)
+
+
+def _table(found: Identified) -> Table:
+    heads = ("window, s", "gap, deg", "std, deg", "95 % interval, deg", "status")
+    table = Table(*heads, box=None, pad_edge=False)
+    for window, estimate in zip(found.windows, found.estimates, strict=True):
+        low, high = map(math.degrees, estimate.interval)
+        known = (
+            f"{math.degrees(estimate.gap):.3f}",
+            f"{math.degrees(estimate.std_total):.3f}",
+            f"{low:.3f} .. {high:.3f}",
+        )
+        end = window.start + window.duration
+        shown = known if estimate.ok else _unsure(estimate)
+        color = "green" if estimate.ok else "yellow"
+        table.add_row(f"{window.start:.2f} .. {end:.2f}", *shown, f"[{color}]{estimate.status.value}[/]")
+        for reason in estimate.reasons:
+            table.add_row("", "", "", "", f"[dim]{reason}[/]")
+    return table
+
+
+def _unsure(estimate: GapEstimate) -> tuple[str, str, str]:
+    """A bound where there is one; what was believed before is no result of the window."""
+    bounded = estimate.status is GapStatus.LOWER_BOUND
+    return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-", "-")
+
+
+def _trend_lines(found: Identified, request: Request) -> list[str]:
+    trend = found.trend
+    if trend is None:
+        return ["no window shows the gap, so there is no trend"]
+    low, high = map(math.degrees, trend.gap_interval)
+    slow, fast = map(math.degrees, trend.rate_interval)
+    lines = [f"gap at {trend.time:.2f} s: {math.degrees(trend.gap):.3f} deg (95 %: {low:.3f} .. {high:.3f})"]
+    if trend.updates > 1:
+        lines.append(f"wear: {math.degrees(trend.rate):.3g} deg/s (95 %: {slow:.3g} .. {fast:.3g})")
+    if found.until_limit is not None:
+        early, late = found.until_limit.interval
+        median = (
+            f"median {found.until_limit.median:.4g} s" if math.isfinite(found.until_limit.median) else "perhaps never"
+        )
+        lines.append(f"{request.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
+    return lines
+
+
+def as_dict(found: Identified, request: Request) -> dict[str, Any]:
+    """What a machine reads: angles in deg, times in s, null where there is no number."""
+    trend, until = found.trend, found.until_limit
+    pairs = zip(found.windows, found.estimates, strict=True)
+    return {
+        "log": str(request.log),
+        "model": found.servo.version,
+        "method": request.method,
+        "windows": [_row(window, estimate) for window, estimate in pairs],
+        "trend": None if trend is None else _finite(_trend(trend)),
+        "until_limit": None
+        if until is None
+        else _finite(
+            {"median_s": until.median, "interval_s": list(until.interval), "probability": until.probability},
+        ),
+    }
+
+
+def _trend(trend: Trend) -> Mapping[str, Any]:
+    return {
+        "time_s": trend.time,
+        "updates": trend.updates,
+        "gap_deg": math.degrees(trend.gap),
+        "gap_interval_deg": [math.degrees(x) for x in trend.gap_interval],
+        "rate_deg_per_s": math.degrees(trend.rate),
+        "rate_interval_deg_per_s": [math.degrees(x) for x in trend.rate_interval],
+    }
+
+
+def _row(window: Window, estimate: GapEstimate) -> dict[str, Any]:
+    row = {
+        "start_s": window.start,
+        "duration_s": window.duration,
+        "time_s": estimate.time,
+        "gap_deg": math.degrees(estimate.gap),
+        "std_deg": math.degrees(estimate.std),
+        "std_total_deg": math.degrees(estimate.std_total),
+        "interval_deg": [math.degrees(x) for x in estimate.interval],
+    }
+    return {**_finite(row), "status": estimate.status.value, "reasons": list(estimate.reasons)}
+
+
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON has no infinity and no NaN."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, list):
+            return [plain(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return {key: plain(value) for key, value in values.items()}

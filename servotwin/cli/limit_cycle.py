@@ -1,0 +1,165 @@
+"""`servotwin limit-cycle`: the exact orbit, its multipliers and the describing function's prediction, told."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
+from servotwin.analysis.limit_cycles.describing import Prediction, predictions
+from servotwin.analysis.limit_cycles.orbit import Orbit
+from servotwin.analysis.limit_cycles.predicted import limit_cycle_near
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+
+_MM = 1e3
+# Orbits whose frequencies agree to this part are one.
+_SAME = 1e-6
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the command found.
+
+    Attributes
+    ----------
+    result : CycleResult
+        Where the loop ends after the step.
+    predictions : tuple of (Prediction, CycleResult)
+        Each prediction, and the exact orbit that it leads to.
+    no_prediction : str
+        Why the describing function says nothing; empty otherwise.
+    """
+
+    result: CycleResult
+    predictions: tuple[tuple[Prediction, CycleResult], ...]
+    no_prediction: str
+
+
+def findings(servo: Servo, gap: float, tolerance: float | None, step: float) -> Findings:
+    """Everything known about the limit cycles of a servo with a gap (rad), a tolerance (m) and after a step (m)."""
+    result = limit_cycle(servo, gap, tolerance, step=step)
+    if tolerance:
+        return Findings(result, (), "a dead zone is a second nonlinearity, which the describing function leaves out")
+    if gap == 0.0:
+        return Findings(result, (), "there is no gap")
+    try:
+        found = predictions(servo, gap)
+    except InvalidInput as error:
+        return Findings(result, (), str(error))
+    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in found), "")
+
+
+def tell(
+    name: str,
+    gap_deg: float,
+    tolerance_mm: float | None,
+    step_mm: float,
+    enter: float | None,
+    leave: float | None,
+    as_json: bool,
+) -> None:
+    """The command: a table, or one JSON object, on the standard output."""
+    servo = Servo.resolve(name)
+    changes = {key: value for key, value in (("enter", enter), ("leave", leave)) if value is not None}
+    servo = servo.replace(sample_rate=None, **changes)
+    tolerance = None if tolerance_mm is None else tolerance_mm / _MM
+    if not (math.isfinite(gap_deg) and gap_deg >= 0.0):
+        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be finite and 0 or more")
+    found = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
+    if as_json:
+        print(json.dumps(as_dict(found), indent=2))
+        return
+    console = Console()
+    console.print(f"{name}: gap {gap_deg:g} deg in all, {_dead_zone(tolerance_mm)}, after a step of {step_mm:g} mm")
+    _print(console, found)
+
+
+def as_dict(found: Findings) -> dict[str, Any]:
+    """The findings as plain numbers; units in the keys."""
+    return {
+        "status": found.result.status.value,
+        "reason": found.result.reason,
+        "orbit": _orbit(found.result.orbit),
+        "describing_function": [
+            {
+                "frequency_hz": one.frequency,
+                "motor_amplitude_deg": math.degrees(one.motor_amplitude),
+                "amplitude_mm": one.amplitude * _MM,
+                "stable": one.stable,
+                "orbit": _orbit(near.orbit),
+                "reason": near.reason,
+            }
+            for one, near in found.predictions
+        ],
+        "no_prediction": found.no_prediction,
+    }
+
+
+def _orbit(orbit: Orbit | None) -> dict[str, Any] | None:
+    if orbit is None:
+        return None
+    half = orbit.half_multipliers
+    return {
+        "frequency_hz": orbit.frequency,
+        "amplitude_mm": orbit.amplitude * _MM,
+        "lowest_mm": orbit.lowest * _MM,
+        "highest_mm": orbit.highest * _MM,
+        "motor_amplitude_deg": math.degrees(orbit.motor_amplitude),
+        "stable": orbit.stable,
+        "symmetric": orbit.symmetric,
+        "multipliers": [[value.real, value.imag] for value in orbit.multipliers.tolist()],
+        "half_multipliers": None if half is None else [[value.real, value.imag] for value in half.tolist()],
+        "events": [{"phase": event.phase, "kind": event.kind, "side": event.side} for event in orbit.events],
+        "residual": orbit.residual,
+    }
+
+
+def _dead_zone(tolerance_mm: float | None) -> str:
+    return f"dead zone ±{tolerance_mm:g} mm" if tolerance_mm else "no dead zone"
+
+
+def _print(console: Console, found: Findings) -> None:
+    orbit = found.result.orbit
+    console.print(f"[bold]{found.result.status.value}[/]{': ' if found.result.reason else ''}{found.result.reason}")
+    table = Table("", "frequency\nHz", "position\n± mm", "motor\n± deg", "", box=None, pad_edge=False)
+    if orbit is not None:
+        table.add_row("exact, after the step", *_cells(orbit))
+    for one, near in found.predictions:
+        numbers = (f"{one.frequency:.4f}", f"{one.amplitude * _MM:.4f}", f"{math.degrees(one.motor_amplitude):.2f}")
+        table.add_row("describing function", *numbers, _stability(one.stable))
+        if near.orbit is not None and (orbit is None or abs(near.orbit.frequency / orbit.frequency - 1.0) > _SAME):
+            table.add_row("exact, near that", *_cells(near.orbit))
+    if table.rows:
+        console.print(table, highlight=False)
+    if orbit is not None:
+        _print_orbit(console, orbit)
+    if found.no_prediction:
+        console.print(f"no describing function: {found.no_prediction}", style="dim", highlight=False)
+
+
+def _cells(orbit: Orbit) -> tuple[str, ...]:
+    angle = math.degrees(orbit.motor_amplitude)
+    return f"{orbit.frequency:.9f}", f"{orbit.amplitude * _MM:.9f}", f"{angle:.4f}", _stability(orbit.stable)
+
+
+def _stability(stable: bool) -> str:
+    return "stable" if stable else "unstable"
+
+
+def _print_orbit(console: Console, orbit: Orbit) -> None:
+    if orbit.half_multipliers is not None:
+        console.print(f"multipliers of half a period: {_sizes(orbit.half_multipliers)}", highlight=False)
+    console.print(f"multipliers of the period: {_sizes(orbit.multipliers)}", highlight=False)
+    events = ", ".join(f"{event.kind} {event.side:+d} at {event.phase:.4f}" for event in orbit.events)
+    console.print(f"events by phase: {events}", highlight=False)
+    console.print(f"closes in the event simulation to {orbit.residual:.1e} of its range", style="dim", highlight=False)
+
+
+def _sizes(values: Any) -> str:
+    return ", ".join(f"{size:.4f}" for size in map(abs, values.tolist()) if size >= 5e-5)

@@ -1,0 +1,1 @@
+"""The command `servotwin map`: its arguments, its table and its picture."""

@@ -1,0 +1,65 @@
+"""`servotwin map`: computes what is missing, piece by piece, and writes numbers, table and picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from servotwin.analysis.maps.pieces import collected, compute
+from servotwin.analysis.maps.result import StabilityMap, write_numbers
+from servotwin.analysis.maps.store import Store
+from servotwin.cli.map import table
+from servotwin.cli.map.request import Request
+from servotwin.errors import InvalidInput
+from servotwin.runtime import files
+
+
+def stability_map(
+    request: Request,
+    out: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    console: Console | None = None,
+) -> StabilityMap:
+    """Compute a map, or what is missing of it, into the directory `out`.
+
+    Parameters
+    ----------
+    request : Request
+    out : Path
+        Made if missing. Gets settings.json and chunks/, from which an interrupted map goes on; map.npz, map.csv,
+        map.txt and map.png.
+    workers : int, optional
+        Processes on this machine; one per core by default.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers do the work instead.
+    console : Console, optional
+        Where progress and table are shown.
+
+    Returns
+    -------
+    StabilityMap
+
+    Raises
+    ------
+    InvalidInput
+        A value out of its range, a directory that cannot be written or holds another map, a scheduler out of reach.
+    KeyboardInterrupt
+        With a sentence on what is finished and how to go on.
+    """
+    console = console or Console()
+    if workers is not None and scheduler is not None:
+        raise InvalidInput(f"--workers {workers} and --scheduler {scheduler}: give one; a cluster has its own workers")
+    settings = request.settings()
+    store = Store(out, settings)
+    compute(store, workers, scheduler, console)
+    found = StabilityMap(settings, collected(store))
+    write_numbers(found, out)
+    files.write_text(out / "map.txt", table.text(found))
+    table.tell(found, console)
+    from servotwin.cli.map import figure
+
+    path = figure.save(found, out)
+    console.print(f"picture: {path}", soft_wrap=True, highlight=False)
+    return found

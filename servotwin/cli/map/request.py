@@ -1,0 +1,146 @@
+"""What was asked for on the command line, made into settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
+from servotwin.analysis.maps.settings import MapSettings
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+
+MAX_VALUES = 4096
+MAX_PANELS = 36
+TOLERANCE, AMPLITUDE = "0:5:64", "0.5:500:64:log"
+
+
+@dataclass(frozen=True)
+class Request:
+    """The options of `servotwin map` that the numbers depend on; None: not given."""
+
+    servo: str
+    tolerance: str | None = None
+    amplitude: str | None = None
+    gap_deg: str | None = None
+    estimate_deg: str | None = None
+    k_dz: str | None = None
+    amplitude_mm: str | None = None
+    enter: float | None = None
+    leave: float | None = None
+    members: int = 16
+    motion: float = 1.0
+    seed: int = 0
+    duration: float = 120.0
+    window: float = 40.0
+    still_um: float = 1.0
+
+    def settings(self) -> MapSettings:
+        """The map.
+
+        Raises
+        ------
+        InvalidInput
+            An option is outside its range, or the two kinds of axes are mixed.
+        """
+        servo = Servo.resolve(self.servo)
+        changes = {key: value for key, value in (("enter", self.enter), ("leave", self.leave)) if value is not None}
+        law = servo.controller.replace(sample_rate=None, rate_limit=None, **changes)
+        axes = self._axes()
+        _check_drawable(axes.shape)
+        return MapSettings(
+            servo,
+            axes,
+            law,
+            members=self.members,
+            motion=self.motion,
+            seed=self.seed,
+            duration=self.duration,
+            window=self.window,
+            still=self.still_um * 1e-6,
+        )
+
+    def _axes(self) -> Axes:
+        ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}
+        physical = {"--gap-deg": self.gap_deg, "--estimate-deg": self.estimate_deg, "--k-dz": self.k_dz}
+        physical["--amplitude-mm"] = self.amplitude_mm
+        given = [[name for name, text in group.items() if text is not None] for group in (ratios, physical)]
+        if all(given):
+            raise InvalidInput(
+                f"{given[0][0]} is in units of p b and {given[1][0]} is not: give axes of one kind, {', '.join(ratios)}"
+                f" or {', '.join(physical)}"
+            )
+        return self._physical() if given[1] else self._ratios()
+
+    def _ratios(self) -> RatioAxes:
+        tolerance = parsed("--tolerance", self.tolerance or TOLERANCE)
+        return RatioAxes(tolerance, parsed("--amplitude", self.amplitude or AMPLITUDE))
+
+    def _physical(self) -> PhysicalAxes:
+        return PhysicalAxes(
+            parsed("--gap-deg", self.gap_deg or "10", math.pi / 180.0),
+            parsed("--k-dz", self.k_dz or "1"),
+            parsed("--amplitude-mm", self.amplitude_mm or "1", 1e-3),
+            () if self.estimate_deg is None else parsed("--estimate-deg", self.estimate_deg, math.pi / 180.0),
+        )
+
+
+def parsed(name: str, text: str, unit: float = 1.0) -> Values:
+    """An axis: "LOW:HIGH:COUNT", evenly spaced, with ":log" in equal ratios, or "VALUE,VALUE,...".
+
+    Parameters
+    ----------
+    name : str
+        The option, for messages.
+    text : str
+    unit : float
+        Multiplies every value.
+
+    Raises
+    ------
+    InvalidInput
+        The text is neither, or a range is empty or out of order.
+    """
+    values = _ranged(name, text) if ":" in text else [_number(name, text, part) for part in text.split(",")]
+    return tuple(value * unit for value in values)
+
+
+def _ranged(name: str, text: str) -> list[float]:
+    low, high, count, *kind = text.split(":") if text.count(":") in (2, 3) else ("", "", "")
+    if kind not in ([], ["log"]) or not count.strip().isdecimal():
+        raise _refused(name, text)
+    first, last, size = _number(name, text, low), _number(name, text, high), int(count)
+    if not (2 <= size <= MAX_VALUES and first < last and (first > 0.0 or not kind)):
+        raise InvalidInput(
+            f"{name} {text!r}: a range goes up, has 2 to {MAX_VALUES} values and, with :log, starts above 0"
+        )
+    return (np.geomspace if kind else np.linspace)(first, last, size).tolist()
+
+
+def _number(name: str, text: str, part: str) -> float:
+    try:
+        value = float(part)
+    except ValueError:
+        raise _refused(name, text) from None
+    if not math.isfinite(value):
+        raise _refused(name, text)
+    return value
+
+
+def _refused(name: str, text: str) -> InvalidInput:
+    return InvalidInput(f"{name} {text!r}: is no axis; give LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or VALUE,VALUE,...")
+
+
+def _check_drawable(shape: Sequence[int]) -> None:
+    """Refuse what no picture can show."""
+    varying = sorted((size for size in shape if size > 1), reverse=True)
+    if not varying:
+        raise InvalidInput("map axes: every axis has one value; give a range to one of them at least")
+    if math.prod(varying[2:]) > MAX_PANELS:
+        raise InvalidInput(
+            f"map axes: {' x '.join(map(str, varying))} values are {math.prod(varying[2:])} panels beside the two"
+            f" longest axes; give at most {MAX_PANELS}"
+        )

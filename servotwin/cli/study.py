@@ -1,0 +1,91 @@
+"""Commands that simulate, estimate and measure, each on what it is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servotwin.errors import InvalidInput
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Where the report goes.")] = Path("servotwin-demo"),
+    preset: Annotated[str, typer.Option(help="paper, table1 or paper-gain2.")] = "paper",
+) -> None:
+    """A servo wears out twice: once alone, once watched over by its twin."""
+    from servotwin.cli.demo import demo as run
+
+    run(out, preset)
+
+
+def reproduce(
+    only: Annotated[list[str] | None, typer.Option(help="Only these figures and claims: fig12, crossover ...")] = None,
+    out: Annotated[Path, typer.Option(help="Where figures, claims.json and report.html go.")] = Path("reproduction"),
+    preset: Annotated[str, typer.Option(help="The preset of the figures; claims are measured in all three.")] = "paper",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
+) -> None:
+    """Every figure and claim of the paper beside what we measure."""
+    from servotwin.reproduction.everything import reproduce as run
+
+    run(out, only=tuple(only or ()), preset=preset, workers=workers)
+
+
+def simulate(
+    scenario: Annotated[Path, typer.Argument(help="A scenario's TOML.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="run.parquet, run.npz or run.csv.")],
+) -> None:
+    """Run one scenario and write its signals."""
+    from servotwin.cli.simulate import record
+
+    record(scenario, output)
+
+
+def convert(
+    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    output: Annotated[Path, typer.Argument(help="run.csv, which an edge can replay, run.npz or run.parquet.")],
+) -> None:
+    """A recorded log in another format."""
+    from servotwin.cli.simulate import convert as run
+
+    run(log, output)
+
+
+def identify(
+    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    servo: Annotated[
+        str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="One window from here on, s; not one per step.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of that window, s; to the log's end by default.")
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option(help="Length of the windows at the steps, s; the log's, or 1.")
+    ] = None,
+    pre_trigger: Annotated[float | None, typer.Option(help="How much of it lies before the step, s.")] = None,
+    method: Annotated[str, typer.Option(help="whitened or paper.")] = "whitened",
+    wear_deg: Annotated[float | None, typer.Option(help="The gap grows by about so much ...")] = None,
+    wear_over_s: Annotated[float | None, typer.Option(help="... in so long; 0.2 deg/s by default.")] = None,
+    gap_limit_deg: Annotated[float | None, typer.Option(help="Tell how long until the gap is that large.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+) -> None:
+    """The gap and its trend from a recorded log."""
+    from servotwin.cli.identify import Request, tell
+
+    cut = (start, duration, window, pre_trigger)
+    tell(Request(log, servo, *cut, method, wear_deg, wear_over_s, gap_limit_deg), json)
+
+
+def bench(context: typer.Context) -> None:
+    """Speed and accuracy beside what one would use instead; part of the source checkout: python -m benchmarks."""
+    try:
+        from benchmarks.cli import app
+    except ModuleNotFoundError as error:
+        if error.name != "benchmarks":
+            raise
+        raise InvalidInput(
+            "servotwin bench: the benchmarks are part of the source checkout; run python -m benchmarks there"
+        ) from None
+    app(context.args, prog_name="servotwin bench", standalone_mode=False)

@@ -1,0 +1,105 @@
+"""`servotwin tune`: a specification in, gains, all crossovers and Ms out, beside the servo's present controller."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from servotwin.analysis.tuning.setpoint import overshoot
+from servotwin.analysis.tuning.tune import Specification, Tuning, judged, tune
+from servotwin.control.controller import Controller
+from servotwin.plant.linear import loop_filter, series
+from servotwin.plant.margins import Margins
+from servotwin.plant.servo import Servo
+
+# With a delay there is no end of phase crossovers; beyond this gain margin they are not shown.
+_FAR = 1e3
+
+
+@dataclass(frozen=True)
+class Request:
+    """The command's arguments, in its units."""
+
+    servo: str
+    kind: str
+    crossover: float
+    phase_margin_deg: float
+    Ms_max: float
+    prefer: str
+    delay_ms: float
+    b: float
+    c: float | None
+
+
+def tell(request: Request, as_json: bool) -> None:
+    """The command: a table, or one JSON object, on the standard output."""
+    servo = Servo.resolve(request.servo)
+    servo = servo.replace(sample_rate=None)
+    system = series(servo.plant(), loop_filter(servo.controller))
+    margin = math.radians(request.phase_margin_deg)
+    wanted = Specification(request.crossover, margin, request.kind, request.Ms_max, request.prefer)
+    delay = 1e-3 * request.delay_ms
+    tuning = tune(system, wanted, delay, servo.controller)
+    overshoots = None
+    weights = (request.b, request.b if request.c is None else request.c)
+    if delay == 0.0:
+        weighted = overshoot(servo, tuning.controller, *weights)
+        overshoots = (overshoot(servo, tuning.controller), weighted)
+    if as_json:
+        print(json.dumps(as_dict(tuning, overshoots), indent=2))
+        return
+    console = Console()
+    present = judged(system, servo.controller, delay)
+    _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
+    angles = tuning.factors
+    shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
+    console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
+    console.print(f"{tuning.stable} of {tuning.candidates} candidates are stable", style="dim", highlight=False)
+    if overshoots is not None:
+        more = f"; with setpoint weights b = {weights[0]:g}, c = {weights[1]:g}: {100 * overshoots[1]:.1f} %"
+        more = more if weights != (1.0, 1.0) else ""
+        console.print(f"overshoot without a gap {100 * overshoots[0]:.1f} %{more}", highlight=False)
+
+
+def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str, Any]:
+    """The tuning as plain numbers; what is infinite or unknown is null."""
+    law, found = tuning.controller, tuning.margins
+    return {
+        "Kp": law.Kp,
+        "Ki": law.Ki,
+        "Kd": law.Kd,
+        "Tf": law.Tf,
+        "K": tuning.factors.K,
+        "angles_deg": {name: math.degrees(getattr(tuning.factors, name)) for name in ("phz", "be", "al")},
+        "crossovers": [
+            {"omega": x.omega, "phase_margin_deg": math.degrees(x.phase_margin)} for x in found.gain_crossovers
+        ],
+        "gain_margins": [{"omega": x.omega, "gain_margin": x.gain_margin} for x in found.phase_crossovers],
+        "Ms": found.Ms,
+        "Ms_omega": found.Ms_omega,
+        "bandwidth": found.bandwidth if math.isfinite(found.bandwidth) else None,
+        "candidates": tuning.candidates,
+        "stable_candidates": tuning.stable,
+        "overshoot": None if overshoots is None else overshoots[0],
+        "overshoot_weighted": None if overshoots is None else overshoots[1],
+    }
+
+
+def _print(console: Console, rows: dict[str, tuple[Controller, Margins]]) -> None:
+    heads = ("", "Kp\nV/m", "Ki\nV/(m s)", "Kd\nV s/m", "Tf\ns", "Ms")
+    table = Table(*heads, box=None, pad_edge=False)
+    for name, (law, found) in rows.items():
+        gains = tuple(f"{value:.6g}" for value in (law.Kp, law.Ki, law.Kd, law.Tf))
+        table.add_row(name, *gains, f"{found.Ms:.4f}")
+    console.print(table, highlight=False)
+    for name, (_, found) in rows.items():
+        crossovers = [f"{x.omega:.4f} rad/s ({math.degrees(x.phase_margin):.2f} deg)" for x in found.gain_crossovers]
+        console.print(f"{name}, crossovers (phase margins): {', '.join(crossovers)}", highlight=False)
+        first = [f"{x.gain_margin:.3f} at {x.omega:.2f} rad/s" for x in found.phase_crossovers if x.gain_margin < _FAR]
+        if first:
+            console.print(f"{name}, gain margins: {', '.join(first)}", highlight=False)

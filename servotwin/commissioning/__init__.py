@@ -1,0 +1,1 @@
+"""The settings that an edge starts with, made of a servo's model and a policy."""

@@ -1,0 +1,1 @@
+"""Declared settings: one reader and one writer."""

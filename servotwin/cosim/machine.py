@@ -1,0 +1,54 @@
+"""The machine of a scenario: its plant and its controller, to be simulated."""
+
+from __future__ import annotations
+
+from servotwin.cosim.scenario import Scenario
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation import Simulation, simulate
+from servotwin.simulation.endless import FOREVER, Endless, first_stretch
+
+
+def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
+    """The plant and its controller at the start of a scenario; `plant` where the machine is another than twin and edge
+    take it for."""
+    return _simulation(scenario, scenario.servo if plant is None else plant)
+
+
+def endless(scenario: Scenario, keep: int) -> Endless:
+    """The same, running on after the scenario's end and remembering `keep` samples.
+
+    Raises
+    ------
+    InvalidInput
+        The controller is continuous.
+    """
+    if scenario.law.sample_rate is None:
+        raise InvalidInput("controller sample_rate = None: a machine that runs on needs a rate in Hz")
+    return Endless(_simulation(scenario, scenario.servo, keep), scenario.reference)
+
+
+def compile_ahead(scenario: Scenario) -> None:
+    """Have everything compiled that a machine of this kind runs: no sample waits for it then."""
+    rate = scenario.law.sample_rate or scenario.recording.sample_rate
+    gap = PiecewiseCubic.held([0.0, 1.5 / rate], [0.01, 0.02])
+    simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
+
+
+def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None) -> Simulation:
+    return Simulation(
+        plant,
+        scenario.duration if keep is None else FOREVER,
+        controller=scenario.start_law,
+        reference=scenario.reference if keep is None else first_stretch(scenario.reference),
+        gap=scenario.gap,
+        tolerance=scenario.start_tolerance,
+        theta_d0=scenario.theta_d0,
+        sample_rate=scenario.recording.sample_rate,
+        noise=scenario.noise,
+        seed=scenario.seed_of("noise"),
+        input_bias=scenario.input_bias,
+        friction=scenario.friction,
+        keep=keep,
+    )

@@ -1,0 +1,309 @@
+"""A scenario: everything that a co-simulation needs, in one frozen value that a TOML file can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from servotwin.commissioning.guarding import Guarding, guarding, start_of
+from servotwin.commissioning.novelty import model_of
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of, with_gains
+from servotwin.cosim import scenario_file
+from servotwin.cosim.scenario_file import Recording
+from servotwin.edge.limits import Limits
+from servotwin.edge.novelty.settings import NoveltySettings
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.errors import InvalidInput
+from servotwin.estimation.gap import shortest_window
+from servotwin.link.simulated import LinkSettings, derive_seed
+from servotwin.messages import NAME_PATTERN
+from servotwin.plant.noise import Noise
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.twin.settings import TwinSettings
+
+BOOT = "boot-1"
+WINDOW = 1.0  # s, section 4.2
+CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+MOST_SAMPLES = 1e8  # some 10 GB of signals
+PRESETS = ("fig15", "fig15-sampled", "fig16", "calm", "certified")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One servo, its wear, its link and its twin.
+
+    Parameters
+    ----------
+    servo : Servo
+    duration : float
+        s, a whole number of samples.
+    seed : int
+        Root of all randomness: each source has its own generator, from (seed, name, source).
+    name : str
+        The servo's name in messages.
+    reference : number or signal
+        m.
+    gap : number or signal
+        rad, total gap.
+    theta_d0 : float
+        rad, screw at the start; the motor's angle is 0 there, so that 0 is the middle of the backlash.
+    controller : Controller, optional
+        The servo's own by default.
+    noise : Noise, optional
+        On the measured position; needs a sampled controller.
+    recording : Recording
+        Left open, a window holds 1 s from the change of the reference on. A loop with little or no integral action, as
+        the certified policy makes it, is calm: the screw turns back so late that a second often shows one side of the
+        gap only. Its windows begin 0.3 s before the change, or with the first sample, and hold 2 s. What `recording`
+        says goes first; limits that it leaves open are made for the policy where `supervision` is.
+    uplink, downlink : LinkSettings
+        Edge to twin, and back.
+    twin : TwinSettings
+        Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
+        Under the policy "certified" the loop begins, twin or no twin, on the fallback set, which is proved for every
+        gap of the stated range, unless `controller` has other gains than the servo's own, or `supervision` is given.
+    supervision : Supervision, optional
+        How the edge looks after itself; then updates may set gains too, in a box around the servo's own, and every
+        change leaves the voltage where it is. None: made for the policies that send gains, "certified" and
+        "hysteresis", from what is proved; under the others updates set the tolerance, at once, and the edge trusts
+        them.
+    input_bias, friction : float
+        What disturbs the plant: V on its input, and N m of Coulomb friction on the motor's shaft.
+
+    Raises
+    ------
+    InvalidInput
+        A value is out of its range, the gap goes below zero, a rate does not divide, a window is too short.
+    """
+
+    servo: Servo
+    duration: float
+    seed: int = 0
+    name: str = "servo"
+    reference: SignalLike = 0.0
+    gap: SignalLike = 0.0
+    theta_d0: float = 0.0
+    controller: Controller | None = None
+    noise: Noise | None = None
+    recording: Recording = field(default_factory=Recording)
+    uplink: LinkSettings = field(default_factory=LinkSettings)
+    downlink: LinkSettings = field(default_factory=LinkSettings)
+    twin: TwinSettings = field(default_factory=TwinSettings)
+    supervision: Supervision | None = None
+    input_bias: float = 0.0
+    friction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(NAME_PATTERN, self.name):
+            raise InvalidInput(f"name = {self.name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        if not (math.isfinite(self.duration) and self.duration > 0.0):
+            raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
+        self._check_rates()
+        as_pieces(self.reference, self.duration)
+        as_nonnegative(self.gap, self.duration, "gap", "rad")
+        self._check_window()
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Scenario:
+        """A scenario from a TOML file; a servo's path in it is relative to the file.
+
+        Raises
+        ------
+        InvalidInput
+            The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
+            is unstable on the servo even without a gap, nothing is proved for the stated range.
+        """
+        return cls.from_table(read_toml(path), Path(path).parent)
+
+    @classmethod
+    def preset(cls, name: str) -> Scenario:
+        """One of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm", "certified"."""
+        if name not in PRESETS:
+            hint = did_you_mean(name, PRESETS)
+            raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
+        text = resources.files("servotwin.cosim").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
+        return cls.from_table(parse_toml(text, f"{name}.toml"), Path())
+
+    @classmethod
+    def from_table(cls, table: Table, folder: Path) -> Scenario:
+        """A scenario from a table that was read already; a servo's path in it is relative to `folder`."""
+        values = scenario_file.read(table, folder)
+        with named(table):
+            scenario = cls(**values)
+            scenario.servo.check_loop(scenario.law)
+            scenario.agent_settings()
+            return scenario
+
+    def replace(self, **changes: Any) -> Scenario:
+        """A copy with some values changed, validated again."""
+        return dataclasses.replace(self, **changes)
+
+    def with_servo(self, servo: Servo) -> Scenario:
+        """The same with another servo and its own controller, changed where this scenario changes its servo's."""
+        if self.controller is None:
+            return self.replace(servo=servo)
+        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.controller)
+        changes = {name: value for name, value in own.items() if value != default[name]}
+        return self.replace(servo=servo, controller=servo.controller.replace(**changes))
+
+    @property
+    def law(self) -> Controller:
+        """The controller that runs."""
+        return self.servo.controller if self.controller is None else self.controller
+
+    @property
+    def model(self) -> Servo:
+        """The servo with the controller that runs: what the twin designs for."""
+        return self.servo.replace(controller=self.law)
+
+    @cached_property
+    def guarding(self) -> Guarding | None:
+        """What the edge is given where the scenario leaves its supervision to the policy; None: nothing.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is proved for the whole stated range.
+        """
+        noise = 0.0 if self.noise is None else self.noise.std
+        return None if self.supervision is not None else guarding(self.model, self.twin, noise)
+
+    @property
+    def start(self) -> Parameters:
+        """What the edge runs before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
+        if self.twin.policy == "certified":
+            fallback = guarded.supervision.fallback if guarded is not None and own else None
+            return Parameters() if fallback is None else start_of(fallback)
+        k_dz = 1.0 if self.twin.k_dz is None else self.twin.k_dz
+        return Parameters(tolerance=self.servo.tolerance_for(self.twin.initial_gap, k_dz))
+
+    @property
+    def start_law(self) -> Controller:
+        """The controller before the first update."""
+        return with_gains(self.law, self.start.gains)
+
+    @property
+    def start_tolerance(self) -> float:
+        """Dead-zone half-width before the first update, m."""
+        return self.start.tolerance
+
+    @property
+    def samples(self) -> int:
+        """Samples recorded, both ends included."""
+        return round(self.duration * self.recording.sample_rate) + 1
+
+    @property
+    def window(self) -> float:
+        """Length of a window, s."""
+        given = self.recording.window
+        return given if given is not None else (CALM_WINDOW if self.calm else WINDOW)
+
+    @property
+    def pre_trigger(self) -> float:
+        """How much of a window lies before the change of the reference, s."""
+        given = self.recording.pre_trigger
+        fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
+        return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
+
+    @property
+    def calm(self) -> bool:
+        """Whether the loop has hardly any integral action, and so nothing that makes it hunt through the gap."""
+        return self.law.Ki == 0.0 or self.twin.policy == "certified"
+
+    def agent_settings(self) -> AgentSettings:
+        """What the edge is told.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is proved for the whole stated range.
+        """
+        settings, guarded = dataclasses.replace(self._recorded(), parameters=self.start), self.guarding
+        if guarded is not None:
+            given = self.recording.limits
+            limits = guarded.limits if given == Limits() else given
+            return dataclasses.replace(
+                settings,
+                limits=limits,
+                controller=self.law,
+                own=guarded.middle if given == Limits() else gains_of(self.servo.controller),
+                supervision=guarded.supervision,
+            )
+        if self.supervision is not None:
+            own = gains_of(self.servo.controller)
+            return dataclasses.replace(settings, controller=self.law, own=own, supervision=self.supervision)
+        return settings
+
+    def _recorded(self) -> AgentSettings:
+        """The part that is about windows."""
+        r = self.recording
+        return AgentSettings(
+            servo=self.name,
+            boot=BOOT,
+            sample_rate=r.sample_rate,
+            window_s=self.window,
+            pre_trigger_s=self.pre_trigger,
+            fine_angle=r.fine_angle,
+            retry=r.retry,
+            limits=r.limits,
+            model_version=self.servo.version,
+            novelty=self._novelty(),
+            **r.requests,
+        )
+
+    def _novelty(self) -> NoveltySettings | None:
+        """What the edge needs to tell which windows are worth sending."""
+        rules = self.recording.novelty
+        model = None if rules is None else model_of(self.servo, self.recording.sample_rate)
+        return None if rules is None or model is None else NoveltySettings(model, rules, self.twin.initial_gap)
+
+    def seed_of(self, source: str) -> int:
+        """The seed of one named source of randomness: the same for equal (seed, name, source), on every machine."""
+        return derive_seed(self.seed, self.name, source)
+
+    def _check_rates(self) -> None:
+        rate, law = self.recording.sample_rate, self.law.sample_rate
+        samples = self.duration * rate
+        self._check_size(max(rate, law or 0.0))
+        if abs(samples - round(samples)) > 1e-6:
+            raise InvalidInput(f"duration = {self.duration!r} s: must be a whole number of samples at {rate!r} Hz")
+        if law is None:
+            if self.noise is not None:
+                raise InvalidInput("noise needs a sampled controller: give the controller a sample rate in Hz")
+            if self.law.rate_limit is not None:
+                raise InvalidInput("a rate limit needs a sampled controller: give the controller a sample rate in Hz")
+            return
+        ratio = max(rate, law) / min(rate, law)
+        if abs(ratio - round(ratio)) > 1e-9 * ratio:
+            raise InvalidInput(
+                f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
+                "whole multiples of one another"
+            )
+
+    def _check_size(self, rate: float) -> None:
+        """All samples and one window fit into memory."""
+        for key, seconds in (("duration", self.duration), ("window", self.recording.longest_window or self.window)):
+            if not seconds * rate <= MOST_SAMPLES:
+                raise InvalidInput(
+                    f"{key} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} "
+                    "are allowed"
+                )
+
+    def _check_window(self) -> None:
+        """The edge accepts the window's length, and the estimator finds enough in it."""
+        self._recorded()
+        needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
+        if self.window < needed * (1.0 - 1e-9):
+            raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")

@@ -1,0 +1,1 @@
+"""Decide at the edge which windows are worth sending."""

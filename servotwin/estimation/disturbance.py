@@ -1,0 +1,220 @@
+"""What pushes and shakes a servo at rest: the bias at the motor's input, and the noise of the position.
+
+At rest nothing accelerates, so on average no torque is passed on, and the motor's voltage cancels the bias, whatever
+the controller is made of. A motor that creeps across its gap is still at rest in that sense: the voltage then carries
+its back EMF too, which is taken off (Eq 4 without acceleration). Coulomb friction holds a motor at rest against any
+voltage up to its own, and is not told from a bias.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import t as student
+
+from servotwin.estimation.estimate import NORMAL_95
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+SHORTEST = 0.1  # s at rest, without which nothing is said
+_BATCH_S, _GROUPS = 0.025, 8  # s over which samples are averaged; means that a spread is made of, at most
+_CREEP = 0.1  # V of back EMF: slower than that is at rest
+_BACK_EMF_SHARE = 0.1  # how wrong k_B may be
+_SMOOTH = 1.0  # mean square of successive differences over variance: 2 for noise, 0.2 for a swing at 3 Hz
+_FEWEST = 8  # means that tell noise from a swing
+_NEAR, _FINE = 2.0, 1e-3  # times the least spread, or V: not worth a shorter rest
+_DRIFTS = 2.0  # standard deviations from which on a drift is one
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What a window says of the input bias and the measurement's noise.
+
+    Attributes
+    ----------
+    bias : float
+        V, added to the voltage on its way to the motor; NaN when unknown.
+    bias_std : float
+        V; inf when unknown.
+    noise : float
+        m, standard deviation of the measured position about its slow motion at rest; NaN when unknown.
+    rest : float
+        s, length of the rest that this stands on; 0 without one.
+    effort : float
+        V, root mean square of the voltage in the whole window; NaN when it was not recorded.
+    reasons : tuple of str
+        Why something is unknown, one sentence each.
+    """
+
+    bias: float
+    bias_std: float
+    noise: float
+    rest: float
+    effort: float
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a bias to go by."""
+        return math.isfinite(self.bias)
+
+
+def nothing_known(effort: float, *reasons: str) -> Disturbance:
+    """Of a window without a rest; `effort` in V."""
+    return Disturbance(math.nan, math.inf, math.nan, 0.0, effort, reasons)
+
+
+def disturbance(window: Window, servo: Servo) -> Disturbance:
+    """Input bias and noise, from the longest rest that shows the bias about as well as any.
+
+    Parameters
+    ----------
+    window : Window
+        With reference, voltage and theta_m; the voltage as the motor gets it, feedforward included, bias not.
+    servo : Servo
+        For its back EMF and pitch.
+    """
+    effort = math.nan if window.voltage is None else float(np.sqrt(np.mean(window.voltage**2)))
+    missing = [name for name in ("reference", "voltage", "theta_m") if name not in window.channels]
+    if missing:
+        return nothing_known(effort, f"the window has no {' and no '.join(missing)}")
+    size = max(1, round(_BATCH_S * window.sample_rate))
+    rests = list(_rests(window, servo, size, _constant(window, size)))
+    if not rests:
+        return nothing_known(effort, _no_rest(window, size))
+    bias, std, first, last = _longest_good(rests)
+    noise = _noise(window.position[first:last], size)
+    return Disturbance(bias, std, noise, (last - first) / window.sample_rate, effort)
+
+
+def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
+    """Input bias and its spread (V) from the last `SHORTEST` s before the reference changes, or the window ends.
+
+    The first of these moments that is one of rest counts; without one, or without the channels, (NaN, inf).
+    """
+    if any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
+        return math.nan, math.inf
+    size = max(1, round(_BATCH_S * window.sample_rate))
+    ends = {last: first for first, last in reversed(_constant(window, size))}
+    shortest = [(first, last) for last, first in reversed(ends.items())]
+    bias, std, _, _ = next(_rests(window, servo, size, shortest), (math.nan, math.inf, 0, 0))
+    return bias, std
+
+
+def _longest_good(rests: list[tuple[float, float, int, int]]) -> tuple[float, float, int, int]:
+    """The longest of (bias, std, first, last) with little more than the least spread, which is partly luck."""
+    allowed = max(_NEAR * min(rest[1] for rest in rests), _FINE)
+    return max((rest for rest in rests if rest[1] <= allowed), key=lambda rest: rest[3] - rest[2])
+
+
+def _constant(window: Window, size: int) -> list[tuple[int, int]]:
+    """(first, last) of every stretch of whole batches that ends with a constant reference, and is long enough."""
+    assert window.reference is not None
+    edges = [0, *(np.flatnonzero(np.diff(window.reference)) + 1), window.reference.size]
+    shortest = max(4, math.ceil(SHORTEST * window.sample_rate / size - 1e-9))
+    pairs = pairwise(edges)
+    return [(int(b) - k * size, int(b)) for a, b in pairs for k in range(shortest, (b - a) // size + 1)]
+
+
+def _rests(
+    window: Window, servo: Servo, size: int, stretches: Sequence[tuple[int, int]]
+) -> Iterator[tuple[float, float, int, int]]:
+    """(bias, std, first, last) of those stretches in which nothing moves."""
+    begins: dict[int, int] = {}
+    for first, last in stretches:
+        begins[last] = min(first, begins.get(last, first))
+    batches = {last: _batches(window, size, first, last) for last, first in begins.items()}
+    for first, last in stretches:
+        rest = _rest(window, servo, size, (last - first) // size, batches[last])
+        if rest is not None:
+            yield *rest, first, last
+
+
+class _Batches(NamedTuple):
+    """Means of batches that end with a constant reference, and the motor's angle at the ends of each (rad)."""
+
+    angle: Array
+    position: Array
+    voltage: Array
+    ends: Array
+
+
+def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
+    assert window.voltage is not None
+    assert window.theta_m is not None
+    angle = window.theta_m[first:last]
+    position, voltage = _means(window.position[first:last], size), _means(window.voltage[first:last], size)
+    ends = np.append(angle[::size], angle[-1] + (angle[-1] - angle[-2]))
+    return _Batches(_means(angle, size), position, voltage, ends)
+
+
+def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
+    """(bias, std) of the last `count` batches; None where something moves in them."""
+    per_sample = servo.k_B * window.sample_rate
+    angle, position = batches.angle[-count:], batches.position[-count:]
+    if not (_still(angle, size, per_sample) and _still(position, size, per_sample / servo.p)):
+        return None
+    speed = per_sample * np.diff(batches.ends[-count - 1 :]) / size
+    drive = batches.voltage[-count:] - speed
+    wrong = _BACK_EMF_SHARE * abs(float(np.mean(speed)))
+    return -float(np.mean(drive)), math.hypot(_spread(drive), wrong)
+
+
+def _still(means: Array, size: int, volts: float) -> bool:
+    """Whether a signal rests but for noise; `volts` is the back EMF (V) of one unit per sample."""
+    if volts * float(np.max(np.abs(np.diff(means)))) / size <= _CREEP:
+        return True
+    return means.size >= _FEWEST and _roughness(means) >= _SMOOTH
+
+
+def _roughness(means: Array) -> float:
+    """Mean square of successive differences over the variance (von Neumann's ratio)."""
+    variance = float(np.var(means))
+    return float(np.mean(np.diff(means) ** 2)) / variance if variance > 0.0 else math.inf
+
+
+def _spread(drive: Array) -> float:
+    """Standard deviation of the mean of correlated values, from the means of groups, a drift being none of chance."""
+    count = min(_GROUPS, drive.size)
+    bounds = np.arange(count + 1) * drive.size // count
+    groups = np.add.reduceat(drive, bounds[:-1]) / np.diff(bounds)
+    line = np.arange(count) - 0.5 * (count - 1)
+    slope = float(line @ groups) / float(line @ line)
+    left = groups - groups.mean() - slope * line
+    by_chance = math.sqrt(float(left @ left) / (count - 2) * 12.0 / (count * (count * count - 1.0)))
+    drift = 0.5 * abs(slope) * (count - 1) if abs(slope) > _DRIFTS * by_chance else 0.0
+    return math.hypot(_few(count - 2) * math.sqrt(float(left @ left) / (count - 2) / count), drift)
+
+
+@lru_cache(maxsize=16)
+def _few(freedom: int) -> float:
+    """By how much more standard deviations 95 % take where few values made them."""
+    return float(student.ppf(0.975, freedom)) / NORMAL_95
+
+
+def _noise(position: Array, size: int) -> float:
+    """rms (m) about the slow motion: a straight line, or, where that leaves a smooth curve, the course of the means."""
+    count = position.size
+    line = np.arange(count) - 0.5 * (count - 1)
+    left = position - position.mean() - line * float(line @ position) / float(line @ line)
+    means = _means(left, size)
+    if _roughness(means) < _SMOOTH:
+        left = left - np.interp(np.arange(count), (np.arange(means.size) + 0.5) * size - 0.5, means)
+    return float(np.sqrt(left @ left / (count - 2)))
+
+
+def _means(samples: Array, size: int) -> Array:
+    return np.asarray(samples.reshape(-1, size).mean(axis=1))
+
+
+def _no_rest(window: Window, size: int) -> str:
+    if not _constant(window, size):
+        return f"the reference is nowhere constant for {SHORTEST:g} s"
+    return f"motor and position rest nowhere for {SHORTEST:g} s while the reference is constant"

@@ -1,0 +1,183 @@
+"""The gap together with the model's own numbers, for a machine that is not quite what its description says.
+
+Of the structure only k/m, c/m and the pitch show in its motion, of the motor, when its angle is not measured, only k_B
+(docs/motor-identifiability.md). A delay between the channels is always estimated too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.core.family import Hold
+from servotwin.estimation.joint.alone import RIVAL, Alone, searched, unsearched
+from servotwin.estimation.joint.knowledge import AnyPrior
+from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
+from servotwin.estimation.joint.settings import SPREADS, JointSettings
+from servotwin.estimation.joint.together import Together
+from servotwin.estimation.joint.verdict import Found, JointEstimate, Parameter, estimate_of, mismatched, stated
+from servotwin.estimation.trend import Prior
+from servotwin.estimation.whitened.channels import faults, motor_angle
+from servotwin.estimation.whitened.settings import Settings as Whitened
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+
+WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
+_SIGMAS = 4.0  # by how many standard deviations a gap may move when its window is fitted with others
+
+
+__all__ = ["JointEstimate", "JointSettings", "Parameter", "Prior", "estimate_jointly"]
+
+
+def estimate_jointly(
+    window: Window | Sequence[Window],
+    servo: Servo,
+    free: tuple[str, ...] | None = None,
+    prior: AnyPrior = None,
+    settings: JointSettings | None = None,
+) -> JointEstimate:
+    """The total gap with the model's numbers, from windows with or without the motor's angle.
+
+    Parameters
+    ----------
+    window : Window, or several
+        Position and theta_m, or position and voltage: the angle is then computed from the voltage. Several windows are
+        fitted together: each has its own gap and delay, k/m, c/m, pitch and k_B are the same in all.
+    servo : Servo
+        The model to start from.
+    free : tuple of str, optional
+        Of "k/m", "c/m", "pitch", "k_B", "gap rate". By default k/m, c/m and the pitch; without the motor's angle k_B in
+        place of the pitch, which it cannot be told from.
+    prior : number, GapEstimate or Prior, optional
+        A gap (rad) to search from as well; a `Prior`'s spread counts as information, on the first window.
+    settings : JointSettings, optional
+
+    Raises
+    ------
+    InvalidInput
+        Unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short; an elastic screw; no
+        window at all, or some with theta_m and some without.
+    """
+    given = settings or JointSettings()
+    windows = _windows(window)
+    names = _free(windows[0], free)
+    fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
+    found = [_alone(fit) for fit in fits]
+    counted = [i for i, fit in enumerate(fits) if not fit.blocked and not mismatched(found[i], given)]
+    if len(counted) > 1:
+        joined = _joined([fits[i] for i in counted], [found[i] for i in counted], given)
+        found = [dict(zip(counted, joined, strict=True)).get(i, one) for i, one in enumerate(found)]
+    leading = found[counted[-1] if counted else -1]
+    return estimate_of(tuple(stated(one, given) for one in found), leading, given)
+
+
+def _windows(given: Window | Sequence[Window]) -> tuple[Window, ...]:
+    """At least one, and all with the same channels."""
+    windows = (given,) if isinstance(given, Window) else tuple(given)
+    if not windows:
+        raise InvalidInput("there is no window: the joint estimator needs at least one")
+    if len({one.theta_m is None for one in windows}) > 1:
+        raise InvalidInput("some windows have theta_m (rad) and some have not: fitted together they must be alike")
+    return windows
+
+
+def _start_of(prior: AnyPrior) -> AnyPrior:
+    """What a prior means to windows that it was not made for: a gap to search from."""
+    return prior.gap if isinstance(prior, Prior) else prior
+
+
+def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
+    """Names of the free parameters, checked."""
+    measured = window.theta_m is not None
+    names = (WITH_ANGLE if measured else FROM_VOLTAGE) if free is None else tuple(free)
+    for name in names:
+        if name not in SPREADS:
+            raise InvalidInput(f"free parameter {name!r} does not exist: allowed are {', '.join(SPREADS)}")
+    if measured and "k_B" in names:
+        raise InvalidInput(
+            "k_B cannot be free where theta_m is measured: the position depends on it through theta_m only"
+        )
+    if not measured and {"k_B", "pitch"} <= set(names):
+        raise InvalidInput("k_B and pitch cannot both be free without theta_m: the position shows p/k_B only")
+    return tuple(dict.fromkeys(names))
+
+
+def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointSettings) -> JointModel:
+    if window.theta_m is None and window.voltage is None:
+        raise InvalidInput(f"{window.where}the window has neither theta_m (rad) nor voltage (V): one of them is needed")
+    if not servo.rigid:
+        raise InvalidInput(f"servo k_d = {servo.k_d} N/m: the joint estimator needs a rigid screw (k_d = inf)")
+    delay = ("delay",) if settings.largest_delay_s > 0.0 else ()
+    motor = MOTOR_START if window.theta_m is None else ()
+    margin = margin_for(settings.largest_delay_s, window.sample_rate)
+    if window.position.size < 200 + 2 * margin:
+        raise InvalidInput(f"{window.where}the window has {window.position.size} samples: at least {200 + 2 * margin}")
+    hold = settings.hold or (Hold.LINEAR if servo.controller.sample_rate is None else Hold.CONSTANT)
+    unsure = jumps(window.voltage) if motor and hold is Hold.LINEAR and window.voltage is not None else ()
+    names = ("gap", "place", *delay, *free, *motor, *(f"{JUMP}{index}" for index in unsure))
+    return JointModel(window, servo, names, hold, margin, unsure)
+
+
+def _faults(window: Window) -> tuple[str, ...]:
+    """What is plainly wrong with the channels that are used."""
+    angle = window.position if window.theta_m is None else window.theta_m
+    sentences = faults(Window(window.position, angle, sample_rate=window.sample_rate))
+    return tuple(one for one in sentences if window.theta_m is not None or not one.startswith("theta_m"))
+
+
+def _still(window: Window) -> bool:
+    """Whether the voltage is all there is, and constant."""
+    return window.theta_m is None and window.voltage is not None and float(np.ptp(window.voltage)) == 0.0
+
+
+def _fit(window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, settings: JointSettings) -> Alone:
+    """One window by itself; not searched when its channels are useless."""
+    broken = "; ".join(_faults(window))
+    if window.theta_m is not None and not broken:
+        window = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, Whitened()))
+    model = _model(window, servo, names, settings)
+    silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
+    if broken or silence:
+        return unsearched(model, prior, settings, blocked=broken or silence)
+    return searched(model, prior, settings)
+
+
+def _alone(fit: Alone) -> Found:
+    """The best minimum of one window, and what speaks against it being the only one."""
+    best = fit.best
+    rivals = tuple(float(one.point[0]) for one in fit.minima[1:] if one.cost < best.cost + RIVAL)
+    objection = fit.blocked or _doubt(best.converged, float(best.point[0]), rivals)
+    return Found(fit.model, best.point, best.covariance(), fit.evaluations, objection)
+
+
+def _joined(fits: Sequence[Alone], alone: Sequence[Found], settings: JointSettings) -> list[Found]:
+    """The windows fitted together; one whose gap moves by more than its spread contradicts the others."""
+    whole = Together.of(fits)
+    best, rivals = whole.solved()
+    covariance, found = best.covariance(), []
+    for before, place, others in zip(alone, whole.places, rivals, strict=True):
+        point = best.point[place]
+        objection = _doubt(best.converged, float(point[0]), others)
+        one = Found(before.model, point, covariance[np.ix_(place, place)], best.evaluations, objection)
+        found.append(replace(one, contradiction=_contradiction(before, one, settings)))
+    return found
+
+
+def _contradiction(before: Found, after: Found, settings: JointSettings) -> str:
+    """Why a window is not of the same machine as the others; empty when it may be."""
+    moved, spread = after.point[0] - before.point[0], math.hypot(before.std(settings), settings.model_error_rad)
+    if before.objection or not abs(moved) > _SIGMAS * spread:
+        return ""
+    return f"fitted with the other windows the gap moves by {math.degrees(moved):.3g} deg: the machine is not the same"
+
+
+def _doubt(converged: bool, gap: float, rivals: tuple[float, ...]) -> str:
+    """Why a minimum may not be the right one; empty when it is."""
+    if not converged:
+        return "the search did not converge"
+    gaps = ", ".join(f"{math.degrees(one):.3g} deg" for one in (gap, *rivals))
+    return f"several gaps explain the window: {gaps}" if rivals else ""

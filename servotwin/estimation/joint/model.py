@@ -1,0 +1,236 @@
+"""The position as a function of the gap and of the model's own numbers, with its exact derivatives.
+
+From the motor's angle, or, where that is not measured, from the voltage: theta_m = G1 u. The screw follows through the
+gap, the structure answers, and the whole may come late by a delay. The structure's initial state and the encoder's
+offset are linear and found on the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
+from servotwin.estimation.core.family import STRUCTURE, Hold, Sampled, motor_family, structure_family
+from servotwin.estimation.core.projection import orthonormal, project_out
+from servotwin.estimation.joint.motor_information import through_gap
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+Reduce: TypeAlias = Callable[[Array], Array]
+MOTOR_START = ("speed0", "current0")  # rad/s and A at the first sample, when only the voltage is known
+JUMP = "jump "  # V s: what a jump of the voltage between two samples adds to the area of the line between them
+_EDGE = 2  # samples that interpolation needs beyond the shift
+_ROUNDING = 1e-9  # of a derivative: what the nuisances leave of it below this is none
+_MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Residual (m,) at a point and its derivatives (P, m) by the parameters, nuisances projected out."""
+
+    residual: Array
+    jacobian: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointModel:
+    """What a window should show, for values of named parameters.
+
+    Parameters are "gap" (rad), "place" (-1..1, where in the gap the screw begins), "delay" (s, of the position),
+    "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch" and "k_B" over the servo's, "speed0" and "current0".
+
+    Attributes
+    ----------
+    window : Window
+    servo : Servo
+    names : tuple of str
+    hold : Hold
+        Of the voltage; counts only where theta_m is not measured.
+    margin : int
+        Samples left out at either end, so that any allowed delay finds its samples.
+    jumps : tuple of int
+        Samples after which the voltage jumps at a time unknown.
+    """
+
+    window: Window
+    servo: Servo
+    names: tuple[str, ...]
+    hold: Hold
+    margin: int
+    jumps: tuple[int, ...] = ()
+
+    @property
+    def rate(self) -> float:
+        """Hz."""
+        return self.window.sample_rate
+
+    @property
+    def of_structure(self) -> tuple[str, ...]:
+        """The structure's free parameters."""
+        return tuple(name for name in STRUCTURE if name in self.names)
+
+    @property
+    def measured(self) -> Array:
+        """(1, n - 2 margin) position, counted from its first sample."""
+        position = self.window.position - self.window.position[0]
+        return position[None, self.margin : position.size - self.margin]
+
+    def adapted(self, values: Mapping[str, float]) -> Servo:
+        """The servo with the parameters' factors."""
+        k, c, p, k_B = (math.exp(values.get(name, 0.0)) for name in (*STRUCTURE, "k_B"))
+        one = self.servo
+        return one.replace(k=tuple(k * one.stiffnesses), c=tuple(c * one.dampings), p=p * one.p, k_B=k_B * one.k_B)
+
+    def motor(self, servo: Servo, values: Mapping[str, float]) -> tuple[Array, dict[str, Array]]:
+        """Angle of the motor from its first sample on (n,), and its derivatives by the parameters it depends on."""
+        if self.window.theta_m is not None:
+            return self.window.theta_m - self.window.theta_m[0], {}
+        assert self.window.voltage is not None
+        start = np.array([values.get("current0", 0.0), values.get("speed0", 0.0), 0.0])
+        family = motor_family(servo).select(("k_B",))
+        sampled, kick = family.sampled(self.rate, self.hold), family.sampled(2.0 * self.rate).F[0] @ family.system.B
+        angle, by_k_B = sampled.respond(self.window.voltage, start)
+        free = sampled.free(angle.size)
+        by = {"k_B": by_k_B, "current0": free[0], "speed0": free[1]}
+        for index in self.jumps:
+            name = f"{JUMP}{index}"
+            by[name] = np.zeros(angle.size)
+            by[name][index + 1 :] = kick @ free[:, : angle.size - index - 1]
+            angle = angle + values.get(name, 0.0) * by[name]
+        return angle, by
+
+    def screw(self, values: Mapping[str, float]) -> tuple[Servo, Array, Gap]:
+        """The adapted servo, the motor's angle and the gap that the screw follows it through."""
+        servo = self.adapted(values)
+        theta_m, _ = self.motor(servo, values)
+        return servo, theta_m, self.gap_at(theta_m, values)
+
+    def gap_at(self, theta_m: Array, values: Mapping[str, float]) -> Gap:
+        """The play operator's arguments."""
+        gap = values["gap"]
+        return Gap(gap, float(theta_m[0]) + 0.5 * gap * values["place"], values.get("gap rate", 0.0) / self.rate)
+
+    def cost(self, values: Mapping[str, float], reduce: Reduce) -> float:
+        """Squared length of the residual, nuisances projected out."""
+        servo, theta_m, at = self.screw(values)
+        structure = structure_family(servo).select(()).sampled(self.rate)
+        forced = structure.plain(contacts(theta_m, at)[:1])
+        shift = values.get("delay", 0.0) * self.rate
+        rows = reduce(np.vstack([self.measured - self.delayed(forced, shift), self.nuisances(structure, shift)]))
+        left = project_out(orthonormal(rows[1:]), rows[:1])[0]
+        return float(left @ left)
+
+    def slopes(self, values: Mapping[str, float], reduce: Reduce) -> Slopes:
+        """Residual and derivatives; those of the nuisances by the parameters are included."""
+        table = self.table(values, reduce)
+        split = table.shape[0] - len(self.names)
+        basis, moved = orthonormal(table[1:split]), table[split:]
+        left = project_out(basis, np.vstack([table[:1], -moved]))
+        left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
+        return Slopes(left[0], left[1:], float(left[0] @ left[0]))
+
+    def table(self, values: Mapping[str, float], reduce: Reduce) -> Array:
+        """(1 + N + 1 + P, m) measured less forced position, nuisances, derivatives of the position by `names`."""
+        servo = self.adapted(values)
+        theta_m, by_motor = self.motor(servo, values)
+        at = self.gap_at(theta_m, values)
+        seen = contacts(theta_m, at)
+        structure = structure_family(servo).select(self.of_structure).sampled(self.rate)
+        shift = values.get("delay", 0.0) * self.rate
+        forced = self.delayed(structure.plain(seen[:1]), shift)
+        rows = reduce(np.vstack([self.measured - forced, self.nuisances(structure, shift)]))
+        weights = np.linalg.lstsq(rows[1:].T, rows[0], rcond=None)[0]
+        tangents = self._tangents(seen, theta_m, at, by_motor, values)
+        derivatives = self._derivatives(structure, seen, weights[:-1], tangents)
+        return np.vstack([rows, reduce(np.array([self._row(derivatives[name], name, shift) for name in self.names]))])
+
+    def _tangents(
+        self, seen: Array, theta_m: Array, at: Gap, by_motor: Mapping[str, Array], values: Mapping[str, float]
+    ) -> dict[str, Array]:
+        """(n,) derivatives of the screw's angle by the parameters that move it."""
+        moved = {
+            "gap": seen[BY_GAP] + 0.5 * values["place"] * seen[BY_START],
+            "place": 0.5 * values["gap"] * seen[BY_START],
+            "gap rate": seen[BY_RATE] / self.rate,
+        }
+        if by_motor:
+            passed = through_gap(np.array(list(by_motor.values())), theta_m, at)
+            moved.update(zip(by_motor, passed, strict=True))
+        return {name: row for name, row in moved.items() if name in self.names}
+
+    def _derivatives(
+        self, structure: Sampled, seen: Array, initial: Array, tangents: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """(n,) derivatives of the position at the full rate; "delay" holds the position itself."""
+        whole = structure.respond(seen[SCREW], initial)
+        moved = structure.plain(np.array(list(tangents.values())))
+        return {
+            **dict(zip(("delay", *self.of_structure), whole, strict=True)),
+            **dict(zip(tangents, moved, strict=True)),
+        }
+
+    def _row(self, row: Array, name: str, shift: float) -> Array:
+        if name != "delay":
+            return self.delayed(row[None], shift)[0]
+        return -self.rate * self.delayed(row[None], shift, slope=True)[0]
+
+    def nuisances(self, structure: Sampled, shift: float) -> Array:
+        """(N + 1, n - 2 margin) free motions of the structure and the encoder's offset."""
+        free = self.delayed(structure.free(self.window.position.size), shift)
+        return np.vstack([free, self.servo.p * np.ones(free.shape[1])])
+
+    def delayed(self, rows: Array, shift: float, slope: bool = False) -> Array:
+        """(k, n - 2 margin) of rows (k, n): `shift` samples later, by cubics; or their slopes per sample."""
+        whole = math.floor(-shift)
+        weights = cubic_slopes(-shift - whole) if slope else cubic(-shift - whole)
+        first, size = self.margin + whole - 1, rows.shape[1] - 2 * self.margin
+        return sum(
+            (weight * rows[:, first + j : first + j + size] for j, weight in enumerate(weights)),
+            start=np.zeros((len(rows), size)),
+        )
+
+
+def jumps(voltage: Array) -> tuple[int, ...]:
+    """Samples after which a voltage (n,) jumps: where a controller lets go, takes hold, or has its reference stepped.
+
+    A jump is a difference that stands out from those before and after it, by much of the range and of what is usual.
+    """
+    change = np.diff(voltage)
+    usual = 0.5 * (np.abs(change[:-2]) + np.abs(change[2:]))
+    excess = np.abs(change[1:-1]) - 2.0 * np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
+    telling = excess > max(_TELLING * float(np.ptp(voltage)), _USUAL * float(np.median(usual)))
+    found = np.flatnonzero(telling)
+    largest = found[np.argsort(-excess[found], kind="stable")[:_MOST_JUMPS]]
+    return tuple(int(i) + 1 for i in np.sort(largest))
+
+
+def margin_for(limit: float, rate: float) -> int:
+    """Samples to leave out at either end for delays of up to `limit` (s) at `rate` (Hz)."""
+    return math.ceil(limit * rate) + _EDGE
+
+
+def cubic(x: float) -> tuple[float, float, float, float]:
+    """Weights of the samples at -1, 0, 1, 2 for the value at x (0..1) of the cubic through them."""
+    return (
+        -x * (x - 1.0) * (x - 2.0) / 6.0,
+        (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0,
+        -(x + 1.0) * x * (x - 2.0) / 2.0,
+        (x + 1.0) * x * (x - 1.0) / 6.0,
+    )
+
+
+def cubic_slopes(x: float) -> tuple[float, float, float, float]:
+    """The same for the slope, per sample."""
+    return (
+        -(3.0 * x * x - 6.0 * x + 2.0) / 6.0,
+        (3.0 * x * x - 4.0 * x - 1.0) / 2.0,
+        -(3.0 * x * x - 2.0 * x - 2.0) / 2.0,
+        (3.0 * x * x - 1.0) / 6.0,
+    )

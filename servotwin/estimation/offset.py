@@ -1,0 +1,130 @@
+"""The encoder's offset as a window shows it, beside the gap; and the gap as one contact shows it, the offset known.
+
+The offset is position / static gain less the screw's angle: what the encoder would have to be shifted by for both to
+agree at rest. It is a constant in the residual, so it costs nothing to read once the gap is known; what earlier windows
+tell of it lets later ones show the gap with one contact only. It is constant as long as the gap opens to both sides
+alike; `TrendSettings.offset_walk_rad_per_sqrt_s` is for wear on one flank.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation import whitened
+from servotwin.estimation.core.between import polygon
+from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap
+from servotwin.estimation.core.normal import least_squares
+from servotwin.estimation.core.response import response
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.estimation.whitened.channels import motor_angle
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+_GAP, _CONSTANT = 0, 1  # rows of the columns
+# An offset that is right leaves what was left without it. A search that lost its way in the narrow valley which the
+# offset makes was sure of gaps 1 deg off, and left a hundred times as much.
+_WORSE = 3.0
+
+
+def estimate_carrying(
+    window: Window,
+    servo: Servo,
+    prior: float | GapEstimate | None,
+    settings: whitened.Settings,
+    carried: tuple[float, float] | None,
+) -> GapEstimate:
+    """The gap from the window alone, or, where that shows too little of it, with the offset that earlier ones showed.
+
+    The estimate says what it knows of the offset, for the trend. A window that shows both sides of the gap is never
+    told of the offset, so that an encoder that has slipped cannot spoil it.
+
+    Parameters
+    ----------
+    window : Window
+    servo : Servo
+    prior : float or GapEstimate, optional
+        As for `estimate_gap`.
+    settings : whitened.Settings
+        With an `offset` of its own, nothing is carried and nothing read.
+    carried : (float, float), optional
+        Mean and standard deviation of the offset, rad.
+    """
+    fitted = whitened.fit(window, servo, prior, settings)
+    known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
+    # A window of one contact can show nothing alone; looking for how little it shows takes longer than all the rest.
+    alone = None if known and fitted.one_sided() else fitted.concluded()
+    if alone is not None:
+        if settings.offset is None and alone.ok:
+            return replace(alone, offset=read_offset(window, servo, alone, settings))
+        if not known or alone.status is GapStatus.MODEL_MISMATCH:
+            return alone
+    assert carried is not None
+    helped = whitened.estimate(window, servo, prior, replace(settings, offset=carried))
+    if helped.ok and not helped.rms > _WORSE * fitted.rms():
+        slope = _slope(_columns(window, servo, helped, settings))
+        return replace(helped, offset=CarriedOffset(*carried, slope))
+    return _refused(alone or fitted.concluded(), helped)
+
+
+def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
+    """What a window says alone, with why nothing else is believed."""
+    if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
+        return alone
+    worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
+    return replace(alone, reasons=(*alone.reasons, worse))
+
+
+def read_offset(
+    window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings | None = None
+) -> OffsetReading:
+    """The offset (rad) with its standard deviation and its covariance with the gap.
+
+    Shape of the covariance: that of white noise; size: such that the gap's variance is the estimate's `std_total`
+    squared, so that whatever that accounts for widens the offset in proportion.
+
+    Raises
+    ------
+    InvalidInput
+        The estimate is not OK, or the window has no theta_m.
+    """
+    if window.theta_m is None or not estimate.ok:
+        missing = "theta_m" if window.theta_m is None else "an OK estimate"
+        raise InvalidInput(f"{window.where}the encoder's offset needs {missing}")
+    table = _columns(window, servo, estimate, settings or whitened.Settings())
+    residual, columns = table[0], table[1:]
+    gain = response(servo, window.sample_rate).static_gain
+    solved = least_squares(np.delete(columns, _GAP, axis=0), residual)
+    covariance = _scaled(least_squares(columns, residual).root, estimate.std_total)
+    offset = float(solved.coefficients[0]) + float(window.position[0]) / gain - float(window.theta_m[0])
+    return OffsetReading(offset, math.sqrt(covariance[1, 1]), float(covariance[0, 1]))
+
+
+def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings) -> Array:
+    """(k, n) residual, its derivatives by gap and constant (per rad of offset), nuisances."""
+    model = response(servo, window.sample_rate)
+    angle = motor_angle(window, servo.encoder_resolution, settings)
+    first, home = float(angle[0]), float(window.position[0])
+    seen = polygon(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
+    rows = model.respond(seen[[SCREW, BY_GAP, BY_START]])
+    constant = np.full((1, angle.size), model.static_gain)
+    late = model.velocities(seen[[SCREW]])
+    return np.vstack([window.position - home - rows[0], rows[1:2], constant, rows[2:], model.free(angle.size), late])
+
+
+def _slope(table: Array) -> float:
+    """By how much the gap of the best fit changes per change of the offset."""
+    columns = table[1:]
+    answer = least_squares(np.delete(columns, _CONSTANT, axis=0), columns[_CONSTANT])
+    return -float(answer.coefficients[_GAP])
+
+
+def _scaled(root: Array, std: float) -> Array:
+    """(2, 2) covariance of gap and offset, scaled to a standard deviation of the gap (rad)."""
+    pair = root[:, :2]
+    covariance = pair.T @ pair
+    return np.asarray(covariance * (std * std / float(covariance[0, 0])))

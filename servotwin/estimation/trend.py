@@ -1,0 +1,264 @@
+"""How the gap grows from window to window: a Kalman filter on the gap, its wear rate and the encoder's offset.
+
+The state is frozen; `predict` and `update` return the next one. Between windows the rate performs a random walk and
+the gap integrates it (an integrated Wiener process), the offset performs a random walk of its own. Every window's
+estimate corrects the state with its `std_total`; the state gives the next window's prior.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, Interval, OffsetReading
+from servotwin.estimation.passage import Passage, passage
+from servotwin.estimation.trend_model import (
+    GAP,
+    OFFSET,
+    RATE,
+    Reading,
+    bound_std,
+    process_noise,
+    reading,
+    transition,
+    truncation,
+)
+from servotwin.estimation.trend_settings import TrendSettings
+from servotwin.plant.signals import Array
+
+__all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
+
+_OUTLIER = "the window did not count, being an outlier"
+_MOVED = "the encoder's offset is not what it was: it is read anew from this window"
+_DOUBTED = "the gap rested on the encoder's offset, which is forgotten until a window shows it again"
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before a window: mean and standard deviation of the gap and of the encoder's offset, rad."""
+
+    gap: float
+    gap_std: float
+    offset: float
+    offset_std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Gap, wear rate and encoder offset at a time, with their covariance.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    mean : (3,) array
+        Total gap (rad), wear rate (rad/s), offset of the encoder (rad).
+    covariance : (3, 3) array
+        Of `mean`, without the error that all windows share.
+    settings : TrendSettings
+    updates : int
+        Windows that counted.
+    refused : int
+        Outliers since the last window that counted.
+    reasons : tuple of str
+        Why the last window did not count, or counted otherwise than as a plain value.
+    rival : Trend or None
+        The state that outliers since then would make; it takes over once `restart_after` of them agree.
+    """
+
+    time: float
+    mean: Array
+    covariance: Array
+    settings: TrendSettings
+    updates: int = 0
+    refused: int = 0
+    reasons: tuple[str, ...] = ()
+    rival: Trend | None = None
+
+    @classmethod
+    def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:
+        """Before the first window: zero, as uncertain as the settings say."""
+        given = settings or TrendSettings()
+        spread = np.array([given.gap_std_rad, given.rate_std_rad_per_s, given.offset_std_rad])
+        return cls(_time(time), np.zeros(3), np.diag(spread**2), given)
+
+    def predict(self, time: float) -> Trend:
+        """The state at a later time, s.
+
+        Raises
+        ------
+        InvalidInput
+            The time is not finite or lies before the state's.
+        """
+        step = _time(time) - self.time
+        if step < 0.0:
+            raise InvalidInput(f"trend: time {time:.9g} s lies before {self.time:.9g} s; windows must come in order")
+        flow = transition(step)
+        covariance = flow @ self.covariance @ flow.T + process_noise(step, self.settings)
+        rival = self.rival and self.rival.predict(time)
+        return replace(self, time=float(time), mean=flow @ self.mean, covariance=covariance, reasons=(), rival=rival)
+
+    def update(self, estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None = None) -> Trend:
+        """The state at the estimate's time, corrected by it.
+
+        Only an OK estimate counts as a value. A lower bound counts one-sidedly: it moves the state only as far as the
+        state lies below it. Others leave the prediction as it is, and say why.
+
+        Parameters
+        ----------
+        estimate : GapEstimate
+        offset : OffsetReading or CarriedOffset, optional
+            The encoder's offset in the same window; None: the estimate's own.
+        """
+        ahead = self.predict(estimate.time)
+        if estimate.ok:
+            return ahead._corrected(reading(estimate, offset or estimate.offset))
+        if estimate.status is GapStatus.LOWER_BOUND and math.isfinite(estimate.gap):
+            return ahead._bounded(estimate)
+        because = "; ".join(estimate.reasons) or "no reason given"
+        return replace(ahead, reasons=(f"the window did not count, being {estimate.status.value}: {because}",))
+
+    def without_offset(self) -> Trend:
+        """The same wear seen by an encoder of which nothing is known, as after it was homed anew."""
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[OFFSET] = covariance[OFFSET] = covariance[:, OFFSET] = 0.0
+        covariance[OFFSET, OFFSET] = self.settings.offset_std_rad**2
+        rival = self.rival and self.rival.without_offset()
+        return replace(self, mean=mean, covariance=covariance, rival=rival)
+
+    def on_clock(self, time: float) -> Trend:
+        """The same state on a clock that now reads `time`, s."""
+        return replace(self, time=_time(time), rival=self.rival and self.rival.on_clock(time))
+
+    def _corrected(self, seen: Reading) -> Trend:
+        """Corrected by what was seen, unless the gap is an outlier; an offset that is one is read anew."""
+        distance = self._distance(seen.of_gap)
+        if distance > self.settings.outlier_std:
+            return self._refused(distance, seen)
+        if self._distance(seen) > self.settings.outlier_std:
+            return replace(self.without_offset()._joseph(seen), reasons=(_MOVED,))
+        return self._joseph(seen)
+
+    def _distance(self, seen: Reading) -> float:
+        """How far from the prediction, in standard deviations of both."""
+        surprise = seen.values - seen.select @ self.mean
+        spread = seen.select @ self.covariance @ seen.select.T + seen.noise
+        return math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
+
+    def _joseph(self, seen: Reading) -> Trend:
+        """Kalman update; Joseph's form keeps the covariance definite."""
+        select, noise = seen.select, seen.noise
+        spread = select @ self.covariance @ select.T + noise
+        gain = np.linalg.solve(spread, select @ self.covariance).T
+        left = np.eye(3) - gain @ select
+        covariance = left @ self.covariance @ left.T + gain @ noise @ gain.T
+        mean = self.mean + gain @ (seen.values - select @ self.mean)
+        counted = self.updates + 1
+        return replace(self, mean=mean, covariance=_symmetric(covariance), updates=counted, refused=0, rival=None)
+
+    def _refused(self, distance: float, seen: Reading) -> Trend:
+        """The prediction with one more refusal; or what the outliers say, once enough of them agree."""
+        expected = f"{math.degrees(self.mean[GAP]):.4g} deg were expected"
+        limit = f"{distance:.3g} standard deviations away, and {self.settings.outlier_std:.3g} are allowed"
+        refused = replace(self, refused=self.refused + 1, reasons=(f"{_OUTLIER}: {expected}, {limit}",))
+        if _leans_on_offset(seen):
+            return replace(refused.without_offset(), reasons=(*refused.reasons, _DOUBTED))
+        rival = self._rival(seen)
+        if rival.updates < self.settings.restart_after:
+            return replace(refused, rival=rival)
+        reason = f"outliers in a row that agree: {rival.updates}; the gap starts afresh, as after a crash or a repair"
+        return replace(rival, updates=self.updates + rival.updates, reasons=(reason,))
+
+    def _rival(self, seen: Reading) -> Trend:
+        """The state that the outliers so far would make, were they right: of those that agree with this one."""
+        if self.rival is not None and self.rival._distance(seen.of_gap) <= self.settings.agreement_std:
+            return self.rival._corrected(seen)
+        fresh = Trend.start(self.time, self.settings).covariance
+        fresh[RATE, RATE] = self.covariance[RATE, RATE]
+        mean = np.array([0.0, self.mean[RATE], 0.0])
+        return Trend(self.time, mean, fresh, self.settings)._joseph(seen)
+
+    def _bounded(self, estimate: GapEstimate) -> Trend:
+        """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
+        column = self.covariance[:, GAP]
+        spread = math.hypot(math.sqrt(column[GAP]), bound_std(estimate))
+        margin = (self.mean[GAP] - estimate.gap) / spread if spread > 0.0 else math.inf
+        pull, cut = truncation(margin)
+        gain = column / spread if spread > 0.0 else np.zeros(3)
+        covariance = _symmetric(self.covariance - np.outer(gain, gain) * cut)
+        reason = f"only a lower bound of {math.degrees(estimate.gap):.4g} deg: it counts where the trend lies below it"
+        return replace(self, mean=self.mean + gain * pull, covariance=covariance, reasons=(reason,))
+
+    @property
+    def gap(self) -> float:
+        """Total gap, rad, at least 0."""
+        return max(0.0, float(self.mean[GAP]))
+
+    @property
+    def gap_std(self) -> float:
+        """Standard deviation of the gap, the error shared by all windows included, rad."""
+        return math.hypot(math.sqrt(self.covariance[GAP, GAP]), self.settings.shared_error_rad)
+
+    @property
+    def gap_interval(self) -> Interval:
+        """95 % interval of the total gap, rad, cut at 0."""
+        middle, half = float(self.mean[GAP]), NORMAL_95 * self.gap_std
+        return max(0.0, middle - half), max(0.0, middle + half)
+
+    @property
+    def rate(self) -> float:
+        """Growth of the total gap, rad/s."""
+        return float(self.mean[RATE])
+
+    @property
+    def rate_std(self) -> float:
+        """rad/s."""
+        return math.sqrt(self.covariance[RATE, RATE])
+
+    @property
+    def rate_interval(self) -> Interval:
+        """95 % interval of the wear rate, rad/s; with both signs in it, wear is not yet established."""
+        return self.rate - NORMAL_95 * self.rate_std, self.rate + NORMAL_95 * self.rate_std
+
+    @property
+    def prior(self) -> Prior:
+        """What the next window may start from; predict to its time first."""
+        return Prior(self.gap, self.gap_std, float(self.mean[OFFSET]), math.sqrt(self.covariance[OFFSET, OFFSET]))
+
+    def as_estimate(self) -> GapEstimate:
+        """The state as a prior for `estimate_gap`; predict to the next window's time first."""
+        std = math.sqrt(self.covariance[GAP, GAP])
+        return GapEstimate(self.gap, std, self.gap_std, self.gap_interval, GapStatus.OK, self.time, method="trend")
+
+    def time_until(self, gap: float) -> Passage:
+        """How long from now until the gap (rad, total) has grown to `gap`: see `servotwin.estimation.passage`.
+
+        Raises
+        ------
+        InvalidInput
+            The gap is negative or not finite.
+        """
+        if not 0.0 <= gap < math.inf:
+            raise InvalidInput(f"trend: gap = {gap!r} rad: must be finite and at least 0")
+        covariance = self.covariance[:OFFSET, :OFFSET].copy()
+        covariance[GAP, GAP] += self.settings.shared_error_rad**2
+        walks = self.settings.gap_walk_rad_per_sqrt_s, self.settings.rate_walk_rad_per_s_per_sqrt_s
+        return passage(self.mean[:OFFSET], covariance, gap, *walks)
+
+
+def _leans_on_offset(seen: Reading) -> bool:
+    """Whether a gap was read by means of the carried offset."""
+    return bool(seen.select[0, OFFSET] != 0.0)
+
+
+def _symmetric(matrix: Array) -> Array:
+    return 0.5 * (matrix + matrix.T)
+
+
+def _time(value: float) -> float:
+    if not math.isfinite(value):
+        raise InvalidInput(f"trend: time = {value!r} s: must be finite")
+    return float(value)

@@ -1,0 +1,214 @@
+"""The default estimator: play operator and exact structure at the full rate, nuisances projected out, noise whitened.
+
+The residual and its derivatives are filtered, never the motor's angle: a filter commutes with the structure, not with
+the play operator. docs/estimator.md explains it and says how well it does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.core.contacts import Travel, travel
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
+from servotwin.estimation.whitened.aligned import Aligned, align_and_fit
+from servotwin.estimation.whitened.channels import faults, motor_angle
+from servotwin.estimation.whitened.diagnosis import likely_fault
+from servotwin.estimation.whitened.gate import Evidence, judge, lower_bound, one_sided
+from servotwin.estimation.whitened.lost_motion import static_lost_motion
+from servotwin.estimation.whitened.model_check import Shift, model_shift, observer_shift
+from servotwin.estimation.whitened.passes import Found
+from servotwin.estimation.whitened.profile import profile_interval
+from servotwin.estimation.whitened.settings import Settings
+from servotwin.estimation.whitened.unexplained import noise_left, slow_share
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+__all__ = ["METHOD", "SHORTEST", "Fitted", "Settings", "estimate", "fit"]
+
+METHOD = "whitened"
+SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
+
+
+def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> GapEstimate:
+    """The total gap (rad) that a window with theta_m and position shows.
+
+    Parameters
+    ----------
+    window : Window
+    servo : Servo
+        The model; that it fits the window is checked.
+    prior : float or GapEstimate, optional
+        Total gap, rad: one of the starts, and what is given back when the window says nothing.
+    settings : Settings, optional
+
+    Raises
+    ------
+    InvalidInput
+        No theta_m, a window too short, a low-pass above half the sample rate.
+    """
+    return fit(window, servo, prior, settings).concluded()
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A window's fit, before anything is held against it, which takes longer than the fit.
+
+    Attributes
+    ----------
+    window : Window
+    servo : Servo
+    prior : float or GapEstimate, optional
+    settings : Settings
+    blank : GapEstimate
+        What is known without the window; its status and reasons are final where the channels are broken.
+    angle : (n,) array
+        rad, of the motor.
+    aligned : Aligned, optional
+        None: the channels are broken.
+    """
+
+    window: Window
+    servo: Servo
+    prior: float | GapEstimate | None
+    settings: Settings
+    blank: GapEstimate
+    angle: Array
+    aligned: Aligned | None
+
+    def one_sided(self) -> str:
+        """Why the window cannot show the gap, whatever else is found: too little contact; empty: it has enough."""
+        return "" if self.aligned is None else one_sided(_travel(self.aligned.found), self.settings)
+
+    def rms(self) -> float:
+        """m, what the fit leaves."""
+        return math.nan if self.aligned is None else _left(self.aligned.found)
+
+    def concluded(self) -> GapEstimate:
+        """The estimate, judged."""
+        if self.aligned is None:
+            return self.blank
+        seen = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
+        status, reasons = judge(seen, self.settings)
+        if status is GapStatus.MODEL_MISMATCH:
+            reasons = (*likely_fault(self.window, self.angle, self.servo, seen.unexplained), *reasons)
+        return _stated(self.blank, seen, status, reasons, self.prior, self.settings)
+
+
+def fit(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> Fitted:
+    """The first half of `estimate`, with the same arguments and errors."""
+    settings = settings or Settings()
+    _check(window)
+    assert window.theta_m is not None
+    blank = _nothing(window, servo, prior)
+    broken = faults(window)
+    if broken:
+        dead = any("constant" in sentence for sentence in broken)
+        blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
+        return Fitted(window, servo, prior, settings, blank, window.theta_m, None)
+    angle = motor_angle(window, servo.encoder_resolution, settings)
+    aligned = align_and_fit(angle, window.position, window.sample_rate, servo, _start(prior), settings)
+    return Fitted(window, servo, prior, settings, blank, angle, aligned)
+
+
+def _check(window: Window) -> None:
+    if window.theta_m is None:
+        raise InvalidInput(f"{window.where}the window has no theta_m: method 'whitened' needs the motor's angle in rad")
+    if window.position.size < SHORTEST:
+        size = window.position.size
+        raise InvalidInput(f"{window.where}the window has {size} samples: method 'whitened' needs at least {SHORTEST}")
+
+
+def _start(prior: float | GapEstimate | None) -> float:
+    value = prior.gap if isinstance(prior, GapEstimate) else prior
+    return 0.0 if value is None or not math.isfinite(value) else value
+
+
+def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, settings: Settings) -> Evidence:
+    found = aligned.found
+    std = settings.calibration * found.std * math.sqrt(max(1.0, found.variance))
+    gain = found.reduction.response.static_gain
+    identifiable = math.isfinite(found.std)
+    return Evidence(
+        aligned,
+        std,
+        profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
+        _travel(found),
+        model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, "", 0.0),
+        observer_shift(found, servo) if identifiable else (0.0, math.inf),
+        static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
+        slow_share(found),
+    )
+
+
+def _left(found: Found) -> float:
+    """m rms, what the fit leaves."""
+    return float(np.sqrt(np.mean(noise_left(found) ** 2)))
+
+
+def _travel(found: Found) -> Travel:
+    """Of the screw, without the end of the window, to which the last mass cannot have answered."""
+    reduction, model = found.reduction, found.reduction.response
+    kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
+    middle = found.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - kept)
+    at = found.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
+    return travel(reduction.theta_m[:kept], at)
+
+
+def _stated(
+    blank: GapEstimate,
+    seen: Evidence,
+    status: GapStatus,
+    reasons: tuple[str, ...],
+    prior: float | GapEstimate | None,
+    settings: Settings,
+) -> GapEstimate:
+    """The estimate that the evidence makes of a blank one."""
+    found = seen.aligned.found
+    systematic = math.hypot(settings.model_error, seen.shift.gap)
+    result = replace(
+        blank,
+        status=status,
+        reasons=reasons,
+        rms=_left(found),
+        evaluations=found.evaluations,
+    )
+    if status is GapStatus.LOWER_BOUND:
+        bound = lower_bound(seen, settings)
+        return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
+    if status is not GapStatus.OK:
+        return result
+    total = math.hypot(seen.std, systematic)
+    first = seen.aligned.first + 0.5 * found.point.gap * found.point.place
+    result = replace(result, gap=found.point.gap, std=seen.std, std_total=total, theta_d0=first)
+    result = replace(result, interval=_widened(found.point.gap, seen.interval, systematic))
+    return _combined(result, prior) if settings.combine and isinstance(prior, GapEstimate) else result
+
+
+def _widened(gap: float, interval: Interval, systematic: float) -> Interval:
+    """A statistical interval with a systematic standard deviation (rad) added on both sides."""
+    extra = NORMAL_95 * systematic
+    return max(0.0, gap - math.hypot(gap - interval[0], extra)), gap + math.hypot(interval[1] - gap, extra)
+
+
+def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
+    """The mean of two estimates, weighted by their total variances."""
+    if not (math.isfinite(prior.gap) and math.isfinite(prior.std_total) and prior.std_total > 0.0):
+        return estimate
+    share = estimate.std_total**2 / (estimate.std_total**2 + prior.std_total**2)
+    gap = estimate.gap + share * (prior.gap - estimate.gap)
+    total = math.sqrt(1.0 - share) * estimate.std_total
+    std = math.hypot((1.0 - share) * estimate.std, share * prior.std)
+    return replace(estimate, gap=gap, std=std, std_total=total, interval=interval_95(gap, total))
+
+
+def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
+    """What is known without the window: the prior."""
+    blank = no_estimate(window.mid_time, model_version=servo.version, method=METHOD)
+    if isinstance(prior, GapEstimate):
+        return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)
+    return blank if prior is None else replace(blank, gap=prior)

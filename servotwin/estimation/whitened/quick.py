@@ -1,0 +1,128 @@
+"""A look at a window in a fraction of a millisecond: the plain fit at a low rate, and how sure that is.
+
+It says whether a gap is still what it was, and leaves to the estimator what it is now. What is known beforehand makes
+it right: the gap, next to which it looks, and the encoder's offset, without which a window of one contact says nothing
+of the gap. Without the offset the screw's place in the gap is one of several that are tried.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.estimation.core.decimation import decimation
+from servotwin.estimation.core.projection import remove
+from servotwin.estimation.core.response import response
+from servotwin.estimation.whitened.misfit import Misfit, Point, Slopes
+from servotwin.estimation.whitened.reduction import Prior, Reduction, factor_for
+from servotwin.estimation.whitened.search import GAP_ONLY, descend
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+PLACES = (-1.0, -0.6, -0.2, 0.2, 0.6, 1.0)
+STEPS = 16
+_FREE, _PRECISION, _GAIN = 2.0, 1e-5, 1e-7  # ranges of the motor; of the motor's range; of the cost
+_SETTLED, _CLOSE = 0.3, 1e-5  # standard deviations, or of the motor's range, that the gap would still move by
+_FLAT = 1e-9  # of the derivative's square: below it nothing shows the gap
+_ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 to 1
+
+
+@dataclass(frozen=True)
+class Quick:
+    """The minimum next to a gap.
+
+    Attributes
+    ----------
+    gap : float
+        rad, total.
+    std : float
+        rad: its spread, for noise as coloured as what is left over and an offset known as well as was said; inf where
+        nothing shows the gap.
+    misfit : float
+        m, root mean square of what is left over.
+    settled : bool
+        Whether the gap would move no more: along a valley in which only the screw's place changes, it need not end.
+    """
+
+    gap: float
+    std: float
+    misfit: float
+    settled: bool
+
+
+def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, float] | None = None) -> Quick:
+    """Look at a window with theta_m next to a total gap (rad).
+
+    Parameters
+    ----------
+    window : Window
+    servo : Servo
+    gap : float
+    offset : (float, float), optional
+        Mean and standard deviation (rad) of the encoder's offset as earlier windows showed it; None: not known.
+    """
+    reduction = _slow(window, servo, offset)
+    misfit, span = reduction.coarse(), float(np.ptp(reduction.theta_m))
+    costs = [misfit.cost(Point(gap, place)) for place in PLACES]
+    start = Point(gap, PLACES[int(np.argmin(costs))])
+    both = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
+    # Where noise hides the place, its steps are wild, and hold the gap's back.
+    fit = descend(misfit, both.point, _FREE * span, _PRECISION * span, STEPS, GAP_ONLY, gain=_GAIN)
+    count = max(1, misfit.position.size - len(misfit.basis) - 2)
+    rms, residual = math.sqrt(fit.slopes.cost / count), fit.slopes.residual
+    weights = _weights(fit.slopes, rms)
+    if weights is None:
+        return Quick(float(fit.point.gap), math.inf, rms, fit.converged)
+    by_place = float(weights @ fit.slopes.jacobian[1])
+    variance = _coloured(weights, residual) + _ANYWHERE * by_place**2
+    if offset is not None:
+        variance += (offset[1] * _by_offset(reduction, misfit, weights)) ** 2
+    std = math.sqrt(variance)
+    still = abs(float(weights @ residual))
+    return Quick(float(fit.point.gap), std, rms, still <= max(_SETTLED * std, _CLOSE * span))
+
+
+def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> Reduction:
+    """Both channels at the rate that the structure needs."""
+    assert window.theta_m is not None
+    angle, position = window.theta_m, window.position
+    reduce = decimation(factor_for(response(servo, window.sample_rate), angle.size))
+    rows = reduce.rows(np.vstack([angle - angle[0], position - position[0]]))
+    model = response(servo, window.sample_rate / reduce.factor)
+    if offset is None:
+        return Reduction.of(rows[0], rows[1], model, skew=False)
+    first, home = float(angle[0] + rows[0, 0]), float(position[0] + rows[1, 0])
+    gain = model.static_gain
+    known = Prior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
+    return Reduction.of(rows[0], rows[1], model, known, skew=False)
+
+
+def _weights(slopes: Slopes, rms: float) -> Array | None:
+    """(m,) by how much the gap moves per change of each sample; None: nothing shows the gap.
+
+    The place lies within the gap: where the noise (m rms) hides it, it is that which is known of it.
+    """
+    by_gap, by_place = slopes.jacobian
+    known = float(by_place @ by_place) + rms * rms / _ANYWHERE
+    left = by_gap - (float(by_gap @ by_place) / known) * by_place if known > 0.0 else by_gap
+    size = float(left @ by_gap)
+    return left / size if size > _FLAT * float(by_gap @ by_gap) else None
+
+
+def _by_offset(reduction: Reduction, misfit: Misfit, weights: Array) -> float:
+    """By how much the gap moves per change of the encoder's offset."""
+    constant = np.full(weights.size, reduction.response.static_gain)
+    remove(misfit.basis, len(misfit.basis), constant)
+    return float(weights @ constant)
+
+
+def _coloured(weights: Array, noise: Array) -> float:
+    """Variance of the weighted sum (n,) of noise with the spectrum of one series (n,) of it."""
+    count = weights.size
+    size = 1 << (2 * count - 1).bit_length()  # at least twice as long, so that no end meets the other
+    gains, powers = (np.abs(np.fft.rfft(series, size)) ** 2 for series in (weights, noise))
+    both = gains * powers
+    return (2.0 * float(both.sum()) - float(both[0] + both[-1])) / (count * size)

@@ -1,0 +1,165 @@
+"""A window made ready for the search: relative angles, few samples, and the nuisances that go with them.
+
+Nuisances enter the position linearly: the encoder's offset (a constant: play of a shifted angle is shifted play), the
+structure's motion from before the window, a delay between the channels (the velocity of the response) and the gap's
+growth within the window. The last two depend on the gap, mildly, and are taken at the point where the search stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from servotwin.estimation.core.between import polygon
+from servotwin.estimation.core.contacts import BY_RATE
+from servotwin.estimation.core.decimation import Decimation, decimation
+from servotwin.estimation.core.normal import least_squares
+from servotwin.estimation.core.projection import orthonormal
+from servotwin.estimation.core.response import Response
+from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.whitened.misfit import Misfit, Point, mix_places
+from servotwin.plant.signals import Array
+
+RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
+_SAMPLES_PER_PERIOD, _SLOWEST, _FEWEST = 40.0, 400.0, 100  # kept at least: of the fastest mode; Hz; in all
+
+_ROUNDING = 1e-13  # of the largest motion, some hundred times a float's
+_MOST_GROWTH = 4.0  # standard deviations of the gap's rate
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known beforehand of a nuisance, in its own unit."""
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Both channels counted from their first sample on, the position decimated.
+
+    Attributes
+    ----------
+    theta_m : (n,) array
+        rad.
+    position : (m,) array
+        m.
+    response : Response
+    decimation : Decimation
+    offset : Prior, optional
+        Of the constant in the position, m.
+    growth : Prior, optional
+        Of the gap's rate, rad per sample; None: the gap is constant.
+    rate : float
+        rad per sample: the rate at which the screw is followed; what is left of the rate is a nuisance.
+    rounding : float
+        m: noise below this is rounding, which changes with every point, and proves nothing.
+    skew : bool
+        Whether a delay between the channels is a nuisance.
+    """
+
+    theta_m: Array
+    position: Array
+    response: Response
+    decimation: Decimation
+    offset: Prior | None = None
+    growth: Prior | None = None
+    skew: bool = True
+    rate: float = 0.0
+    rounding: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        theta_m: Array,
+        position: Array,
+        model: Response,
+        offset: Prior | None = None,
+        growth: Prior | None = None,
+        skew: bool = True,
+    ) -> Reduction:
+        """From theta_m (n,) rad and position (n,) m, both from any origin."""
+        reduce = decimation(factor_for(model, theta_m.size))
+        rows = reduce.rows(np.asarray(position - position[0])[None])
+        largest = max(float(np.abs(position).max()), abs(model.static_gain) * float(np.abs(theta_m).max()))
+        rounding = _ROUNDING * largest
+        return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew, rounding=rounding)
+
+    def fixed(self) -> Array:
+        """(r, m) nuisances that do not depend on the gap: the constant, the free motions."""
+        return _fixed(self.response, self.decimation, self.theta_m.size)
+
+    def table(self, point: Point) -> Array:
+        """(k, m) residual, derivatives of the response by gap and place, nuisances; not whitened."""
+        seen = polygon(self.theta_m, point.screw(0.0, self.rate))
+        mix_places(seen, point.gap, point.place)
+        rows = self.response.respond(seen if self.growth else seen[:BY_RATE])
+        rows = np.vstack([rows, self.response.velocities(seen[:1])]) if self.skew else rows
+        moving = self.decimation.rows(rows)
+        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:]])
+
+    def prepared(self, noise: Autoregression, rows: Array, first: int) -> Array:
+        """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
+        known = {} if self.offset is None else {first: self.offset}
+        if self.growth is not None:
+            known[first + len(self.fixed())] = Prior(self.growth.mean - self.rate, self.growth.std)
+        columns = [noise.whiten(rows)]
+        for row, prior in known.items():
+            column = np.zeros((len(rows), 1))
+            column[0], column[row] = prior.mean / prior.std, 1.0 / prior.std
+            columns.append(column)
+        return np.hstack(columns) if known else columns[0]
+
+    def coarse(self) -> Misfit:
+        """The misfit in white noise, with the fixed nuisances only: for the first search.
+
+        A constant that is known is taken off: as if it were free, the search would end where it is not, and the noise
+        would be made of what that leaves.
+        """
+        fixed = self.fixed()
+        known = 0.0 if self.offset is None else self.offset.mean * fixed[0]
+        basis = _fixed_basis(self.response, self.decimation, self.theta_m.size, self.offset is None)
+        return Misfit(self.theta_m, self.position - known, basis, self.response, self.decimation, rate=self.rate)
+
+    def misfit(self, noise: Autoregression, point: Point) -> Misfit:
+        """The misfit in noise of a known kind, its nuisances taken at a point."""
+        table = self.table(point)
+        table[RESIDUAL] = self.position
+        rows = self.prepared(noise, np.delete(table, [GAP, PLACE], axis=0), 1)
+        extra = rows.shape[1] - self.position.size
+        basis = orthonormal(rows[1:])
+        return Misfit(self.theta_m, rows[0], basis, self.response, self.decimation, noise, extra, self.rate)
+
+    def growing(self, noise: Autoregression, point: Point) -> Reduction:
+        """With the screw followed at the rate of growth that a point and a noise make likely.
+
+        The rate is linear only as long as no contact comes or goes with it: a motor that holds still in contact holds
+        the screw in a constant gap, and not in a growing one.
+        """
+        if self.growth is None:
+            return self
+        rows = self.prepared(noise, self.table(point), CONSTANT)
+        shares = least_squares(rows[GAP:], rows[RESIDUAL]).coefficients[CONSTANT - GAP :]
+        most = _MOST_GROWTH * self.growth.std
+        return replace(self, rate=min(max(self.rate + float(shares[len(self.fixed())]), -most), most))
+
+
+@lru_cache(maxsize=32)
+def _fixed(model: Response, reduce: Decimation, samples: int) -> Array:
+    return reduce.rows(np.vstack([np.ones((1, samples)), model.free(samples)]))
+
+
+@lru_cache(maxsize=32)
+def _fixed_basis(model: Response, reduce: Decimation, samples: int, constant: bool) -> Array:
+    return orthonormal(_fixed(model, reduce, samples)[0 if constant else 1 :])
+
+
+def factor_for(model: Response, samples: int) -> int:
+    """By how much to decimate: the structure's fastest mode keeps its band, and the window enough samples."""
+    rate = 1.0 / model.interval
+    fastest = float(np.abs(model.poles).max()) / (2.0 * np.pi)
+    kept = max(_SLOWEST, _SAMPLES_PER_PERIOD * fastest)
+    return max(1, min(int(rate / kept), samples // _FEWEST))

@@ -1,0 +1,184 @@
+"""Levenberg-Marquardt in the gap and the screw's place in it, within bounds, from several starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.estimation.core.contacts import BY_GAP, BY_START, contacts
+from servotwin.estimation.whitened.misfit import Misfit, Point, Slopes
+from servotwin.plant.signals import Array
+
+_SHORT = 20  # steps of a descent that only looks whether there is something lower
+_FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
+ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
+
+
+class Free(NamedTuple):
+    """What a search may change."""
+
+    gap: bool
+    place: bool
+
+
+BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
+_ROUND = tuple(0.1 * step for step in range(-9, 10))
+_LOWER = 1e-3  # of the cost: how much another place must promise
+_PLAIN = 1e-4  # of the information: below it gap and place are not told apart
+PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85), (0.002, 0.01, 0.03, 0.08, 0.2)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where a search ended."""
+
+    point: Point
+    slopes: Slopes
+    evaluations: int
+    converged: bool
+
+
+def descend(
+    misfit: Misfit,
+    start: Point,
+    largest: float,
+    tolerance: float,
+    steps: int = 60,
+    free: Free = BOTH,
+    gain: float = _GAIN,
+) -> Fit:
+    """From a start to the nearest minimum with 0 <= gap <= largest (rad).
+
+    It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises less than the
+    part `gain` of the cost. What is not `free` keeps its value.
+    """
+    point, here, damping = start, misfit.slopes(start), _FIRST_DAMPING
+    for count in range(1, steps):
+        step = _step(here, point, damping, largest, free)
+        trial = _bounded(point, step, largest)
+        if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= gain * here.cost:
+            return Fit(point, here, count, True)
+        ahead = misfit.slopes(trial)
+        if ahead.cost < here.cost:
+            point, here, damping = trial, ahead, max(0.1 * damping, 1e-9)
+        else:
+            damping = 8.0 * damping
+            if damping > _LARGEST_DAMPING:
+                return Fit(point, here, count + 1, True)
+    return Fit(point, here, steps, False)
+
+
+def _step(here: Slopes, point: Point, damping: float, largest: float, free: Free) -> tuple[float, float]:
+    """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
+    J = here.jacobian
+    a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
+    g, h = -float(J[0] @ here.residual), -float(J[1] @ here.residual)
+    gap_free = free.gap and not ((point.gap <= 0.0 and g < 0.0) or (point.gap >= largest and g > 0.0))
+    place_free = free.place and not ((point.place <= -1.0 and h < 0.0) or (point.place >= 1.0 and h > 0.0)) and c > 0.0
+    a, c = a * (1.0 + damping), c * (1.0 + damping)
+    if gap_free and place_free and a * c - b * b > _FLOOR * a * c:
+        determinant = a * c - b * b
+        return (c * g - b * h) / determinant, (a * h - b * g) / determinant
+    return (g / a if gap_free and a > 0.0 else 0.0), (h / c if place_free else 0.0)
+
+
+def _promise(here: Slopes, point: Point, trial: Point) -> float:
+    """By how much a step lowers the cost if the residual is linear."""
+    change = (trial.gap - point.gap) * here.jacobian[0] + (trial.place - point.place) * here.jacobian[1]
+    return -float(change @ (2.0 * here.residual + change))
+
+
+def _bounded(point: Point, step: tuple[float, float], largest: float) -> Point:
+    return Point(min(max(point.gap + step[0], 0.0), largest), min(max(point.place + step[1], -1.0), 1.0))
+
+
+def _distance(one: Point, other: Point) -> float:
+    """rad: how far two points are apart, the place counted as an angle of the screw."""
+    return max(abs(one.gap - other.gap), 0.5 * other.gap * abs(one.place - other.place))
+
+
+def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float) -> list[Fit]:
+    """Minima from several starts: for every place of the screw the best of some gaps (rad).
+
+    First the gap alone descends. From where the screw rests for long, gap and place move it alike, and nothing leads
+    back to where it does not rest: the place must not go there early.
+    """
+    best: list[tuple[float, Point]] = []
+    for place in PLACES:
+        points = [Point(gap, place) for gap in gaps]
+        costs = [misfit.cost(point) for point in points]
+        lowest = int(np.argmin(costs))
+        best.append((costs[lowest], points[lowest]))
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, ROUGH) for _, point in best]
+    return [continued(misfit, fit, largest, tolerance) for fit in near]
+
+
+def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """On with both; and again from within, if the screw would have begun in contact, or from there, if close to it.
+
+    In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
+    in. And from a little further in, where the motor only just began to move, next to nothing leads there.
+    """
+    ends = [descend(misfit, fit.point, largest, tolerance, gain=ROUGH)]
+    point = ends[0].point
+    inside = [point._replace(place=share * point.place) for share in _WITHIN] if abs(point.place) == 1.0 else []
+    ends += [descend(misfit, start, largest, tolerance, _SHORT, gain=ROUGH) for start in (*inside, *in_contact(point))]
+    best = min(ends, key=lambda end: end.slopes.cost)
+    evaluations = fit.evaluations + sum(end.evaluations for end in ends)
+    return Fit(best.point, best.slopes, evaluations, best.converged)
+
+
+def in_contact(point: Point) -> list[Point]:
+    """The point with the screw in the contact that it is close to, if it is and does not begin there."""
+    return [point._replace(place=math.copysign(1.0, point.place))] if _WITHIN[-1] <= abs(point.place) < 1.0 else []
+
+
+def off_the_plateau(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """A fit, or a lower one from the lowest of other places in the same gap.
+
+    A contact in the first moments of a window looks like motion from before it: over much of the gap the place makes no
+    difference, nothing leads away from there, and a place that makes one may lie beyond.
+    """
+    points = [fit.point._replace(place=place) for place in _ROUND]
+    costs = [misfit.cost(point) for point in points]
+    lowest = int(np.argmin(costs))
+    if not costs[lowest] < (1.0 - _LOWER) * fit.slopes.cost:
+        return fit
+    other = descend(misfit, points[lowest], largest, tolerance, gain=ROUGH)
+    best = min(fit, other, key=lambda one: one.slopes.cost)
+    return Fit(best.point, best.slopes, fit.evaluations + other.evaluations, best.converged)
+
+
+def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+    """A fit, or a lower one from the edge of the plain that it lies on.
+
+    Where the screw rests until its first contact, gap and place act alike, through the way that the motor went before.
+    The plain ends where a smaller gap would let the motor touch the screw on the other side on its way; a little travel
+    there, too small to be seen from afar, may lead lower.
+    """
+    J = fit.slopes.jacobian
+    a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
+    if a * c - b * b > _PLAIN * a * c:
+        return fit
+    starts = _edges(misfit.theta_m, fit.point)
+    fits = [fit, *(descend(misfit, start, largest, tolerance, gain=ROUGH) for start in starts)]
+    best = min(fits, key=lambda one: one.slopes.cost)
+    return Fit(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
+
+
+def _edges(theta_m: Array, point: Point) -> list[Point]:
+    """Points a little beyond the edge of the plain on which `point` lies."""
+    seen = contacts(theta_m, point.screw(0.0))
+    touched = np.flatnonzero(seen[BY_START] == 0.0)
+    if not touched.size:
+        return []
+    first = int(touched[0])
+    side = 1.0 if seen[BY_GAP, first] < 0.0 else -1.0
+    way = 0.5 * point.gap * (1.0 + side * point.place)
+    edge = way - float(np.min(side * theta_m[: first + 1]))
+    gaps = [(1.0 - share) * edge for share in _BEYOND]
+    return [Point(gap, side * min(1.0, 2.0 * way / gap - 1.0)) for gap in gaps if gap > 0.0]

@@ -1,5 +1,0 @@
-"""The default estimator: exact structure, nuisances projected out, noise whitened, every answer gated."""
-
-from servotwin.identify.whitened.estimator import METHOD, SHORTEST, Fitted, Settings, estimate, fit
-
-__all__ = ["METHOD", "SHORTEST", "Fitted", "Settings", "estimate", "fit"]

@@ -1,0 +1,1 @@
+"""Recorded logs: one registry of readers and writers."""

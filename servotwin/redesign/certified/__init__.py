@@ -1,0 +1,1 @@
+"""Settings verified by simulation on the machines that the evidence allows."""

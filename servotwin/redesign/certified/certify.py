@@ -1,0 +1,230 @@
+"""A setting that was proved on the machines the estimate allows, or none.
+
+Candidates are simulated on members drawn from everything that is uncertain: the plant's parameters, the gap within the
+estimate's interval, the size of the steps, what is left of the input bias. A few members rank them; the best is then
+tried on many, and sent only if these settle. Nothing is extrapolated from the estimate's point value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from time import perf_counter
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.margins import Margins
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.assess import Outcome, Trial, assess, nearness
+from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.uncertainty import Members, Uncertainty, draw
+from servotwin.redesign.setting import Setting
+
+# Measurement noise reaches from well above the crossover to half the rate at which it is sampled.
+_NOISE_BAND = (10.0, 2500.0)
+# What an input bias leaves is the same number on every plant, but for rounding.
+_ROUNDED = 1.0 + 1e-6
+
+
+def certify(
+    servo: Servo,
+    uncertainty: Uncertainty,
+    demands: Demands | None = None,
+    trial: Trial | None = None,
+    feedforward: float = 0.0,
+    noise: float = 0.0,
+    clock: Callable[[], float] = perf_counter,
+) -> Certificate | Refusal:
+    """The cheapest setting that meets the demands on every machine the uncertainty allows.
+
+    Parameters
+    ----------
+    servo : Servo
+        The model; candidates are its own controller with scaled gains.
+    uncertainty : Uncertainty
+    demands : Demands, optional
+    trial : Trial, optional
+    feedforward : float
+        V, part of every candidate.
+    noise : float
+        m rms on the measured position.
+    clock : callable
+        s, for the certificate's own time.
+
+    Raises
+    ------
+    InvalidInput
+        No candidate is within the bound on Ms.
+    """
+    begin = clock()
+    demands, trial = demands or Demands(), trial or Trial()
+    demands, disturbed = _for_disturbance(demands, uncertainty, feedforward)
+    laws = candidates_of(servo, demands, uncertainty.gap[1], disturbed, noise > 0.0)
+    candidates = [_fed(setting, feedforward) for setting in laws]
+    ranked = _ranked(
+        candidates, draw(servo, uncertainty, demands.screened, demands.conditions, demands.seed), trial, demands, noise
+    )
+    members = draw(servo, uncertainty, demands.plants, demands.conditions, demands.seed)
+    best: Certificate | None = None
+    for setting in ranked[: demands.attempts]:
+        (outcome,) = assess([setting], members, trial)
+        tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
+        tried = replace(tried, looked_at=len(candidates), seconds=clock() - begin)
+        if not _shortcoming(tried, demands):
+            return tried
+        best = tried if best is None or tried.settled > best.settled else best
+    assert best is not None
+    return Refusal(f"none of {len(candidates)} candidates is proved: the best {_shortcoming(best, demands)}", best)
+
+
+def confirm(
+    servo: Servo,
+    uncertainty: Uncertainty,
+    setting: Setting,
+    demands: Demands,
+    trial: Trial | None = None,
+    noise: float = 0.0,
+    clock: Callable[[], float] = perf_counter,
+) -> Certificate | Refusal:
+    """Whether one setting meets the demands on every machine the uncertainty allows; no other is looked at.
+
+    Parameters
+    ----------
+    servo, uncertainty, demands, trial, noise, clock
+        As for `certify`.
+    setting : Setting
+        With its feedforward.
+    """
+    begin, fed = clock(), setting.controller.feedforward
+    demands = _for_disturbance(demands, uncertainty, fed)[0]
+    members = draw(servo, uncertainty, demands.plants, demands.conditions, demands.seed)
+    (outcome,) = assess([setting], members, trial or Trial())
+    tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
+    tried = replace(tried, looked_at=1, seconds=clock() - begin)
+    missing = _shortcoming(tried, demands)
+    return Refusal(f"the setting {missing}", tried) if missing else tried
+
+
+def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: float) -> tuple[Demands, bool]:
+    """The demands where friction or bias act on a member, and whether they do.
+
+    The members' bias sets in together with the step: what it adds to the overshoot says nothing.
+    """
+    low, high = (bias + feedforward for bias in uncertainty.input_bias)
+    disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
+    return (replace(demands, overshoot=math.inf) if disturbed else demands), disturbed
+
+
+def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Setting]:
+    """Every combination of scales, integral action and dead zone within the bound on Ms.
+
+    Integral action is for friction and for an input bias that is not known, a dead zone keeps noise out of the voltage:
+    they are looked at only where there is something for them to do.
+
+    Raises
+    ------
+    InvalidInput
+        There is none.
+    """
+    laws = _laws(servo, demands, demands.integral if disturbed else (0.0,))
+    if not laws:
+        raise InvalidInput(
+            f"no candidate has Ms <= {demands.Ms:g} on this servo: raise the bound or allow smaller scales than "
+            f"{min(demands.scales):g}"
+        )
+    plain = [Setting(law) for law in laws]
+    zone = servo.tolerance_for(gap)
+    hysteretic = [
+        Setting(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
+    ]
+    return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
+
+
+@lru_cache(maxsize=16)
+def _laws(servo: Servo, demands: Demands, integral: tuple[float, ...]) -> list[Controller]:
+    """Scaled controllers whose loops keep to the bound on Ms."""
+    own = servo.controller
+    laws = [
+        own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale, Ki=own.Ki * share)
+        for share in integral
+        for scale in demands.scales
+    ]
+    return [law for law in dict.fromkeys(laws) if _margins(servo, law).Ms <= demands.Ms]
+
+
+@lru_cache(maxsize=256)
+def _margins(servo: Servo, law: Controller) -> Margins:
+    return servo.margins(law)
+
+
+def _fed(setting: Setting, feedforward: float) -> Setting:
+    return Setting(setting.controller.replace(feedforward=feedforward), setting.tolerance)
+
+
+def _ranked(candidates: list[Setting], members: Members, trial: Trial, demands: Demands, noise: float) -> list[Setting]:
+    """Best first: those that settle on more members, in whole percents, then the cheaper."""
+    outcomes = assess(candidates, members, trial)
+
+    def place(k: int) -> tuple[bool, float]:
+        fails = float(np.mean(outcomes[k].settled)) < demands.settled or outcomes[k].overshoot.max() > demands.overshoot
+        fails = fails or bool(outcomes[k].tail.max() > _ROUNDED * demands.tail)
+        return fails, _cost(candidates[k], outcomes[k], demands, noise)
+
+    return [candidates[k] for k in sorted(range(len(candidates)), key=place)]
+
+
+def _cost(setting: Setting, outcome: Outcome, demands: Demands, noise: float) -> float:
+    price = demands.effort_weight * setting.noise_effort(noise, _NOISE_BAND) if noise else 0.0
+    return float(np.percentile(outcome.cost, 95.0)) + price
+
+
+def _certificate(
+    servo: Servo,
+    setting: Setting,
+    members: Members,
+    uncertainty: Uncertainty,
+    outcome: Outcome,
+    demands: Demands,
+    noise: float,
+) -> Certificate:
+    loop = _margins(servo, setting.controller.replace(feedforward=0.0, enter=1.0, leave=1.0))
+    crossover = loop.gain_crossovers[-1]
+    return Certificate(
+        setting=setting,
+        gap=uncertainty.gap,
+        input_bias=uncertainty.input_bias,
+        step=uncertainty.step,
+        friction=uncertainty.friction,
+        members=members.count,
+        settled=float(np.mean(outcome.settled)),
+        cost=_cost(setting, outcome, demands, noise),
+        tail=float(outcome.tail.max()),
+        tail_p95=float(np.percentile(outcome.tail, 95.0)),
+        error_rms=float(outcome.error_rms.max()),
+        effort=float(outcome.effort.max()),
+        overshoot=float(outcome.overshoot.max()),
+        settling=float(np.percentile(outcome.settling, 95.0)),
+        settling_worst=float(outcome.settling.max()),
+        within=float(np.max(nearness(setting, np.array(uncertainty.input_bias), uncertainty.step[1]))),
+        Ms=loop.Ms,
+        crossover=crossover.omega,
+        phase_margin=crossover.phase_margin,
+        saturated=bool(outcome.saturated.any()),
+        looked_at=0,
+        seconds=0.0,
+    )
+
+
+def _shortcoming(tried: Certificate, demands: Demands) -> str:
+    """What is missing, in words; empty: nothing."""
+    if tried.settled < demands.settled:
+        return f"settles on {100.0 * tried.settled:.1f} % of the members, and {100.0 * demands.settled:g} % are asked"
+    if tried.tail > _ROUNDED * demands.tail:
+        return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * demands.tail:.3g} mm are allowed"
+    if tried.overshoot > demands.overshoot:
+        return f"overshoots by {100.0 * tried.overshoot:.0f} %, and {100.0 * demands.overshoot:.0f} % are allowed"
+    return ""

@@ -1,0 +1,260 @@
+"""Settings proved beforehand, one for each cell of a grid over what evidence leaves open.
+
+A cell is an interval of gaps and a largest input bias that the feedforward leaves; its setting was proved for the whole
+cell, so it holds for every region inside. What no proved cell contains is not covered: then the fallback set is sent.
+Cells of every width overlap by half, so that a region lies in one at most four times as wide, but for the narrowest.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+from servotwin.control.gains import gains_of
+from servotwin.errors import InvalidInput
+from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.region import Region
+from servotwin.redesign.certified.uncertainty import Range
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Redesign
+from servotwin.redesign.setting import Setting
+
+_KEPT_LEVELS = 2  # of width: nobody is troubled with an update for a little less
+_QUIET = 1e-6  # m rms: noise below is like none
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where settings are proved.
+
+    Parameters
+    ----------
+    finest : float
+        rad, width of the narrowest cells; others are twice, four times ... as wide, up to the whole stated range.
+    biases : tuple of float
+        V, rising: largest input bias that is left beside the feedforward.
+    noises : tuple of float
+        m rms, rising: for which settings are ranked; what is proved does not depend on it.
+
+    Raises
+    ------
+    InvalidInput
+        A value is not finite, not positive (a noise: negative), or they do not rise.
+    """
+
+    finest: float = math.radians(4.0)
+    biases: tuple[float, ...] = (1e-3, 1e-2, 5e-2)
+    noises: tuple[float, ...] = (0.0, 1e-5)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.finest < math.inf:
+            raise InvalidInput(f"table finest = {self.finest!r} rad: must be finite and above 0")
+        for name, unit, least in (("biases", "V", 1e-300), ("noises", "m", 0.0)):
+            values = getattr(self, name)
+            rising = all(a < b for a, b in itertools.pairwise(values))
+            if not values or not rising or not (least <= values[0] and values[-1] < math.inf):
+                raise InvalidInput(f"table {name} = {values!r} {unit}: must be finite, rising and not negative")
+
+    def levels(self, stated: Range) -> tuple[float, ...]:
+        """rad: widths of cells, rising; the last is the whole stated range."""
+        whole = stated[1] - stated[0]
+        halvings = 0 if whole <= self.finest else math.ceil(math.log2(whole / self.finest) - 1e-9)
+        return tuple(whole / 2.0**k for k in range(halvings, -1, -1))
+
+
+class Key(NamedTuple):
+    """Which cell: places in the levels of width, along the gap in half widths, in the biases and in the noises."""
+
+    level: int
+    place: int
+    bias: int
+    noise: int
+
+
+@dataclass(frozen=True)
+class CertifiedTable:
+    """What was proved for the cells of a grid.
+
+    Attributes
+    ----------
+    grid : Grid
+    stated : (float, float)
+        rad: range of gaps.
+    friction : (float, float)
+        N m.
+    feedforward_limit : float
+        V, either sign.
+    bias_known : float
+        V: up to here the policy asks for less overshoot, and only cells up to here are proved for that.
+    fallback : Certificate
+        What holds for the whole stated range.
+    cells : dict of Key to Certificate or None
+        None: nothing is proved there.
+    """
+
+    grid: Grid
+    stated: Range
+    friction: Range
+    feedforward_limit: float
+    bias_known: float
+    fallback: Certificate
+    cells: dict[Key, Certificate | None]
+
+    def find(self, region: Region, running: Setting | None = None) -> Certificate | Refusal:
+        """The certificate of the narrowest proved cell that contains a region, its feedforward put in.
+
+        A cell up to four times as wide comes before it whose setting is `running` already, but for the feedforward.
+        """
+        if region.friction[0] < self.friction[0] or region.friction[1] > self.friction[1]:
+            return Refusal(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")
+        if abs(region.feedforward) > self.feedforward_limit:
+            return Refusal(f"a feedforward of {region.feedforward:.3g} V is in no cell of the table")
+        proved = [(key, found) for key in self._containing(region) if (found := self.cells.get(key)) is not None]
+        if proved:
+            widest = proved[0][0].level + _KEPT_LEVELS
+            kept = [found for key, found in proved if key.level <= widest and _alike(found.setting, running)]
+            return _fed((kept or [proved[0][1]])[0], region.feedforward)
+        low, high = (math.degrees(end) for end in region.gap)
+        left = 1e3 * region.largest_bias
+        return Refusal(
+            f"no proved cell of the table holds gaps of {low:.4g} to {high:.4g} deg with {left:.3g} mV of bias"
+        )
+
+    def _containing(self, region: Region) -> Iterator[Key]:
+        """Cells that contain a region, the smallest bias first, then the narrowest."""
+        low, high = region.gap
+        noise = self._noise(region.noise)
+        wide = enumerate(self.grid.levels(self.stated))
+        places = [Key(level, self._place(low, width), 0, noise) for level, width in wide]
+        holding = [key for key in places if _holds(cell_range(self.grid, self.stated, key), low, high)]
+        known = region.largest_bias <= self.bias_known
+        for bias, limit in enumerate(self.grid.biases):
+            if region.largest_bias <= limit and (limit <= self.bias_known) == known:
+                yield from (key._replace(bias=bias) for key in holding)
+
+    def _place(self, low: float, width: float) -> int:
+        """Of the cell of a width with the largest beginning that is not above `low`."""
+        most = 2 * round((self.stated[1] - self.stated[0]) / width) - 2 if width > 0.0 else 0
+        if most <= 0:
+            return 0
+        return min(max(0, math.floor((low - self.stated[0]) / (0.5 * width))), most)
+
+    def _noise(self, noise: float) -> int:
+        """The level that is nearest, in ratios."""
+        distances = [abs(math.log((level + _QUIET) / (noise + _QUIET))) for level in self.grid.noises]
+        return distances.index(min(distances))
+
+
+def keys_of(grid: Grid, stated: Range) -> Iterator[Key]:
+    """All cells, the widest first."""
+    widths = grid.levels(stated)
+    for level in reversed(range(len(widths))):
+        count = 1 if level == len(widths) - 1 else 2 * round((stated[1] - stated[0]) / widths[level]) - 1
+        for place in range(count):
+            for bias in range(len(grid.biases)):
+                for noise in range(len(grid.noises)):
+                    yield Key(level, place, bias, noise)
+
+
+def cell_range(grid: Grid, stated: Range, key: Key) -> Range:
+    """rad: the gaps of a cell."""
+    width = grid.levels(stated)[key.level]
+    low = stated[0] + 0.5 * width * key.place
+    return low, min(low + width, stated[1])
+
+
+def proved(policy: CertifiedPolicy, grid: Grid, key: Key) -> Certificate | None:
+    """What holds in a cell; None: nothing is proved.
+
+    The feedforward enters by what it leaves of the bias alone, as long as no voltage meets its limit: so the cell is
+    proved with none, and with a limit that is lower by the largest feedforward. Where that is met, it is not proved.
+    Every member has to settle: the few that need not might all lie in the region that is looked up.
+    """
+    stated, bias = policy.uncertainty.gap, grid.biases[key.bias]
+    known = policy.uncertainty.replace(gap=cell_range(grid, stated, key), input_bias=(-bias, bias))
+    limit = policy.servo.controller.voltage_limit
+    servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
+    demands = replace(policy.held(), settled=1.0)
+    found = certify(servo, known, demands, policy.trial, 0.0, grid.noises[key.noise], policy.clock)
+    if isinstance(found, Refusal) or found.saturated:
+        return None
+    law = found.setting.controller.replace(voltage_limit=limit)
+    return replace(found, setting=replace(found.setting, controller=law))
+
+
+def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[Key, Certificate | None]) -> CertifiedTable:
+    """The table of a policy's proofs."""
+    known = policy.uncertainty
+    least = policy.demands.bias_known
+    return CertifiedTable(grid, known.gap, known.friction, policy.feedforward_limit, least, policy.fallback(), cells)
+
+
+@dataclass(frozen=True)
+class TablePolicy:
+    """The certified policy with its proofs looked up; what it sends carries the certificate of a cell.
+
+    Parameters
+    ----------
+    policy : CertifiedPolicy
+    table : CertifiedTable
+    """
+
+    policy: CertifiedPolicy
+    table: CertifiedTable
+    needs_estimate: ClassVar[bool] = False
+    owes: ClassVar[bool] = True
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """The setting of a cell that contains all that the evidence allows; without one the fallback set, and why."""
+        return self.policy.decide(evidence, self)
+
+    def prove(self, region: Region, running: Setting | None) -> Certificate | Refusal:
+        """Looked up."""
+        return self.table.find(region, running)
+
+    def fallback(self) -> Certificate:
+        """Looked up."""
+        return self.table.fallback
+
+    def withdrawn(self, evidence: Evidence, why: str) -> Redesign:
+        """The fallback set, whatever the table says."""
+        return self.policy.decide(evidence, _Withdrawn(self.table.fallback, why))
+
+
+@dataclass(frozen=True)
+class _Withdrawn:
+    """Proves nothing."""
+
+    proved: Certificate
+    why: str
+    owes: ClassVar[bool] = False
+
+    def prove(self, _region: Region, _running: Setting | None) -> Refusal:
+        return Refusal(self.why)
+
+    def fallback(self) -> Certificate:
+        return self.proved
+
+
+def _holds(cell: Range, low: float, high: float) -> bool:
+    return cell[0] <= low and high <= cell[1]
+
+
+def _alike(one: Setting, other: Setting | None) -> bool:
+    """Whether two settings are the same but for the feedforward."""
+    if other is None or one.tolerance != other.tolerance:
+        return False
+    return gains_of(one.controller) == gains_of(other.controller.replace(feedforward=one.controller.feedforward))
+
+
+def _fed(found: Certificate, feedforward: float) -> Certificate:
+    """With a feedforward, and the input bias that then is the cell's."""
+    low, high = found.input_bias
+    law = found.setting.controller.replace(feedforward=feedforward)
+    setting = replace(found.setting, controller=law)
+    return replace(found, setting=setting, input_bias=(low - feedforward, high - feedforward))

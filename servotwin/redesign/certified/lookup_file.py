@@ -1,0 +1,148 @@
+"""A table of proved settings as a file, and for whom it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from time import perf_counter
+
+import msgspec
+from msgspec import Struct
+
+import servotwin
+from servotwin.errors import InvalidInput
+from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.lookup import CertifiedTable, Grid, Key, keys_of, proved, table_of
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.runtime import files
+
+SUFFIX = ".table"
+LARGEST = 64 * 1024 * 1024
+"""Bytes of a file that are looked at."""
+_KEPT_EVERY = 10.0  # s between two states of an unfinished table on the disk
+
+
+class TableFile(Struct, frozen=True, tag="certified-table/1"):
+    """What is on the disk.
+
+    Attributes
+    ----------
+    of : dict of str to str
+        Everything that the proofs depend on, in full.
+    grid : Grid
+    fallback : Certificate
+    cells : tuple of (Key, Certificate or None)
+        Fewer than the grid has while it is unfinished.
+    """
+
+    of: dict[str, str]
+    grid: Grid
+    fallback: Certificate
+    cells: tuple[tuple[Key, Certificate | None], ...]
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(TableFile)
+
+
+def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:
+    """The finished table of a file, for the policy whose proofs it holds.
+
+    Raises
+    ------
+    InvalidInput
+        It cannot be read, belongs to another model, other demands or another version, or is unfinished.
+    """
+    found = _read(path)
+    _check_owner(path, found, policy)
+    missing = len(set(keys_of(found.grid, policy.uncertainty.gap)) - {key for key, _ in found.cells})
+    if missing:
+        raise InvalidInput(f"{path}: {missing} cells of this table are not proved yet: run the same command again")
+    return table_of(policy, found.grid, dict(found.cells))
+
+
+def build(
+    path: Path, policy: CertifiedPolicy, grid: Grid, clock: Callable[[], float] = perf_counter
+) -> Generator[tuple[int, int], None, None]:
+    """Prove a table cell by cell into a file, going on where an earlier run ended; gives (cells done, cells in all).
+
+    What is done is on the disk every few seconds and when this is closed.
+
+    Raises
+    ------
+    InvalidInput
+        The file is there and no table, another's or on another grid; it cannot be written; there is no fallback set.
+    """
+    keys = list(keys_of(grid, policy.uncertainty.gap))
+    cells = _begun(path, policy, grid)
+    kept, fallback = clock(), policy.fallback()
+    try:
+        for key in keys:
+            if key not in cells:
+                cells[key] = proved(policy, grid, key)
+            yield len(cells), len(keys)
+            if clock() - kept > _KEPT_EVERY:
+                _write(path, TableFile(told(policy), grid, fallback, tuple(cells.items())))
+                kept = clock()
+    finally:
+        _write(path, TableFile(told(policy), grid, fallback, tuple(cells.items())))
+
+
+def told(policy: CertifiedPolicy) -> dict[str, str]:
+    """Everything that a policy's proofs depend on, by name and in full."""
+    parts = {"servotwin": servotwin.__version__, "feedforward_limit": repr(policy.feedforward_limit)}
+    for name in ("servo", "uncertainty", "demands"):
+        parts |= dict(spelled(name, getattr(policy, name)))
+    trial = {f"trial.{name}": repr(getattr(policy.trial, name)) for name in ("duration", "last", "rate")}
+    return {**parts, **trial}
+
+
+def _begun(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[Key, Certificate | None]:
+    if not path.exists():
+        return {}
+    found = _read(path)
+    _check_owner(path, found, policy)
+    if found.grid != grid:
+        raise InvalidInput(f"{path}: is a table on another grid ({found.grid}); choose another file, or remove it")
+    return dict(found.cells)
+
+
+def _read(path: Path) -> TableFile:
+    try:
+        if path.stat().st_size > LARGEST:
+            raise InvalidInput(f"{path}: is larger than {LARGEST} bytes, which no table is")
+        return _decoder.decode(path.read_bytes())
+    except OSError as error:
+        raise InvalidInput(
+            f"{path}: cannot be read ({error.strerror or error}); `servotwin certify` makes tables"
+        ) from None
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise InvalidInput(f"{path}: is no table of proved settings ({error})") from None
+
+
+def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
+    wanted = told(policy)
+    differing = [key for key in sorted({*wanted, *found.of}) if wanted.get(key) != found.of.get(key)]
+    if differing:
+        key = differing[0]
+        there, here = (each.get(key, "nothing") for each in (found.of, wanted))
+        more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
+        raise InvalidInput(
+            f"{path}: was proved for {key} = {there}, and this is {here}{more}: prove a table of its own with"
+            " `servotwin certify`"
+        )
+
+
+def spelled(name: str, value: object) -> Iterator[tuple[str, str]]:
+    """(dotted name, value in full) of everything in nested dataclasses."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from spelled(f"{name}.{field.name}", getattr(value, field.name))
+    else:
+        yield name, repr(value)
+
+
+def _write(path: Path, table: TableFile) -> None:
+    with files.written(path) as temporary:
+        temporary.write_bytes(_encoder.encode(table))

@@ -1,0 +1,96 @@
+"""Policies that set the dead zone only: with the paper's own remarks made a rule, and with hysteresis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.uncertainty import Range
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Redesign
+from servotwin.redesign.settling import settling_map
+
+
+def gap_range(estimate: GapEstimate) -> Range:
+    """The gaps (rad) to reckon with: the estimate's interval, and what `std_total` adds to it."""
+    spread = NORMAL_95 * estimate.std_total
+    low, high = min(estimate.interval[0], estimate.gap - spread), max(estimate.interval[1], estimate.gap + spread)
+    return max(low, 0.0), high
+
+
+@dataclass(frozen=True)
+class MarginPolicy:
+    """tolerance = max(k_DZ p gap, k_noise noise) for the widest gap of the interval.
+
+    k_DZ is the least that settles for every step of the stated size, read from the map of `settling`: what the paper
+    says of its k_DZ and of noise (sections 4.2 and 4.3), as a rule.
+
+    Parameters
+    ----------
+    servo : Servo
+    step : (float, float)
+        m, sizes of the steps that the reference makes.
+    k_noise : float
+        Tolerances per standard deviation of the measurement's noise.
+
+    Raises
+    ------
+    InvalidInput
+        A value is outside its range.
+    """
+
+    servo: Servo
+    step: Range = (1e-4, 2.5e-3)
+    k_noise: float = 3.0
+    needs_estimate: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step[0] <= self.step[1] < math.inf:
+            raise InvalidInput(f"policy step = {self.step!r} m: must be positive, finite and in order")
+        if not 0.0 <= self.k_noise < math.inf:
+            raise InvalidInput(f"policy k_noise = {self.k_noise!r}: must be finite and at least 0")
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """The tolerance for an estimate that is OK."""
+        if evidence.unusable:
+            return Redesign(None, math.nan, evidence.unusable)
+        estimate = evidence.estimate
+        high = gap_range(estimate)[1]
+        noise = evidence.disturbance.noise
+        least = self.k_noise * noise if math.isfinite(noise) else 0.0
+        if high == 0.0:
+            return Redesign(least, estimate.gap, "")
+        lost = self.servo.p * high
+        k_dz = settling_map(self.servo).least(self.step[0] / lost, self.step[1] / lost)
+        if not math.isfinite(k_dz):
+            return Redesign(None, math.nan, "no dead zone on the map settles for every step of the stated size")
+        return Redesign(max(k_dz * lost, least), estimate.gap, "")
+
+
+@dataclass(frozen=True)
+class HysteresisPolicy:
+    """A dead zone of p gap that is entered well inside and left well outside.
+
+    Parameters
+    ----------
+    servo : Servo
+    enter, leave : float
+        Tolerances.
+    """
+
+    servo: Servo
+    enter: float = 0.5
+    leave: float = 1.5
+    needs_estimate: ClassVar[bool] = True
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        """Tolerance and thresholds for an estimate that is OK."""
+        if evidence.unusable:
+            return Redesign(None, math.nan, evidence.unusable)
+        estimate = evidence.estimate
+        law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
+        return Redesign(self.servo.tolerance_for(estimate.gap), estimate.gap, "", law)

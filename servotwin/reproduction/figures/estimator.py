@@ -1,0 +1,232 @@
+"""The estimator explained: what a window with two contacts, one contact or none says about the gap."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
+from servotwin.estimation.core.projection import orthonormal, project_out
+from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.whitened.misfit import Point
+from servotwin.estimation.whitened.reduction import Reduction
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.report import style
+from servotwin.reproduction.figures.plate import Plate
+from servotwin.reproduction.measures import Array
+from servotwin.reproduction.runs import AMPLITUDE, RATE, Runs
+from servotwin.simulation import Run, simulate
+
+GAP = math.radians(10.0)
+FLOOR = 1e-6  # m: white noise on the position
+HALF_PERIOD = 6.0  # s, of the reference
+SPAN = 1.0  # s, of a window
+WIDEST = math.radians(25.0)
+GAPS, PLACES = 101, 61
+CALM, BEFORE_STEP = 0.0, 0.75  # integral gain over its own, and how long before the step the other windows begin, s
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One window.
+
+    Attributes
+    ----------
+    title : str
+    time : (n,) array
+        s, from the window's first sample.
+    theta_m, theta_d : (n,) arrays
+        rad; the true screw.
+    pushed : (n,) array
+        +1 while the motor pushes the screw forwards, -1 backwards, 0 while the gap is open.
+    raw, left : (n,) arrays
+        Derivative of the position by the gap (m/rad); the part of it that nothing else can imitate.
+    spread : float
+        rad: Cramer-Rao bound of the standard deviation in white noise of `FLOOR`; inf: no information.
+    gaps, starts, misfit : (PLACES, GAPS) arrays
+        rad, rad from the motor's first angle; root mean square residual, m.
+    estimate : GapEstimate
+    start : float
+        rad: the screw's true first angle less the motor's.
+    """
+
+    title: str
+    time: Array
+    theta_m: Array
+    theta_d: Array
+    pushed: Array
+    raw: Array
+    left: Array
+    spread: float
+    gaps: Array
+    starts: Array
+    misfit: Array
+    estimate: GapEstimate
+    start: float
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Three windows."""
+
+    panels: tuple[Panel, ...]
+
+
+def data(runs: Runs) -> Data:
+    """The paper's loop after a step; a calm loop around a step; the same loop at rest."""
+    servo = runs.servo
+    lively, calm = _run(servo, 1.0), _run(servo, CALM)
+    return Data(
+        (
+            _panel("two contacts", servo, lively, HALF_PERIOD),
+            _panel("one contact", servo, calm, HALF_PERIOD - BEFORE_STEP),
+            _panel("at rest", servo, calm, HALF_PERIOD - SPAN - 0.5),
+        )
+    )
+
+
+def _run(servo: Servo, integral: float) -> Run:
+    controller = servo.controller.replace(Ki=integral * servo.controller.Ki)
+    reference = SquareWave(AMPLITUDE, 2.0 * HALF_PERIOD)
+    return simulate(
+        servo, HALF_PERIOD + SPAN + 0.1, controller=controller, reference=reference, gap=GAP, sample_rate=RATE
+    )
+
+
+def _panel(title: str, servo: Servo, run: Run, start: float) -> Panel:
+    clean = Window.from_run(run, start, SPAN)
+    noise = FLOOR * np.random.default_rng(0).standard_normal(clean.position.size)
+    window = clean.replace(position=clean.position + noise)
+    assert window.theta_m is not None
+    first = round(start * RATE)
+    theta_d = run.theta_d[first : first + window.theta_m.size]
+    model = response(servo, RATE)
+    raw, left = sensitivity(window.theta_m, Gap(GAP, float(theta_d[0])), model)
+    size = float(np.linalg.norm(left))
+    spread = FLOOR / size if size > 1e-9 * max(float(np.linalg.norm(raw)), 1e-300) else math.inf
+    estimate = estimate_gap(window, servo)
+    begun = float(theta_d[0] - window.theta_m[0])
+    pushed = np.sign(window.theta_m - theta_d) * (np.abs(window.theta_m - theta_d) >= 0.5 * GAP * (1.0 - 1e-6))
+    time = np.arange(theta_d.size) / RATE
+    return Panel(title, time, window.theta_m, theta_d, pushed, raw, left, spread, *cost(window, model), estimate, begun)
+
+
+def sensitivity(theta_m: Array, at: Gap, model: Response) -> tuple[Array, Array]:
+    """(n,) derivative of the position by the gap, whole and without what the other unknowns can imitate.
+
+    They are the screw's start, the structure's motion from before, the encoder's offset and a delay.
+    """
+    seen = contacts(theta_m, at)
+    by_gap, by_start = model.respond(seen[[BY_GAP, BY_START]])
+    late = model.velocities(seen[[SCREW]])
+    others = np.vstack([by_start, np.ones(theta_m.size), model.free(theta_m.size), late])
+    return by_gap, project_out(orthonormal(others), by_gap[None])[0]
+
+
+def cost(window: Window, model: Response) -> tuple[Array, Array, Array]:
+    """Gap, screw's start and root mean square residual (PLACES, GAPS), the linear unknowns at their best everywhere."""
+    assert window.theta_m is not None
+    misfit = Reduction.of(window.theta_m, window.position, model).coarse()
+    gaps, places = np.meshgrid(np.linspace(0.0, WIDEST, GAPS), np.linspace(-1.0, 1.0, PLACES))
+    points = zip(gaps.ravel().tolist(), places.ravel().tolist(), strict=True)
+    squares = np.array([misfit.cost(Point(gap, place)) for gap, place in points]).reshape(gaps.shape)
+    return gaps, 0.5 * gaps * places, np.sqrt(squares / misfit.position.size)
+
+
+def plot(d: Data) -> Figure:
+    """Angles, what the contacts contribute, and the misfit over gap and start; one column for each window."""
+    figure, axes = style.panels(3, 3, height=2.3, heights=(1.0, 0.9, 1.35), share=False)
+    reach = 1.1 * max(float(np.abs(panel.raw).max()) for panel in d.panels)
+    for column, panel in zip(axes.T, d.panels, strict=True):
+        _angles(column[0], panel)
+        _contribution(column[1], panel, reach)
+    meshes = [_misfit(one, panel) for one, panel in zip(axes[2], d.panels, strict=True)]
+    for row, label in zip(axes[:, 0], ("Angle (deg)", "Position by gap (µm/deg)", "Screw's start (deg)"), strict=True):
+        row.set_ylabel(label)
+    figure.align_ylabels(axes[:, 0])
+    figure.colorbar(meshes[0], ax=axes[2, :].tolist(), label="Misfit (µm rms)", location="bottom", aspect=50, pad=0.03)
+    axes[0, 1].legend(loc="lower left")
+    axes[1, 1].legend(loc="lower left")
+    style.letter(axes[0])
+    return figure
+
+
+def _angles(axes: Axes, panel: Panel) -> None:
+    _shade(axes, panel)
+    origin = float(panel.theta_m[0])
+    style.trace(axes, panel.time, (panel.theta_m - origin) * style.DEG, style.BLUE, r"motor $\theta_m$")
+    style.trace(axes, panel.time, (panel.theta_d - origin) * style.DEG, style.BLACK, r"screw $\theta_d$")
+    axes.set(xlim=(0.0, SPAN), xticks=(0.0, 0.5, SPAN), title=panel.title)
+    axes.tick_params(labelbottom=False)
+
+
+def _shade(axes: Axes, panel: Panel) -> None:
+    """Forwards contact orange, backwards contact green."""
+    for side, color in ((1.0, style.ORANGE), (-1.0, style.GREEN)):
+        axes.fill_between(
+            panel.time,
+            0.0,
+            1.0,
+            where=(panel.pushed == side).tolist(),
+            transform=axes.get_xaxis_transform(),
+            color=color,
+            alpha=0.25,
+            linewidth=0.0,
+        )
+
+
+def _contribution(axes: Axes, panel: Panel, reach: float) -> None:
+    per_degree = 1e6 / style.DEG
+    _shade(axes, panel)
+    axes.plot(panel.time, panel.raw * per_degree, color=style.GREY, label="whole")
+    axes.plot(panel.time, panel.left * per_degree, color=style.RED, label="the gap's alone")
+    axes.set(
+        xlabel="Time (s)", xlim=(0.0, SPAN), xticks=(0.0, 0.5, SPAN), ylim=(-reach * per_degree, reach * per_degree)
+    )
+    known = f"at best ±{panel.spread * style.DEG:.2g} deg" if math.isfinite(panel.spread) else "shows nothing"
+    axes.set_title(known, loc="right", fontsize=8.0)
+
+
+def _misfit(axes: Axes, panel: Panel) -> QuadMesh:
+    norm = LogNorm(0.1, 100.0)
+    values = np.maximum(panel.misfit * 1e6, 0.1)
+    gaps, starts = panel.gaps * style.DEG, panel.starts * style.DEG
+    mesh = axes.pcolormesh(gaps, starts, values, norm=norm, cmap="viridis", shading="gouraud", rasterized=True)
+    axes.contour(gaps, starts, values, levels=np.geomspace(0.2, 100.0, 12), colors="white", linewidths=0.4, alpha=0.7)
+    axes.plot(GAP * style.DEG, panel.start * style.DEG, "o", color="white", markeredgecolor=style.BLACK, markersize=6)
+    axes.set(xlabel="Gap (deg)", xlim=(0.0, WIDEST * style.DEG), facecolor="#EEEEEE")
+    axes.grid(False)
+    axes.set_title(said(panel.estimate), loc="right", fontsize=8.0)
+    return mesh
+
+
+def said(estimate: GapEstimate) -> str:
+    """What the estimator answers, in a few words."""
+    if estimate.ok:
+        return f"OK: {estimate.gap * style.DEG:.3f} ± {estimate.std * style.DEG:.3f} deg"
+    if estimate.status is GapStatus.LOWER_BOUND:
+        return f"at least {estimate.gap * style.DEG:.2g} deg"
+    return estimate.status.value
+
+
+PLATE = Plate(
+    "estimator",
+    "When a window shows the gap.",
+    "Three windows of a loop with a gap of 10 deg and 1 µm of white noise: (a) pushed both ways, (b) one way, (c) not"
+    " at all. Above: motor and screw, the contacts shaded (forwards orange, backwards green). Middle: how the position"
+    " answers to a wider gap, and the part of that answer that no other unknown can imitate; above it the Cramer-Rao"
+    " bound. Below: the misfit over the gap and the screw's first angle (from the motor's), all linear unknowns at"
+    " their best; the dot is the truth, and above it what the estimator answers.",
+    data,
+    plot,
+)

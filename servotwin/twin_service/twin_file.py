@@ -1,0 +1,61 @@
+"""A twin's file as a whole: [service] here, models and servos in `twin.fleet`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from servotwin.config.table import part, read_toml
+from servotwin.errors import InvalidInput
+from servotwin.twin.fleet import Fleet
+from servotwin.twin_service.config import ServiceConfig, service
+from servotwin.twin_service.job import Start
+
+
+@dataclass(frozen=True)
+class TwinFile:
+    """What a twin runs on.
+
+    Attributes
+    ----------
+    path : Path
+    service : ServiceConfig
+    fleet : Fleet
+    text : str
+        Of the file: workers read it once more.
+    """
+
+    path: Path
+    service: ServiceConfig
+    fleet: Fleet
+    text: str
+
+    @property
+    def start(self) -> Start:
+        """What a worker is told."""
+        return Start(self.text, str(self.path), str(self.path.parent))
+
+
+def read_twin(path: Path) -> TwinFile:
+    """Read a twin's file.
+
+    Raises
+    ------
+    InvalidInput
+        One sentence that names the file, the key and what is allowed.
+    """
+    table = read_toml(path)
+    text, folder = path.read_text(encoding="utf-8"), path.parent
+    config = part(table, "service", lambda inner: service(inner, folder))
+    fleet = Fleet.read(table, folder)
+    table.done()
+    return TwinFile(path, config, fleet, text)
+
+
+def service_of(path: Path) -> ServiceConfig:
+    """[service] alone, for what needs no models: quick."""
+    table = read_toml(path)
+    try:
+        return part(table, "service", lambda inner: service(inner, path.parent))
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None

@@ -1,0 +1,202 @@
+"""Lock-step: the deployed twin, and the machine as a process of its own, under the co-simulation's clock.
+
+Sample time drives the link: delays, losses and duplicates are those of the scenario, drawn alike, and each message goes
+to the real service by HTTP, is committed, worked on in its pool, committed again and answered before time moves on. So
+estimates and versions are the co-simulation's, bit for bit, or something is wrong with one of them.
+"""
+
+from __future__ import annotations
+
+import ssl
+from array import array
+from http.client import HTTPConnection, HTTPSConnection
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.cosim.driver import CHANNELS, Cosimulation, Progress, Remote
+from servotwin.cosim.scenario import Scenario
+from servotwin.edge.drive import Block, DriveLost, SupervisedDrive
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.recorder import Floats
+from servotwin.errors import InvalidInput
+from servotwin.link.url import in_clear
+from servotwin.messages import Fallback, Gains, Message, Receipt, Window, decode, encode
+from servotwin.plant.signals import PiecewiseCubic
+
+TIMEOUT = 300.0
+"""s for one answer: a proof may be part of it."""
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """What the service says in lock-step.
+
+    Attributes
+    ----------
+    messages : list of bytes
+    wake : float or None
+        Sample time at which the twin wants to be woken.
+    """
+
+    messages: list[bytes]
+    wake: float | None
+
+
+_answered = msgspec.msgpack.Decoder(Answered)
+
+
+class HttpTwin:
+    """A twin in another process that keeps to sample time: a service whose file says `lockstep = true`.
+
+    Parameters
+    ----------
+    url : str
+        http://127.0.0.1:8765
+    servo : str
+    token : str
+        Empty: the service asks for none.
+    context : ssl.SSLContext, optional
+        For https.
+    """
+
+    def __init__(self, url: str, servo: str, token: str = "", context: ssl.SSLContext | None = None) -> None:
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or parts.hostname is None:
+            raise InvalidInput(f"twin url = {url!r}: must be http://HOST:PORT or https://HOST:PORT")
+        if token and in_clear(url):
+            raise InvalidInput(f"twin url = {url!r}: would send the token in clear to another machine; give https://")
+        place: Any = {"host": parts.hostname, "port": parts.port, "timeout": TIMEOUT}
+        self._line = HTTPConnection(**place) if parts.scheme == "http" else HTTPSConnection(**place, context=context)
+        self._path = f"/v1/servos/{servo}/lockstep"
+        self._headers = {"authorization": f"Bearer {token}"} if token else {}
+        self._wake: float | None = None
+
+    def receive(self, message: Message, now: float) -> list[Message]:
+        """What it sends after a message that arrived at `now` (s)."""
+        return self._ask("receive", now, encode(message))
+
+    def wake(self, now: float) -> list[Message]:
+        """What it sends without having been asked."""
+        return self._ask("wake", now, b"")
+
+    def next_wake(self) -> float | None:
+        """When it wants to be woken, s, as it last said."""
+        return self._wake
+
+    def close(self) -> None:
+        """Hang up."""
+        self._line.close()
+
+    def _ask(self, what: str, now: float, body: bytes) -> list[Message]:
+        self._line.request("POST", f"{self._path}/{what}?now={now!r}", body, self._headers)
+        response = self._line.getresponse()
+        data = response.read()
+        if response.status != 200:
+            raise InvalidInput(f"twin {self._path}/{what} at {now:g} s: {response.status} {data[:500].decode()}")
+        found = _answered.decode(data)
+        self._wake = found.wake
+        return [decode(each) for each in found.messages]
+
+
+class DrivenMachine:
+    """A `cosim.Machine` behind the drive protocol: another process, in lock-step.
+
+    Parameters
+    ----------
+    drive : SupervisedDrive
+        Connected, at its first sample.
+    scenario : Scenario
+        How long it runs.
+    """
+
+    def __init__(self, drive: SupervisedDrive, scenario: Scenario) -> None:
+        self.samples = scenario.samples
+        self._drive, self._version, self._index = drive, 0, 0
+        self._signals = {name: array("d") for name in CHANNELS}
+
+    @property
+    def index(self) -> int:
+        """The present sample."""
+        return self._index
+
+    def advance(self, index: int) -> None:
+        """Go on to a sample."""
+        while self._index < index:
+            block = self._drive.read(index - self._index)
+            if block is None or block.first != self._index:
+                raise DriveLost(f"the machine did not give sample {self._index}")
+            self._keep(block)
+
+    def measured(self, name: str, first: int, last: int) -> Floats:
+        """A channel at samples first .. last - 1."""
+        return self._signals[name][first:last]
+
+    def set_tolerance(self, tolerance: float) -> None:
+        """A new dead zone (m) from the present sample on."""
+        self._write(tolerance, None)
+
+    def set_controller(self, controller: Controller, tolerance: float) -> None:
+        """Other gains and dead zone (m) from the present sample on."""
+        self._write(tolerance, gains_of(controller))
+
+    def set_reference(self, _reference: PiecewiseCubic) -> None:
+        """Not in lock-step.
+
+        Raises
+        ------
+        InvalidInput
+        """
+        raise InvalidInput("lock-step knows no probing moves: leave [twin.excitation] out of the scenario")
+
+    def _write(self, tolerance: float, gains: Gains | None) -> None:
+        self._version += 1
+        self._drive.write(Parameters(self._version, tolerance, gains=gains))
+
+    def _keep(self, block: Block) -> None:
+        for name in CHANNELS:
+            self._signals[name].extend(getattr(block, name))
+        self._index = block.last
+
+
+class LockStep(msgspec.Struct, frozen=True):
+    """What crossed the link in lock-step, each once, in the order in which it was sent.
+
+    Attributes
+    ----------
+    windows, receipts, fallbacks : tuple
+        Of the edge.
+    sent : tuple of Message
+        Of the twin: acknowledgements, updates, requests.
+    """
+
+    windows: tuple[Window, ...]
+    receipts: tuple[Receipt, ...]
+    fallbacks: tuple[Fallback, ...]
+    sent: tuple[Message, ...]
+
+
+def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress: Progress | None = None) -> LockStep:
+    """Run a scenario on a real twin and a machine behind a drive.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        As the machine and the twin were told.
+    twin : Remote
+        `HttpTwin`, or any other.
+    drive : SupervisedDrive
+    progress : callable, optional
+        Called with the share done.
+    """
+    run = Cosimulation(scenario, DrivenMachine(drive, scenario), twin=twin)
+    while not run.done:
+        run.advance()
+        if progress is not None:
+            progress(run.share)
+    up = {record.serial: decode(record.data) for record in run.link.up.records}
+    down = {record.serial: decode(record.data) for record in run.link.down.records}
+    windows = {each.identity: each for each in up.values() if isinstance(each, Window)}
+    return LockStep(tuple(windows.values()), tuple(run.receipts), tuple(run.fallbacks), tuple(down.values()))

@@ -1,0 +1,253 @@
+"""Tuning: the paper's factorisation, exact specifications, Nyquist against poles, refusals."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from servotwin.analysis.tuning.factors import KINDS, Factors, factorised
+from servotwin.analysis.tuning.response import FrequencyData, Plant, circled
+from servotwin.analysis.tuning.setpoint import overshoot, prefilter, shaped
+from servotwin.analysis.tuning.tune import Specification, judged, tune
+from servotwin.cli import app as cli
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant import linear
+from servotwin.plant.servo import Servo
+from servotwin.simulation.simulate import simulate
+
+PAPER = Servo.preset("paper")
+FIRST = PAPER.margins().gain_crossovers[0]
+
+
+def test_the_printed_gains_factor_as_stated():
+    found = factorised(PAPER.controller, 10.0)
+    assert math.degrees(found.phz) == pytest.approx(59.833, abs=5e-4)
+    assert math.degrees(found.be) == pytest.approx(0.470, abs=5e-4)
+    assert math.degrees(found.al) == pytest.approx(45.0, abs=1e-9)
+    # The crossover is 9.9996, not 10.
+    assert found.K * abs(PAPER.plant().response(10.0)) == pytest.approx(1.0, rel=1e-4)
+    again = found.controller()
+    for name in ("Kp", "Ki", "Kd", "Tf"):
+        assert getattr(again, name) == pytest.approx(getattr(PAPER.controller, name), rel=1e-12)
+
+
+def test_the_tuner_is_at_least_as_good_as_the_paper_by_both_its_criteria():
+    paper = PAPER.margins()
+    wanted = Specification(FIRST.omega, FIRST.phase_margin)
+    smallest = tune(PAPER.plant(), wanted)
+    assert smallest.margins.Ms < 0.9 * paper.Ms
+    bounded = Specification(FIRST.omega, FIRST.phase_margin, Ms_max=paper.Ms, prefer="Ki")
+    largest = tune(PAPER.plant(), bounded)
+    assert largest.margins.Ms <= paper.Ms
+    assert largest.controller.Ki > PAPER.controller.Ki
+    for one in (smallest, largest):
+        crossovers = one.margins.gain_crossovers
+        assert len(crossovers) == 3
+        assert crossovers[0].omega == pytest.approx(FIRST.omega, rel=1e-9)
+        assert crossovers[0].phase_margin == pytest.approx(FIRST.phase_margin, abs=1e-9)
+
+
+def lag_plant() -> linear.LinearSystem:
+    return linear.series(linear.lag(2.0, 0.5), linear.series(linear.lag(1.0, 0.1), linear.lag(1.0, 0.02)))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "P"])
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+def test_every_type_meets_its_specification(kind, gain):
+    system = linear.series(linear.gain(gain), lag_plant())
+    wanted = Specification(6.0, math.radians(62.0 if kind in ("PI", "PID", "PIDF") else 85.0), kind)
+    found = tune(system, wanted)
+    nearest = min(found.margins.gain_crossovers, key=lambda x: abs(x.omega - 6.0))
+    assert nearest.omega == pytest.approx(6.0, rel=1e-9)
+    assert nearest.phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
+    assert found.margins.stable
+    law = found.controller
+    assert (law.Ki != 0.0) is KINDS[kind].integral
+    assert math.copysign(1.0, law.Kp) == gain or kind == "PDF"
+    if kind == "PI":
+        assert law.Kd == 0.0
+
+
+def test_a_proportional_controller_takes_the_margin_it_gets():
+    system = lag_plant()
+    found = tune(system, Specification(6.0, math.radians(40.0), "P"))
+    assert found.controller.Kp == pytest.approx(1.0 / abs(system.response(6.0)), rel=1e-12)
+    assert found.margins.gain_crossovers[0].phase_margin > math.radians(40.0)
+    with pytest.raises(InvalidInput, match="turns it not at all"):
+        tune(system, Specification(6.0, math.radians(100.0), "P"))
+
+
+@given(
+    st.floats(1.0, 8.0),
+    st.floats(20.0, 80.0),
+    st.sampled_from(["PI", "PIDF", "PDF"]),
+)
+@settings(max_examples=25)
+def test_what_is_returned_is_stable_and_what_is_wanted(crossover, margin_deg, kind):
+    try:
+        found = tune(PAPER.plant(), Specification(crossover, math.radians(margin_deg), kind))
+    except InvalidInput:
+        assume(False)
+    judge = PAPER.margins(found.controller)
+    assert judge.stable
+    nearest = min(judge.gain_crossovers, key=lambda x: abs(x.omega - crossover))
+    assert nearest.omega == pytest.approx(crossover, rel=1e-8)
+    assert math.degrees(nearest.phase_margin) == pytest.approx(margin_deg, abs=1e-6)
+
+
+@given(st.floats(1.0, 15.0), st.floats(0.1, 1.5), st.floats(0.0, 1.0), st.floats(0.1, 1.4))
+@settings(max_examples=60)
+def test_nyquist_agrees_with_the_poles(wc, phz, share, al):
+    factors = Factors(1.0 / abs(PAPER.plant().response(wc)), wc, phz, share * phz, al, True)
+    poles = PAPER.closed_loop(factors.controller()).poles()
+    assume(abs(np.max(poles.real)) > 1e-3)
+    plant = Plant(PAPER.plant())
+    omega = plant.looks(wc)
+    loops = (factors.response(omega) * plant.response(omega))[None, :]
+    assert bool(circled(loops, plant.integrators + 1)[0]) is bool(np.max(poles.real) < 0.0)
+
+
+@given(st.floats(0.5, 20.0), st.floats(0.05, 1.5), st.floats(0.0, 1.0), st.floats(0.05, 1.5))
+def test_factors_and_gains_are_inverse(wc, phz, share, al):
+    factors = Factors(3.0, wc, phz, share * phz, al, True)
+    found = factorised(factors.controller(), wc)
+    np.testing.assert_allclose(found[:5], factors[:5], rtol=1e-9, atol=1e-6)
+    omega = np.logspace(-1, 3, 20)
+    np.testing.assert_allclose(linear.pidf(factors.controller()).response(omega), factors.response(omega), rtol=1e-9)
+
+
+def test_frequency_data_give_what_the_system_gives():
+    system = PAPER.plant()
+    omega = np.unique(np.concatenate([np.geomspace(1e-3, 1e4, 3000), np.linspace(5.0, 100.0, 4000)]))
+    wanted = Specification(4.2, math.radians(60.0))
+    data = tune(FrequencyData(omega, system.response(omega), integrators=1), wanted)
+    exact = tune(system, wanted)
+    assert data.margins.stable
+    assert data.margins.Ms == pytest.approx(exact.margins.Ms, rel=0.01)
+    assert data.margins.gain_crossovers[0].omega == pytest.approx(4.2, rel=1e-6)
+
+
+def test_a_delay_is_a_turn_of_the_phase_and_stays_stable():
+    delay, wanted = 0.02, Specification(4.2, math.radians(60.0))
+    found = tune(PAPER.plant(), wanted, delay)
+    without = judged(PAPER.plant(), found.controller).gain_crossovers[0]
+    assert without.phase_margin == pytest.approx(wanted.phase_margin + 4.2 * delay, abs=1e-9)
+    assert found.margins.gain_crossovers[0].phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
+    assert found.margins.stable
+    long = min(x.phase_margin / x.omega for x in found.margins.gain_crossovers if x.phase_margin > 0.0)
+    assert not judged(PAPER.plant(), found.controller, delay + 1.05 * long).stable
+    assert judged(PAPER.plant(), found.controller, delay + 0.95 * long).stable
+
+
+def test_margins_without_polynomials_against_those_with():
+    near, exact = judged(PAPER.plant(), PAPER.controller, delay=1e-12), PAPER.margins()
+    assert [x.omega for x in near.gain_crossovers] == pytest.approx([x.omega for x in exact.gain_crossovers], rel=1e-8)
+    assert near.phase_crossovers[0].gain_margin == pytest.approx(exact.phase_crossovers[0].gain_margin, rel=1e-6)
+    assert near.Ms == pytest.approx(exact.Ms, rel=1e-6)
+
+
+def test_dead_zone_and_limits_are_kept():
+    like = PAPER.controller.replace(enter=0.5, leave=1.5, voltage_limit=24.0)
+    found = tune(PAPER.plant(), Specification(4.2, math.radians(60.0)), like=like).controller
+    assert (found.enter, found.leave, found.voltage_limit) == (0.5, 1.5, 24.0)
+
+
+def unstable() -> linear.LinearSystem:
+    return linear.LinearSystem(np.array([[1.0]]), np.ones(1), np.ones(1), 0.0, np.array([1.0]), np.array([-1.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("system", "wanted", "said"),
+    [
+        (unstable(), (1.0, 60.0, "PI"), "has a pole at 1"),
+        (PAPER.plant(), (10.0, 60.0, "PD"), "cannot be had at 10 rad/s"),
+        (PAPER.plant(), (10.0, 60.0, "PIDF"), "is stable on this plant"),
+        (FrequencyData([1.0, 2.0, 3.0, 4.0], [1.0, 0.5, 0.3, 0.2]), (9.0, 60.0, "PI"), "1 to 4 rad/s"),
+    ],
+)
+def test_what_cannot_be_reached_is_said(system, wanted, said):
+    with pytest.raises(InvalidInput, match=said):
+        tune(system, Specification(wanted[0], math.radians(wanted[1]), wanted[2]))
+
+
+def test_an_unreachable_sensitivity_names_the_one_that_can_be_had():
+    with pytest.raises(InvalidInput, match=r"reaches there is 1\.597"):
+        tune(PAPER.plant(), Specification(4.2, math.radians(60.0), Ms_max=1.2))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"crossover": 0.0}, "crossover = 0.0 rad/s"),
+        ({"phase_margin": math.pi}, "phase margin = 180 deg"),
+        ({"kind": "PIFD"}, "did you mean 'PID'"),
+        ({"Ms_max": 1.0}, "Ms_max = 1.0"),
+        ({"prefer": "Kd"}, "prefer = 'Kd'"),
+    ],
+)
+def test_specifications_are_checked(changes, said):
+    with pytest.raises(InvalidInput, match=said):
+        Specification(**({"crossover": 4.2, "phase_margin": 1.0} | changes))
+
+
+def test_setpoint_weights_equal_the_law_that_weighs():
+    """F C = C_r, and with all weights one there is no filter."""
+    law, omega = PAPER.controller, np.logspace(-1, 3, 30)
+    s = 1j * omega
+    above = 0.3 * law.Kp + law.Ki / s + 0.1 * law.Kd * s / (law.Tf * s + 1.0)
+    np.testing.assert_allclose(prefilter(law, 0.3, 0.1).response(omega) * linear.pidf(law).response(omega), above)
+    np.testing.assert_allclose(prefilter(law, 1.0, 1.0).response(omega), 1.0)
+
+
+def test_setpoint_weights_calm_the_step_and_leave_the_end():
+    tuned = tune(PAPER.plant(), Specification(FIRST.omega, FIRST.phase_margin)).controller
+    assert overshoot(PAPER, tuned, 0.2, 0.2) < 0.7 * overshoot(PAPER, tuned)
+    reference = shaped(tuned, 0.2, 0.2, 1e-3, 8.0, 1000.0)
+    run = simulate(PAPER, 8.0, controller=tuned, reference=reference, sample_rate=1000.0)
+    assert np.max(run.position) / 1e-3 - 1.0 == pytest.approx(overshoot(PAPER, tuned, 0.2, 0.2), abs=0.01)
+    assert run.position[-1] == pytest.approx(1e-3, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("law", "weights", "said"),
+    [
+        (PAPER.controller, (1.5, 1.0), "weight b = 1.5"),
+        (PAPER.controller.replace(Ki=0.0), (0.5, 0.5), "integral action"),
+        (Controller(1.0, -1.0, 0.0, 1.0), (0.5, 0.5), "zeros are stable"),
+        (Controller(1.0, 1.0, -1.0, 1.0), (0.5, 0.0), "only c = b"),
+    ],
+)
+def test_weights_are_checked(law, weights, said):
+    with pytest.raises(InvalidInput, match=said):
+        prefilter(law, *weights)
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, ["tune", *map(str, arguments)])
+
+
+def test_the_command_tells_gains_and_every_crossover():
+    result = run(9.9996, 14.498)
+    assert result.exit_code == 0
+    for said in ("tuned", "present", "4.6111", "24.8765 rad/s", "28.4648 rad/s", "overshoot"):
+        assert said in result.output
+
+
+def test_the_command_as_json():
+    found = json.loads(run(4.2, 60, "--b", 0.2, "--json").output)
+    assert found["crossovers"][0]["omega"] == pytest.approx(4.2, rel=1e-9)
+    assert found["overshoot_weighted"] < found["overshoot"]
+    assert json.loads(run(4.2, 60, "--delay-ms", 5, "--json").output)["overshoot"] is None
+
+
+@pytest.mark.parametrize("arguments", [(10, 60), (10, 60, "--type", "PD"), (-1, 60), (4.2, 60, "--ms-max", 1.1)])
+def test_a_user_error_is_one_sentence_and_exit_code_2(arguments):
+    result = run("--", *arguments) if arguments[0] == -1 else run(*arguments)
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ")

@@ -1,0 +1,274 @@
+"""`servotwin bench fleet`: its edges without a twin, its line without a socket, and all of it once, small."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from twin_messages import window_message
+from typer.testing import CliRunner
+
+from benchmarks.fleet import findings
+from benchmarks.fleet.edges import Fleet, Turn
+from benchmarks.fleet.line import Line
+from benchmarks.fleet.plan import Load, Plan, decode_load, encode_load, shares
+from benchmarks.fleet.processes import Used, children, used
+from benchmarks.fleet.runs import Ran
+from benchmarks.fleet.setting import QUICK
+from benchmarks.fleet.stock import BOOT, readdressed
+from benchmarks.fleet.tables import lines
+from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, Sample, Watch
+from servotwin.cli.app import app
+from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
+from servotwin.messages import Receipt, Update, decode, encode
+from servotwin.store.rows import Incoming, Kind
+from servotwin.store.store import open_store
+
+PLAN = Plan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
+
+
+def load(plan: Plan = PLAN, places: int = 2) -> Load:
+    made = tuple(tuple(encode(window_message(sequence=10 * p + k, start=5.0)) for k in range(2)) for p in range(places))
+    return Load(plan, made)
+
+
+def fleet(plan: Plan = PLAN) -> Fleet:
+    return Fleet(load(plan), 0.0)
+
+
+# --- what is sent
+
+
+def test_a_window_is_readdressed_and_stays_whole() -> None:
+    one = window_message(sequence=1, start=5.0)
+    one = msgspec.structs.replace(one, reference_changes=((5.1, 1e-3),))
+    other = decode(encode(readdressed(one, "ax-1", 7, 300.0, 4)))
+    assert (other.servo, other.boot, other.sequence, other.parameter_version) == ("ax-1", BOOT, 7, 4)
+    assert other.channels == one.channels
+    assert other.reference_changes == ((pytest.approx(300.1), 1e-3),)
+
+
+def test_windows_fall_due_at_the_rate_and_no_more_than_the_plan_has() -> None:
+    edges = fleet()
+    edges.fall_due(0.0)
+    assert edges.waiting == 1
+    edges.fall_due(0.55)
+    assert edges.waiting == 6
+    edges.fall_due(100.0)
+    assert edges.waiting == 20
+    taken = [edges.take(100.0) for _ in range(20)]
+    assert [due for _, due in taken] == pytest.approx([0.1 * k for k in range(20)])
+    assert [edge.name for edge, _ in taken][:5] == ["ax-00000", "ax-00001", "ax-00002", "ax-00003", "ax-00000"]
+    assert edges.take(100.0) is None
+
+
+def test_in_an_outage_windows_are_kept() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 1.5)))
+    edges.fall_due(1.0)
+    assert edges.take(1.0) is None
+    assert edges.waiting == 11
+    assert edges.take(1.5) is not None
+    assert edges.undisturbed(0.4)
+    assert not edges.undisturbed(1.0)
+
+
+def test_without_a_rate_a_window_is_due_whenever_one_may_be_sent() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, rate=0.0))
+    assert [edges.take(0.1 * k)[0].name for k in range(5)] == [
+        "ax-00000",
+        "ax-00001",
+        "ax-00002",
+        "ax-00003",
+        "ax-00000",
+    ]
+    assert edges.take(2.0) is None
+
+
+def test_news_moves_the_gap_to_the_next_place_and_keeps_it_there() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, news=1.0))
+    edge = edges.edges[0]
+    first = decode(edges.window(edge, 0.1))
+    assert (edge.place, edges.counts.news) == (1, 1)
+    assert first.channels == edges.places[1][0].channels
+    quiet = fleet()
+    assert decode(quiet.window(quiet.edges[0], 0.1)).channels == quiet.places[0][0].channels
+    assert (first.start, first.sequence, first.parameter_version) == (pytest.approx(200.1), 100, 3)
+
+
+def test_updates_are_applied_once_and_answered() -> None:
+    edges = fleet()
+    edge = edges.edges[1]
+    update = Update("ax-00001", 4, 3, ("boot-9", 100), 200.0, 0.1, 1e-3, (0.09, 0.11), "ok", 0.0, 400.0)
+    key = key_of(verifier_of(""))
+    body = msgspec.msgpack.encode([seal(key, TO_EDGE, "ax-00001", serial, encode(update)) for serial in (5, 6)])
+    edges.heard(edge, body)
+    assert (edge.version, edge.serial, edges.counts.updates) == (4, 6, 1)
+    (receipt,) = edge.receipts
+    assert isinstance(receipt, Receipt)
+    assert (receipt.version, receipt.applied, receipt.boot) == (4, True, "boot-9")
+
+
+class Spoken:
+    """A line that answers at once, as told."""
+
+    def __init__(self, *answers) -> None:
+        self.answers, self.asked = list(answers), []
+
+    def ask(self, head, body, answered) -> None:
+        self.asked.append((head.split(b" HTTP")[0].decode(), body))
+        answered(*self.answers.pop(0))
+
+
+def test_a_turn_polls_answers_and_sends() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, polls=True))
+    edge, told = edges.edges[0], []
+    edge.receipts.append(Receipt("ax-00000", 3, True, 1, "applied", 3, "boot-9"))
+    line = Spoken((200, b"\x90"), (202, b""), (201, b"\x90"))
+    turn = Turn(edges, line, asyncio.Event(), told)
+    turn.begin(edge, 0.0)
+    assert [what for what, _ in line.asked] == [
+        "GET /v1/servos/ax-00000/outgoing?after=0&wait=0",
+        "POST /v1/servos/ax-00000/letters",
+        "PUT /v1/servos/ax-00000/windows/boot-9/100",
+    ]
+    assert (edge.sequence, edges.counts.windows, edges.counts.polls) == (101, 1, 1)
+    assert turn.done.is_set()
+    assert not told
+
+
+@pytest.mark.parametrize(("status", "kept", "failures"), [(503, 1, 0), (429, 1, 0), (400, 0, 1), (500, 0, 1)])
+def test_what_is_put_off_is_kept_and_what_is_refused_ends_it(status: int, kept: int, failures: int) -> None:
+    edges, told = fleet(), []
+    turn = Turn(edges, Spoken((status, b"")), asyncio.Event(), told)
+    turn.begin(edges.edges[0], 0.0)
+    assert (edges.waiting, len(told), edges.counts.windows) == (kept, failures, 0)
+    assert turn.done.is_set()
+
+
+class Wire:
+    """Takes what a line writes."""
+
+    def __init__(self) -> None:
+        self.written = b""
+
+    def write(self, data: bytes) -> None:
+        self.written += data
+
+    def is_closing(self) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("cut", range(1, 60, 7))
+def test_a_line_reads_answers_however_they_come(cut: int) -> None:
+    broken, answers = [], []
+    line, wire = Line(broken.append), Wire()
+    line._transport = wire
+    assert not line.closed
+    whole = b"HTTP/1.1 201 Created\r\ncontent-type: x\r\nContent-Length: 5\r\n\r\nhello"
+    line.ask(b"PUT /x HTTP/1.1\r\n", b"body", lambda status, body: answers.append((status, body)))
+    assert wire.written == b"PUT /x HTTP/1.1\r\nContent-Length: 4\r\n\r\nbody"
+    line.data_received(whole[:cut])
+    line.data_received(whole[cut:])
+    assert answers == [(201, b"hello")]
+    line.connection_lost(None)
+    assert line.closed
+    assert not broken
+    line._transport = wire
+    line.ask(b"GET /y HTTP/1.1\r\n", b"", lambda status, body: answers.append((status, body)))
+    line.connection_lost(None)
+    assert broken
+
+
+def test_a_load_comes_back_from_its_file() -> None:
+    assert decode_load(encode_load(load())) == load()
+
+
+def test_shares_are_the_median_the_99_percent_and_the_largest() -> None:
+    assert shares([float(k) for k in range(101)]) == (50.0, 99.0, 100.0)
+    assert shares([]) == (0.0, 0.0, 0.0)
+
+
+# --- what is seen
+
+
+def test_processes_are_seen_by_what_they_use() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        seen = used(process.pid)
+        assert seen is not None
+        assert seen.memory > 0
+        assert process.pid in children(os.getpid())
+    assert used(process.pid) is None
+
+
+def watched(*samples: Sample) -> Watch:
+    return Watch(1, 2, lambda: (0, 0.0), list(samples))
+
+
+def test_cores_and_memory_of_a_role() -> None:
+    def at(time: float, cpu: float, memory: int) -> Sample:
+        return Sample(time, {EDGES: Used(cpu, memory)}, 0, 0.0)
+
+    watch = watched(at(0.0, 1.0, 10), at(1.0, 1.2, 30), at(4.0, 3.0, 20))
+    assert watch.cores(EDGES) == pytest.approx(0.5)
+    assert watch.memory(EDGES) == (10, 30, 30)
+    assert watch.cores(TWIN) == 0.0
+
+
+def test_the_store_tells_how_long_windows_waited(tmp_path: Path) -> None:
+    store = open_store(f"sqlite:///{tmp_path / 'x.db'}")
+    try:
+        items = [
+            Incoming("a", Kind.WINDOW, f"b/{k}", b"x", "", bytes([k]) * 16, 100.0 + k, "b", k, float(k))
+            for k in range(4)
+        ]
+        store.put(items)
+        with findings.reading(tmp_path / "x.db") as reading:
+            assert findings.waiting(reading, 110.0) == (4, 10.0)
+            assert findings.stored(reading) == 4
+            found = findings.done(reading, 101.0, 103.0)
+            assert (found.windows, found.undone) == (2, 2)
+            assert findings.made(reading, 0.0) == {}
+            assert findings.failures(reading) == []
+    finally:
+        store.close()
+
+
+# --- all of it
+
+
+@pytest.mark.slow
+def test_a_small_fleet_with_real_processes(tmp_path: Path, monkeypatch) -> None:
+    kept: list[Ran] = []
+    monkeypatch.setattr(
+        "benchmarks.fleet.command.show", lambda _scale, alone, whole, _console: kept.extend((alone, whole))
+    )
+    output = tmp_path / "fleet.json"
+    shown = CliRunner().invoke(app, ["bench", "fleet", "--quick", "--json", str(output)])
+    assert shown.exit_code == 0, shown.output
+    alone, whole = kept
+    assert alone.report.windows > 0
+    sent = round(QUICK.rate * (QUICK.steady + QUICK.outage + QUICK.after))
+    assert whole.report.windows == sent
+    assert whole.made["glance"] == sent
+    # Every window with news is estimated, and of the others those that are due.
+    assert whole.report.news <= whole.made.get("estimate", 0) <= whole.report.news + 0.1 * sent
+    assert whole.steady.undone == 0
+    assert not math.isnan(whole.drained)
+    assert {role for role in (EDGES, TWIN, WORKERS) if whole.watch.memory(role)[2] > 0} == {EDGES, TWIN, WORKERS}
+    found = json.loads(output.read_text())
+    assert found["schema"] == "servotwin-bench-fleet/1"
+    assert len(found["lines"]) == len(list(lines(QUICK, alone, whole)))
+
+
+def test_full_belongs_to_the_fleet() -> None:
+    for names in (["tick"], ["W1"], [], ["fleet", "--quick"]):
+        shown = CliRunner().invoke(app, ["bench", *names, "--full"])
+        assert shown.exit_code == 2
+        assert "--full: only bench fleet takes it" in shown.output

@@ -1,0 +1,61 @@
+"""`servotwin bench hostile`: what is shown and written of machines and their twins."""
+
+import io
+import json
+from collections import Counter
+
+import pytest
+from rich.console import Console
+
+from benchmarks import alone, endurance, hostile
+from benchmarks.hostile import Outcome
+from benchmarks.hostiletwin import Kind
+from servotwin.errors import InvalidInput
+from servotwin.messages import Cause, Reason
+
+WORST = {Kind.SILENT: 0.5, Kind.LIES_HIGH: 1.5, Kind.LIES_LOW: 0.25, Kind.REPLAYS: 0.75}
+
+
+def fake(seed: int, kind: Kind, rubs: bool) -> Outcome:
+    fallbacks = (Cause.SILENCE,) if kind is Kind.SILENT else ()
+    refused = Counter({Reason.OLD_DATA: 2, Reason.EXPIRED: seed})
+    return Outcome(kind, hostile.case(seed, rubs), WORST[kind], 0.0, True, seed, fallbacks, refused)
+
+
+def told(text: Console) -> str:
+    return text.file.getvalue()
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch, tmp_path):
+    monkeypatch.setattr(endurance, "shared", lambda _function, tasks: ((task, fake(*task)) for task in reversed(tasks)))
+    console, output = Console(file=io.StringIO(), width=100), tmp_path / "hostile.json"
+    outcomes = endurance.endurance("2026-11-21", output, 8, console=console)
+    return outcomes, told(console), json.loads(output.read_text())
+
+
+def test_every_kind_has_its_row_in_the_order_of_the_kinds(found) -> None:
+    outcomes, text, _ = found
+    assert [outcome.kind for outcome in outcomes] == [*hostile.KINDS, *hostile.KINDS, hostile.KINDS[0]]
+    rows = {kind: next(line.split() for line in text.splitlines() if line.startswith(kind.value)) for kind in WORST}
+    assert rows[Kind.LIES_HIGH][-5:] == ["2", "1.50", "2", "6", "0"]
+    assert rows[Kind.SILENT][-5:] == ["2", "0.50", "0", "4", "2"]
+    rubbing = next(line.split() for line in text.splitlines() if line.startswith(endurance.FRICTION))
+    assert rubbing[-5:] == ["1", "0.50", "0", "0", "1"]
+    assert "6 of 8 machines as stated stay within 0.12" in text
+
+
+def test_the_document_says_the_same(found) -> None:
+    outcomes, _, document = found
+    assert document["schema"] == endurance.SCHEMA
+    assert document["band"]["error_m"] == hostile.band().error
+    assert [row["worst_bands"] for row in document["outcomes"]] == [outcome.worst for outcome in outcomes]
+    assert [row["friction_n_m"] > 0.0 for row in document["outcomes"]] == [False] * 8 + [True]
+    assert document["outcomes"][0]["fallbacks"] == ["the twin is silent"]
+
+
+def test_it_stands_alone() -> None:
+    for names, others in ((("hostile", "W1"), False), (("hostile",), True), (("estimator", "hostile"), False)):
+        with pytest.raises(InvalidInput, match="stands alone"):
+            alone.run_alone(names, "", None, True, others)
+    assert not alone.run_alone(("W1",), "", None, True, True)

@@ -1,0 +1,94 @@
+"""The policies side by side: machines, one trial, the table, the command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks.policies.command import chosen, dumps, policies, shown
+from benchmarks.policies.contenders import constants, contender
+from benchmarks.policies.machines import BIAS, BLOCKS, machines
+from benchmarks.policies.table import Row, compare
+from benchmarks.policies.trial import REST, Told, run_machine, scores
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Step
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.setting import Setting
+from servotwin.simulation import simulate
+
+MODEL = Servo.preset("paper")
+KNOWN = Uncertainty(input_bias=(-0.1, 0.1))
+CALM = Setting(MODEL.controller.replace(Ki=0.0))
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_machines_are_what_is_stated(block: str) -> None:
+    those = machines(MODEL, KNOWN, block, 50, 7)
+    assert those == machines(MODEL, KNOWN, block, 50, 7)
+    assert all(0.0 <= m.gap <= KNOWN.gap[1] and abs(m.theta_d0) <= 0.5 * m.gap for m in those)
+    assert all(KNOWN.step[0] <= m.step <= KNOWN.step[1] for m in those)
+    assert all(abs(m.servo.k / MODEL.k - 1.0) <= 0.15 and abs(m.servo.c / MODEL.c - 1.0) <= 0.5 for m in those)
+    assert any(m.input_bias for m in those) == (block == "bias")
+    assert any(m.friction for m in those) == (block == "friction")
+    assert all(m.friction <= BIAS * m.servo.k_T / m.servo.R for m in those)
+
+
+def test_scores_are_those_of_the_closed_form() -> None:
+    """Without a gap the calm loop is linear: its error is that of the closed loop's step response."""
+    run = simulate(MODEL, REST + 60.0, controller=CALM.controller, reference=Step(1e-3, REST), sample_rate=500.0)
+    found = scores(run, 1e-3, CALM, MODEL)
+    time = np.arange(0.0, 60.0 + 1e-9, 0.002)
+    response = MODEL.closed_loop(CALM.controller).step(time)
+    assert found.overshoot == pytest.approx(response.max() - 1.0, abs=1e-6)
+    assert found.settling == pytest.approx(time[np.flatnonzero(np.abs(response - 1.0) > 0.02)[-1]], abs=0.002)
+    assert found.cost == pytest.approx(np.abs(response - 1.0).mean() * 60.0, rel=1e-3)
+    assert found.ripple < 1e-12
+    assert (found.scale, found.integral, found.width) == (1.0, 0.0, 0.0)
+
+
+def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
+    machine = max(machines(MODEL, KNOWN, "bias", 10, 1), key=lambda m: abs(m.input_bias))
+    learnt = run_machine(machine, "bias", MODEL, contender("certified", MODEL, KNOWN))
+    constant = run_machine(machine, "bias", MODEL, Told(None, CALM))
+    assert constant.tail == pytest.approx(abs(machine.input_bias / CALM.controller.Kp), rel=1e-2)
+    assert learnt.tail < 0.05 * constant.tail
+    assert learnt.cost < constant.cost
+
+
+def test_constants_are_all_different_and_hold_the_calm_one() -> None:
+    found = constants(MODEL, KNOWN)
+    assert len(set(found.values())) == len(found) > 20
+    assert CALM in found.values()
+
+
+def test_the_table_and_its_document() -> None:
+    rows = list(compare(MODEL, KNOWN, 3, seed=3, blocks=("clean",)))
+    assert [row.name for row in rows[:5]] == ["no dead zone", "paper", "margin", "hysteresis", "certified"]
+    assert rows[-1].name.startswith("constant: ")
+    certified = rows[4]
+    assert certified.settled == 1.0
+    assert certified.at("tail", 95.0) < 5e-6
+    assert rows[0].at("tail", 50.0) > 10.0 * certified.at("tail", 95.0)
+    assert len(shown(rows).rows) == len(rows)
+    assert sum(int(cell) for cell in chosen(rows).columns[2]._cells) == 3
+    document = json.loads(dumps(rows, "2026-11-21"))
+    assert document["rows"][4]["tail"] == pytest.approx(list(certified.scores.tail))
+    assert document["rows"][0]["gap_deg"] == pytest.approx([math.degrees(m.gap) for m in certified.machines], abs=1e-6)
+
+
+def test_settled_is_a_share() -> None:
+    those = tuple(machines(MODEL, KNOWN, "clean", 2, 1))
+    still, hunting = (run_machine(those[0], "clean", MODEL, Told(None, s)) for s in (CALM, Setting(MODEL.controller)))
+    row = Row("clean", "two", type(still)(*np.array([still, hunting]).T), those)
+    assert row.settled == 0.5
+
+
+def test_a_file_that_cannot_be_written_is_told_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="json"):
+        policies("", tmp_path / "out.csv", 2, console=Console(quiet=True))

@@ -1,0 +1,174 @@
+"""The evidence chain as people read it."""
+
+import math
+from typing import Any
+
+import pytest
+
+from servotwin.cli.audit_text import HEAD, lines_of
+from servotwin.messages import Cause
+
+SERVO = {
+    "servo": "ax-1",
+    "gap": math.radians(7.5),
+    "std": math.radians(0.02),
+    "status": "ok",
+    "version": 3,
+    "receipt": "applied",
+    "windows": 42,
+    "waiting": 1,
+    "heard": 0.0,
+}
+UPDATE = {"tolerance": 61.25e-6, "controller": {"Kp": 1377.7, "Ki": 0.0, "Kd": -135.1, "Tf": 0.1, "feedforward": -0.02},
+          "proof": {"members": 256}}  # fmt: skip
+
+
+def found(kind: str, status: str = "", **values: Any) -> dict[str, Any]:
+    nothing = {"version": None, "gap": None, "std": None, "tail": None, "made": 0.0, "body": None}
+    return {"kind": kind, "status": status, **nothing, **values}
+
+
+def estimate(status: str = "ok", **values: Any) -> dict[str, Any]:
+    return found("estimate", status, **{"version": 2, "gap": math.radians(7.5), "tail": 12.34e-6, **values})
+
+
+def link(
+    number: int, *of: dict[str, Any], boot: str = "b1", done: float | None = 1.0, steps: Any = ()
+) -> dict[str, Any]:
+    window = {"boot": boot, "sequence": number, "received": 60.0 * number, "done": done}
+    return {"window": window, "found": list(of), "steps": list(steps)}
+
+
+def step(effect: Any = None, *answers: dict[str, Any]) -> dict[str, Any]:
+    return {"update": found("update", "ok", version=3, body=UPDATE), "answers": list(answers), "effect": effect}
+
+
+def told(*links: dict[str, Any], events: Any = (), changes: bool = False, **servo: Any) -> list[str]:
+    lines = list(lines_of({**SERVO, **servo}, links[::-1], events, changes))
+    assert lines[lines.index(HEAD) - 1] == ""
+    return lines
+
+
+def chain(*links: dict[str, Any], **other: Any) -> list[str]:
+    lines = told(*links, **other)
+    return lines[lines.index(HEAD) + 1 :]
+
+
+def test_the_head_says_how_it_stands() -> None:
+    trend = found("trend", body={"mean": [0.1, math.radians(0.5) / 3600.0, 0.0], "covariance": [0.0] * 9})
+    head = told(link(1, estimate(), trend, found("disturbance", body={"bias": 0.02, "noise": 2e-6})))[:3]
+    assert head == [
+        "servo ax-1: gap 7.500 ± 0.020 deg (ok), version 3 (applied)",
+        "  windows: 42 stored, 1 messages wait, last heard of 1970-01-01 00:00:00 UTC",
+        "  wear 0.5 ± 0 deg/h, input bias 20.0 mV, noise 2.0 um",
+    ]
+    assert told(link(1), gap=None, version=None, receipt="", heard=None)[:2] == [
+        "servo ax-1: no gap known, no version sent",
+        "  windows: 42 stored, 1 messages wait",
+    ]
+
+
+def test_a_version_from_its_window_to_its_effect() -> None:
+    """In the order of time: window, version, receipt, effect; each thing on a line of its own."""
+    after = estimate(tail=5e-6, version=3)
+    effect = {"window": {"sequence": 2}, "before": estimate(), "after": after}
+    receipt = found("receipt", "applied", version=3, body={"applied": True, "sample": 5000})
+    first = link(1, estimate(), found("redesign", "", body={}), steps=[step(effect, receipt)])
+    lines = chain(first, link(2, after, found("redesign", "what was proved is in force already")))
+    assert lines[0] == "boot b1"
+    assert [line[HEAD.index("what followed") :] for line in lines[1:]] == [
+        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, proved on 256 "
+        "machines",
+        "version 3 applied at sample 5000",
+        "version 3 in window 2: error 12.3 -> 5.0 um",
+        "what was proved is in force already",
+    ]
+    assert lines[1].split()[:6] == ["1970-01-01", "00:01:00", "1", "7.500", "12.3", "2"]
+
+
+@pytest.mark.parametrize(
+    ("of", "said"),
+    [
+        (link(1, done=None), "waits to be worked on"),
+        (link(1, found("estimate", "failed: ValueError: no")), "failed: ValueError: no"),
+        (link(1, found("glance", "nothing moved", gap=0.1)), "a glance was enough: nothing moved"),
+        (link(1, found("glance", "it moved"), estimate()), ""),
+        (link(1, estimate("lower bound", body={"estimate": {"reasons": ["one side"]}})), "lower bound: one side"),
+        (link(1, estimate("lower bound")), "lower bound: no reason noted"),
+        (link(1, estimate("lower bound"), found("redesign", "it is a lower bound")), "it is a lower bound"),
+        (link(1, estimate(), found("trend", "an outlier")), "trend: an outlier"),
+        (link(1, estimate(), found("redesign", "")), "a setting was found, and waits to be sent"),
+        (link(1, estimate(), found("excitation", "the window shows the gap")), ""),
+        (link(1, estimate(), found("request", "windows tell too little")), "request: windows tell too little"),
+        (link(1, estimate(), found("proof", "", version=3)), "version 3 is proved for this evidence"),
+        (link(1, estimate(), found("proof", "two fail", version=3)), "version 3 FAILED its proof: two fail"),
+        (link(1, estimate(), found("withdrawn", "two fail", version=3)), "version 3 WITHDRAWN: two fail"),
+    ],
+)  # fmt: skip
+def test_what_is_said_of_a_window(of: dict[str, Any], said: str) -> None:
+    _, line = chain(of)
+    assert line[HEAD.index("what followed") :] == said
+
+
+def test_a_refused_version_shows_why() -> None:
+    receipt = found("receipt", "expired", version=3, body={"applied": False})
+    assert (
+        chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip() == "version 3 REFUSED by the edge: expired"
+    )
+
+
+@pytest.mark.parametrize(
+    ("cause", "measured", "allowed", "said"),
+    [
+        (Cause.SILENCE, 41.0, 40.0, "41 s where 40 s are allowed"),
+        (Cause.EFFORT, 0.5, 0.2, "0.5 V where 0.2 V are allowed"),
+        (Cause.LIMIT_CYCLE, 3e-4, 1e-5, "300 um where 10 um are allowed"),
+        (Cause.ERROR, 3e-4, 1e-5, "300 um where 10 um are allowed"),
+        (Cause.ERROR_ENERGY, 3e-4, 1e-5, "300 um where 10 um are allowed"),
+    ],
+)
+def test_a_fallback_stands_where_it_happened(cause: Cause, measured: float, allowed: float, said: str) -> None:
+    body = {"cause": cause.value, "measured": measured, "allowed": allowed}
+    events = [found("fallback", cause.value, version=3, body=body, made=90.0)]
+    lines = chain(link(1, estimate()), link(2, estimate()), events=events)
+    assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {said}"
+
+
+def test_a_drive_that_refuses_is_no_question_of_size() -> None:
+    event = found(
+        "fallback", Cause.DRIVE.value, version=3, body={"cause": Cause.DRIVE.value, "measured": 0.0, "allowed": 0.0}
+    )
+    assert chain(link(1), events=[event])[0].endswith(f"FALLBACK from version 3: {Cause.DRIVE.value}")
+
+
+def test_starts_of_the_edge_and_faults_of_the_twin_are_told() -> None:
+    events = [
+        found("hello", "b2", version=3, made=70.0),
+        found("answer", "taken", made=80.0),
+        found("estimate", "failed: the state is not understood; the twin begins anew", made=90.0),
+    ]
+    lines = chain(link(1, estimate()), link(2, estimate(), boot="b2"), events=events)
+    assert [line[21:] for line in lines if line.startswith("1970") and "7.5" not in line] == [
+        "edge in touch: boot b2, version 3 in force",
+        "the edge answers a request: taken",
+        "failed: the state is not understood; the twin begins anew",
+    ]
+    assert [line for line in lines if line.startswith("boot")] == ["boot b1", "boot b2"]
+
+
+def test_changes_leaves_out_what_led_to_nothing() -> None:
+    quiet, failed = link(1, estimate(), found("redesign", "no")), link(2, found("estimate", "failed: no"))
+    asked, sent = link(3, estimate(), found("request", "more")), link(4, estimate(), steps=[step()])
+    lines = chain(quiet, failed, asked, sent, changes=True)
+    assert [line.split()[2] for line in lines if line.startswith("1970")] == ["2", "3", "4"]
+
+
+def test_rubbish_in_a_body_is_no_reason_to_fail() -> None:
+    for body in (None, {}, {"mean": []}, {"mean": None, "bias": "x", "noise": None}):
+        of = [
+            found(kind, "odd", version=1, body=body) for kind in ("trend", "disturbance", "estimate", "update", "new")
+        ]
+        receipt = found("receipt", "odd", body=body)
+        update = {"update": found("update", body=body), "answers": [receipt], "effect": None}
+        events = [found(kind, "odd", body=body) for kind in ("fallback", "hello", "answer")]
+        assert chain(link(1, *of, steps=[update]), events=events)

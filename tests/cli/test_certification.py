@@ -1,0 +1,112 @@
+"""`servotwin certify`: tables for the models of a twin's file, or of a scenario."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from servotwin.cli.app import app
+from servotwin.cli.certify import certify, grid_of
+from servotwin.errors import InvalidInput
+from servotwin.redesign.certified.lookup import Grid
+from servotwin.twin.fleet import Fleet
+
+COARSE = Grid(math.radians(60.0), (1e-2,), (0.0,))
+MODEL = """
+[models.{name}]
+servo = "paper"
+[models.{name}.twin]
+{table}
+"""
+
+
+def twin_file(folder: Path, *models: tuple[str, str]) -> Path:
+    text = "".join(MODEL.format(name=name, table=f'table = "{table}"' if table else "") for name, table in models)
+    path = folder / "twin.toml"
+    path.write_text(text + '\n[servos]\n"ax-*" = "one"\n', encoding="utf-8")
+    return path
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path: Path) -> None:
+    path = twin_file(tmp_path, ("one", "one.table"), ("other", ""))
+    with pytest.raises(InvalidInput, match=r"one\.table: cannot be read .*`servotwin certify` makes tables"):
+        Fleet.loads(path.read_text(), "twin.toml", tmp_path)
+    console = quiet()
+    (table,) = certify(path, grid=COARSE, console=console)
+    assert "1 of 1 cells of gaps from 0 to 60 deg are proved" in console.file.getvalue()
+    assert len(table.cells) == 1
+    assert Fleet.loads(path.read_text(), "twin.toml", tmp_path).models[0].settings.table == str(tmp_path / "one.table")
+
+
+def test_one_model_may_be_named_and_its_file(tmp_path: Path) -> None:
+    path = twin_file(tmp_path, ("one", ""), ("other", ""))
+    certify(path, "other", tmp_path / "x.table", COARSE, quiet())
+    assert (tmp_path / "x.table").exists()
+
+
+def test_a_scenario_will_do(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(
+        'servo = "paper"\nduration_s = 50.0\n[reference]\nkind = "square"\namplitude_mm = 1.0\nperiod_s = 40.0\n'
+        '[gap]\ntotal_deg = 5.0\n[twin]\ntable = "s.table"\n',
+        encoding="utf-8",
+    )
+    certify(path, grid=COARSE, console=quiet())
+    assert (tmp_path / "s.table").exists()
+
+
+@pytest.mark.parametrize(
+    ("models", "options", "why"),
+    [
+        ((("one", ""),), (None, None), 'no model has a key table = "NAME.table"'),
+        ((("one", "a.table"),), ("ore", None), "no such model .did you mean 'one'"),
+        ((("one", ""), ("two", "")), (None, Path("x.table")), "has 2 models; say which with --model"),
+    ],
+)
+def test_what_cannot_be_proved_is_said(tmp_path: Path, models, options, why: str) -> None:
+    with pytest.raises(InvalidInput, match=why):
+        certify(twin_file(tmp_path, *models), *options, COARSE, quiet())
+
+
+def test_a_policy_that_proves_nothing_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "twin.toml"
+    path.write_text(
+        '[models.one]\nservo = "paper"\n[models.one.twin]\npolicy = "paper"\n[servos]\n"a" = "one"\n', encoding="utf-8"
+    )
+    with pytest.raises(InvalidInput, match="model 'one': policy 'paper' proves nothing"):
+        certify(path, out=tmp_path / "x.table", grid=COARSE, console=quiet())
+
+
+def test_an_interrupt_says_what_is_finished(tmp_path: Path, monkeypatch) -> None:
+    def interrupted(*_given):
+        yield 3, 8
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servotwin.cli.certify.build", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"interrupted: 3 of 8 cells are in .*one\.table; the same command"):
+        certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=quiet())
+
+
+@pytest.mark.parametrize(("options", "why"), [(("x", "0"), "--bias-mv 'x'"), (("1", "0,y"), "--noise-um '0,y'")])
+def test_options_that_are_no_numbers_are_named(options: tuple[str, str], why: str) -> None:
+    with pytest.raises(InvalidInput, match=why):
+        grid_of(4.0, *options)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    path = twin_file(tmp_path, ("one", "one.table"))
+    coarse = ["--finest-deg", "60", "--bias-mv", "10", "--noise-um", "0"]
+    shown = CliRunner().invoke(app, ["certify", str(path), *coarse])
+    assert shown.exit_code == 0, shown.output
+    assert "1 of 1 cells" in shown.output
+    again = CliRunner().invoke(app, ["certify", str(path), "--finest-deg", "30"])
+    assert again.exit_code == 2

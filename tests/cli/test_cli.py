@@ -1,0 +1,139 @@
+"""The command line: quick to start, one sentence for every user error, exit codes 2 and 130, no traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from typer.testing import CliRunner
+
+from servotwin.cli import app as cli
+
+SMALL = """
+servo = "paper"
+duration_s = 2.0
+[reference]
+kind = "step"
+size_mm = 1.0
+[gap]
+total_deg = 5.0
+"""
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def run_process(*arguments):
+    command = [sys.executable, "-m", "servotwin", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    path = tmp_path / "scenario.toml"
+    path.write_text(SMALL)
+    return path
+
+
+def test_help_names_every_command():
+    result = run("--help")
+    assert result.exit_code == 0
+    for name in ("demo", "reproduce", "simulate"):
+        assert name in result.output
+
+
+def test_help_loads_no_numbers_library():
+    heavy = "{'numpy', 'scipy', 'numba', 'matplotlib'}"
+    code = f"import sys, servotwin.cli.app; print(*sorted({heavy} & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert found.stdout.strip() == ""
+
+
+def test_version():
+    result = run("--version")
+    assert result.exit_code == 0
+    assert result.output.startswith("servotwin 0.")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("simulate", "SCENARIO", "-o", "run.xyz"), "'.xyz'"),
+        (("simulate", "SCENARIO", "-o", "nowhere/run.csv"), "no directory nowhere"),
+        (("simulate", "missing.toml", "-o", "run.csv"), "missing.toml"),
+        (("reproduce", "--only", "fig13"), "fig13"),
+        (("reproduce", "--only", "crosover"), "did you mean 'crossover'"),
+        (("reproduce", "--only", "fig7", "--preset", "papre"), "papre"),
+        (("demo", "--preset", "tabel1"), "tabel1"),
+        (("demo", "--out", "SCENARIO/out"), "cannot be made"),
+    ],
+)
+def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arguments, said):
+    monkeypatch.chdir(scenario.parent)
+    result = run(*(argument.replace("SCENARIO", str(scenario)) for argument in arguments))
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ")
+    assert [path.name for path in scenario.parent.iterdir()] == [scenario.name]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("duraton_s = 3.0\n" + SMALL, "duraton_s"),
+        (SMALL.replace("5.0", "-5.0"), "total_deg"),
+        (SMALL.replace("1.0", "nan"), "size_mm"),
+        ("", "empty"),
+        ("= what", "TOML"),
+    ],
+)
+def test_a_bad_scenario_is_refused_before_anything_is_written(scenario, change, said):
+    scenario.write_text(change)
+    result = run("simulate", scenario, "-o", scenario.parent / "run.csv")
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert scenario.name in result.stderr
+    assert [path.name for path in scenario.parent.iterdir()] == [scenario.name]
+
+
+def test_a_process_ends_with_2_and_without_traceback(tmp_path):
+    result = run_process("simulate", tmp_path / "no.toml", "-o", tmp_path / "run.csv")
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+    assert result.stderr.startswith("error: ")
+
+
+def test_an_interrupt_is_130_and_one_line(scenario, monkeypatch):
+    monkeypatch.setattr("servotwin.cli.simulate.record", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    result = run("simulate", scenario, "-o", scenario.parent / "run.csv")
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_a_reproduction_can_be_interrupted(tmp_path):
+    """Ctrl-C reaches the whole foreground group: parent and workers."""
+    command = [sys.executable, "-m", "servotwin", "reproduce", "--workers", "2", "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while not (tmp_path / "out").is_dir() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(1.0)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    assert not (tmp_path / "out" / "report.html").exists()
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_the_estimator_s_bench_takes_no_option_that_it_ignores():
+    for words in (["W1"], ["--runs", "3"], ["--slow"]):
+        result = run("bench", "estimator", *words)
+        assert result.exit_code == 2, words

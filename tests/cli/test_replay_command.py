@@ -1,0 +1,172 @@
+"""`servotwin replay` on the store of a real twin: the same bit for bit, or what differs, window by window."""
+
+import re
+import shutil
+import sqlite3
+from contextlib import closing
+from importlib.metadata import version
+from math import inf
+from pathlib import Path
+
+import msgspec
+import pytest
+from test_lockstep import SCENARIO, deployed
+from typer.testing import CliRunner
+
+from servotwin.cli import app as cli
+from servotwin.cosim.scenario import Scenario
+from servotwin.store.retention import forget
+from servotwin.store.store import open_store
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a twin that has worked through a scenario in lock-step."""
+    folder = tmp_path_factory.mktemp("recorded")
+    text = SCENARIO.format(twin='policy = "paper"', duration=24.0, period=4.0, fine="false")
+    (folder / "scenario.toml").write_text(text)
+    deployed(folder, Scenario.load(folder / "scenario.toml"), 'policy = "paper"')
+    return folder
+
+
+@pytest.fixture
+def folder(recorded: Path, tmp_path: Path) -> Path:
+    """A copy that may be spoiled."""
+    for file in recorded.glob("twin.*"):
+        shutil.copy(file, tmp_path)
+    return tmp_path
+
+
+def replayed(folder: Path, *options: str) -> tuple[int, str]:
+    """Exit code, and what is printed."""
+    found = CliRunner().invoke(cli.app, ["replay", "axis", "--config", str(folder / "twin.toml"), *options])
+    return found.exit_code, found.stdout + found.stderr
+
+
+def changed(folder: Path, statement: str, *values: object) -> int:
+    """Rows of the store that a statement changes."""
+    with closing(sqlite3.connect(folder / "twin.db")) as database, database:
+        return database.execute(statement, values).rowcount
+
+
+def asked(folder: Path, query: str) -> list[tuple[object, ...]]:
+    with closing(sqlite3.connect(folder / "twin.db")) as database:
+        return database.execute(query).fetchall()
+
+
+def windows(folder: Path) -> int:
+    ((number,),) = asked(folder, "select count(*) from messages where kind = 'window'")
+    assert isinstance(number, int)
+    assert number > 5
+    return number
+
+
+def test_every_estimate_comes_out_again_bit_for_bit(folder: Path) -> None:
+    code, said = replayed(folder)
+    assert code == 0
+    assert said.split("\n") == [
+        f"servo axis: {windows(folder)} windows", f"  {windows(folder):6d} the same, bit for bit", ""
+    ]  # fmt: skip
+
+
+def test_a_version_that_is_another_one_now_is_named(folder: Path) -> None:
+    assert changed(folder, "update contexts set text = replace(text, ?, ?)", f'"{version("numpy")}"', '"1.2.3"') == 1
+    code, said = replayed(folder)
+    assert code == 0, "the numbers are the same all the same"
+    assert f"{windows(folder)} the same, bit for bit" in said
+    assert f"otherwise since {windows(folder)} windows: numpy 1.2.3 then, {version('numpy')} now" in said
+
+
+def test_an_estimate_that_is_not_what_comes_out_is_told(folder: Path) -> None:
+    """One bit of one stored number: nothing explains that, and nothing else is blamed."""
+    (row, body), *_ = asked(folder, "select id, body from evidence where kind = 'estimate' and status = 'ok'")
+    assert isinstance(body, bytes)
+    stored = msgspec.msgpack.decode(body)
+    stored["estimate"]["gap"] += 1e-12
+    assert changed(folder, "update evidence set body = ? where id = ?", msgspec.msgpack.encode(stored), row) == 1
+    code, said = replayed(folder)
+    assert code == 1
+    assert re.search(
+        r"^window .*/\d+: gap .* deg then, .* deg now; changed: gap; no version, .* explains it$", said, re.M
+    )
+    assert re.search(r"^ +1 NOT the same$", said, re.M)
+    assert f"{windows(folder) - 1} the same, bit for bit" in said
+
+
+def test_another_model_of_today_is_named_with_what_it_changes(folder: Path) -> None:
+    code, _ = replayed(folder, "--present")
+    assert code == 0
+    twin = folder / "twin.toml"
+    twin.write_text(twin.read_text().replace('policy = "paper"', 'policy = "paper"\nmethod = "paper"'))
+    code, said = replayed(folder, "--present")
+    assert code == 1
+    assert f"otherwise since {windows(folder)} windows: settings.method 'whitened' then, 'paper' now" in said
+    assert replayed(folder)[0] == 0, "as they were then"
+
+
+def test_windows_that_retention_took_are_counted_and_the_rest_is_compared(folder: Path) -> None:
+    store = open_store(f"sqlite:///{folder / 'twin.db'}")
+    try:
+        gone = forget(store, inf)
+    finally:
+        store.close()
+    assert gone.emptied > 0
+    assert gone.kept > 0
+    code, said = replayed(folder)
+    assert code == 0
+    assert f"{gone.emptied} not made again, as retention took the window" in said
+    assert f"{gone.kept} the same, bit for bit" in said
+
+
+def test_one_window_is_enough(folder: Path) -> None:
+    name = asked(folder, "select key from messages where kind = 'window'")[2][0]
+    assert isinstance(name, str)
+    code, said = replayed(folder, "--window", name)
+    assert (code, said.splitlines()[0]) == (0, "servo axis: 1 window")
+
+
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("update contexts set text = '{}'", "settings are not understood"),
+        ("update contexts set text = 'x'", "the context is not understood"),
+        ("update bodies set body = x'00'", "cannot be decompressed|not understood"),
+        ("update evidence set body = x'00' where kind = 'estimate'", "the stored estimate is not understood"),
+    ],
+)
+def test_what_is_not_understood_is_told_for_each_window(folder: Path, statement: str, said: str) -> None:
+    assert changed(folder, statement) > 0
+    code, found = replayed(folder)
+    assert code == 1
+    assert "NOT made again, as what is stored is not understood" in found
+    assert re.search(said, found), found
+    assert "Traceback" not in found
+
+
+def test_what_was_never_estimated_is_counted_as_that(folder: Path) -> None:
+    assert changed(folder, "update evidence set status = 'failed: a reason' where kind = 'estimate'") == windows(folder)
+    code, said = replayed(folder)
+    assert (code, said.splitlines()[1].strip()) == (
+        0,
+        f"{windows(folder)} not estimated, as nothing could be made of the window",
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--window", "never/1"), "error: servo 'axis': no window never/1 of it was ever stored\n"),
+        (("--window", "never"), "error: window 'never': give BOOT/NUMBER, as `servotwin audit` shows it\n"),
+    ],
+)
+def test_a_window_that_is_none_is_one_sentence(folder: Path, arguments: tuple[str, ...], said: str) -> None:
+    assert replayed(folder, *arguments) == (2, said)
+
+
+def test_reading_makes_no_store(folder: Path) -> None:
+    for file in folder.glob("twin.db*"):
+        file.unlink()
+    code, said = replayed(folder)
+    assert code == 2
+    assert said.endswith("there is no such file; the twin makes it when it first runs\n")
+    assert not (folder / "twin.db").exists()

@@ -1,0 +1,167 @@
+"""A twin's or an edge's file that cannot work: one sentence, exit code 2, no traceback; each by the real process."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from selfsigned import self_made
+
+from servotwin.edge_process.checks import check
+from servotwin.edge_process.config_file import load
+from servotwin.errors import InvalidInput
+
+MODELS = '[models.a]\nservo = "paper"\n[models.a.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "a"\n'
+EDGE = """
+servo = "ax-1"
+role = "control"
+sample_rate_hz = 1000.0
+[drive]
+kind = "simulated"
+address = "unix:nothing.sock"
+[controller]
+kp_v_per_m = 1377.7
+ki_v_per_m_s = 0.0
+kd_v_s_per_m = -135.1
+filter_time_s = 0.1
+"""
+
+
+def ended(folder: Path, *arguments: str) -> str:
+    """What a process that refuses its file says."""
+    environment = {key: value for key, value in os.environ.items() if key != "SERVOTWIN_STORE_PASSWORD"}
+    done = subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=120,
+        stdin=subprocess.DEVNULL, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    sentence = done.stderr.strip()
+    assert sentence.startswith("error: ")
+    assert "\n" not in sentence
+    assert done.stdout == ""
+    return sentence
+
+
+def twin(folder: Path, service: str, models: str = MODELS) -> str:
+    (folder / "twin.toml").write_text(f"[service]\nport = 0\n{service}\n{models}")
+    return ended(folder, "servotwin", "twin")
+
+
+def nonsense(folder: Path) -> str:
+    for name in ("c.pem", "k.pem"):
+        (folder / name).write_text("nonsense\n")
+    return 'tls_certificate = "c.pem"\ntls_key = "k.pem"'
+
+
+def strangers(folder: Path) -> str:
+    """A certificate and the key of another one."""
+    for name in ("one", "other"):
+        (folder / name).mkdir()
+    certificate, _ = self_made(folder / "one")
+    _, key = self_made(folder / "other")
+    return f'tls_certificate = "{certificate}"\ntls_key = "{key}"'
+
+
+def world_readable(folder: Path) -> str:
+    (folder / "tokens.toml").write_text("")
+    (folder / "tokens.toml").chmod(0o644)
+    return 'tokens = "tokens.toml"'
+
+
+def text_store(folder: Path) -> str:
+    (folder / "twin.db").write_text("this is no database, but long enough to be looked at as one" * 20)
+    return ""
+
+
+@pytest.mark.parametrize(
+    ("service", "said"),
+    [
+        ("prot = 1", "unknown key 'service.prot' (did you mean 'port'?)"),
+        ("retention_days = -3", "service.retention_days = -3 is not allowed; give a positive number"),
+        ('tokens = "none.toml"', "none.toml: there is no such file of tokens; `servotwin enroll` makes it"),
+        (world_readable, "has mode 0644, so that others may open it; make it 0600"),
+        (nonsense, "are no certificate with its own key, in PEM and without a password"),
+        (strangers, "KEY_VALUES_MISMATCH"),
+        ('store = "sqlite:///no/such/folder/twin.db"', "cannot be made (No such file or directory)"),
+        (text_store, "file is not a database"),
+        ('store = "postgresql://u:secret@h/d"', "holds a password"),
+    ],
+)
+def test_a_twin_says_what_is_wrong_and_does_not_begin(
+    tmp_path: Path, service: str | Callable[[Path], str], said: str
+) -> None:
+    sentence = twin(tmp_path, service if isinstance(service, str) else service(tmp_path))
+    assert said in sentence
+    assert "secret" not in sentence
+
+
+def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = taken.getsockname()[1]
+        (tmp_path / "twin.toml").write_text(f"[service]\nport = {port}\n{MODELS}")
+        assert f"port = {port}: cannot listen there (Address already in use)" in ended(tmp_path, "servotwin", "twin")
+
+
+def edge(folder: Path, more: str) -> str:
+    (folder / "edge.toml").write_text(EDGE + more)
+    return ended(folder, "servotwin.edge_process", "edge.toml")
+
+
+def test_an_edge_says_what_is_wrong_and_does_not_begin(tmp_path: Path) -> None:
+    """As a process; the other reasons below, without one each."""
+    assert "edge.toml: unknown key 'keeep' (did you mean 'keep'?)" in edge(tmp_path, "[keeep]\n")
+    assert list(tmp_path.iterdir()) == [tmp_path / "edge.toml"]
+
+
+TOKEN = 'token_file = "token"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (f'[twin]\nurl = "https://h"\n{TOKEN}ca_file = "no.crt"', "no.crt: holds no certificates that can be read (No"),
+        (
+            f'[twin]\nurl = "https://h"\n{TOKEN}ca_file = "edge.toml"',
+            "edge.toml: holds no certificates that can be read",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_file = "none"',
+            "none: the token cannot be read (No such file or directory)",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_file = "open"',
+            "open: others than its owner may open it; give it mode 0600",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_env = "SERVOTWIN_NOT_SET"',
+            "environment variable SERVOTWIN_NOT_SET: holds no",
+        ),
+        (f'[twin]\nurl = "mqtt://h"\n{TOKEN}user = "u"\npassword_file = "none"', "none: the password cannot be read"),
+        ('[keep]\noutbox = "no/outbox.sqlite"', "[keep]: outbox = 'no/outbox.sqlite': there is no folder "),
+        ('[keep]\nstatus = "/no/status.json"', "[keep]: status = '/no/status.json': there is no folder /no"),
+    ],
+)
+def test_what_an_edge_s_file_names_has_to_be_there(tmp_path: Path, more: str, said: str) -> None:
+    (tmp_path / "edge.toml").write_text(EDGE + more)
+    for name, mode in (("token", 0o600), ("open", 0o644)):
+        (tmp_path / name).write_text("secret-token\n")
+        (tmp_path / name).chmod(mode)
+    with pytest.raises(InvalidInput) as refused:
+        check(load(tmp_path / "edge.toml"))
+    assert said in str(refused.value)
+    assert "secret-token" not in str(refused.value)
+
+
+def test_a_broker_without_its_library_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "token").write_text("t\n")
+    (tmp_path / "token").chmod(0o600)
+    (tmp_path / "edge.toml").write_text(f'{EDGE}[twin]\nurl = "mqtt://h"\n{TOKEN}')
+    check(load(tmp_path / "edge.toml"))
+    monkeypatch.setattr("servotwin.edge_process.checks.find_spec", lambda _name: None)
+    with pytest.raises(InvalidInput, match=r"needs paho-mqtt: pip install 'servotwin\[mqtt\]'"):
+        check(load(tmp_path / "edge.toml"))

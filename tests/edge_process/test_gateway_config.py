@@ -1,0 +1,136 @@
+"""edge.toml: what is written is read back bit for bit; what is wrong is refused by name."""
+
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.config.table import parse_toml
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.cosim.scenario import Scenario
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.edge.verdict import FallbackSet
+from servotwin.edge.watch import WatchSettings
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
+from servotwin.edge_process.config_file import edge_toml, load, read
+from servotwin.errors import InvalidInput
+from servotwin.link.session import Retry
+from servotwin.messages import Band
+
+LAW = Controller(1377.7, 18907.6, -135.1, 0.1, voltage_limit=10.0, sample_rate=1000.0)
+PLAIN = """
+servo = "axis-1"
+role = "control"
+sample_rate_hz = 1000.0
+[drive]
+kind = "simulated"
+[controller]
+kp_v_per_m = 1377.7
+ki_v_per_m_s = 18907.6
+kd_v_s_per_m = -135.1
+filter_time_s = 0.1
+"""
+
+
+def again(config: EdgeConfig) -> EdgeConfig:
+    return read(parse_toml(edge_toml(config), "edge.toml"))
+
+
+@pytest.mark.parametrize("preset", ["fig15-sampled", "fig16", "calm", "certified"])
+def test_what_a_scenario_tells_its_edge_comes_back_bit_for_bit(preset: str) -> None:
+    scenario = Scenario.preset(preset)
+    agent = replace(scenario.agent_settings(), boot=UNBOOTED)
+    law = scenario.law if scenario.law.sample_rate else scenario.law.replace(sample_rate=agent.sample_rate)
+    agent = replace(agent, controller=None if agent.controller is None else law)
+    config = EdgeConfig(agent, "control", law, {"kind": "simulated", "port": 4000}, TwinLink("https://h:1", "token"))
+    assert again(config) == config
+
+
+METRES = st.floats(1e-7, 1e-2)
+
+
+@given(METRES, METRES, METRES, st.text(max_size=20).filter(lambda text: text.isprintable()), st.booleans())
+def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text: str, stay: bool) -> None:
+    gains = gains_of(LAW.replace(Kp=1.0 + a, leave=1.0 + b))
+    band = Band(a, b, 0.1 + c, 2.0)
+    supervision = Supervision(FallbackSet(c, None if stay else gains, band, 7.0 + a), WatchSettings(error_floor=b), 0.1)
+    agent = AgentSettings(
+        "axis-1", UNBOOTED, 1000.0, 0.5, 0.1, Retry(1.0, 1.5, 9.0), Limits(0.0, a, b, inf, max_rate=c),
+        Parameters(0, b, gains=gains, band=band, fallback=True), True, -a, text, LAW, gains, supervision, 2.0, 0.2,
+        ProbeLimits(c, 20.0, 0.5),
+    )  # fmt: skip
+    twin = TwinLink("https://twin.example:8443/base", None, "TOKEN", "ca.pem", 3.0, 5.0)
+    keeping, sensor = Keeping("o.db", "p.json", "s.json", "b", 9, 2_500_000), SensorGuard(0.003, -0.5)
+    drive = {"kind": "opcua", "list": [1, 2.5], "flag": True, "map": {"text": text}}
+    config = EdgeConfig(agent, "supervise", LAW, drive, twin, keeping, sensor)
+    assert again(config) == config
+
+
+def test_a_short_file_is_enough(tmp_path: Path) -> None:
+    file = tmp_path / "edge.toml"
+    file.write_text(PLAIN)
+    config = load(file)
+    assert config.agent == AgentSettings("axis-1", UNBOOTED, 1000.0)
+    assert config.controller == Controller(1377.7, 18907.6, -135.1, 0.1, sample_rate=1000.0)
+    assert (config.twin, config.path("x")) == (None, tmp_path / "x")
+    assert config.settings("b7").boot == "b7"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('role = "control"', 'role = "contrl"', "role = 'contrl'.*did you mean 'control'"),
+        ("sample_rate_hz = 1000.0", "sample_rate_hz = 0", "sample_rate_hz = 0 is not allowed"),
+        ('servo = "axis-1"', 'servo = "axis 1"', "agent servo = 'axis 1'"),
+        ('servo = "axis-1"', 'servo = "axis-1"\nhurry = 1', "unknown key 'hurry'"),
+        ('kind = "simulated"', "", "key 'drive.kind' is missing"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\nsample_rate_hz = 5", r"controller sample_rate_hz = 5.0 Hz"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'ftp://x'", "url = 'ftp://x' is not allowed"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'http://x'", "token in clear to another machine"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'https://x'", "token_file or token_env is needed"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[keep]\nwindows = 0", "outbox windows = 0"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[sensor]\nhold_s = -1", "hold_s = -1.0 s"),
+        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[limits]\nmaximum_m = -1", "limits.maximum_m = -1"),
+    ],
+)
+def test_what_is_wrong_is_refused_by_name(old: str, new: str, said: str) -> None:
+    with pytest.raises(InvalidInput, match=said):
+        read(parse_toml(PLAIN.replace(old, new), "edge.toml"))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost"])
+def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
+    assert TwinLink(f"http://{host}:8765", "token").url == f"http://{host}:8765"
+    for other in ("10.0.0.1", "[2001:db8::1]", "localhost.example", "127.0.0.1.example", "127.1"):
+        for scheme in ("http", "HTTP"):
+            with pytest.raises(InvalidInput, match="in clear"):
+                TwinLink(f"{scheme}://{other}:8765", "token")
+
+
+def test_to_control_a_controller_is_needed() -> None:
+    text = PLAIN[: PLAIN.index("[controller]")]
+    with pytest.raises(InvalidInput, match=r"table \[controller\] is missing"):
+        read(parse_toml(text, "edge.toml"))
+    assert read(parse_toml(text.replace("control", "supervise"), "edge.toml")).controller is None
+
+
+def test_a_token_is_read_from_a_private_file_or_the_environment(tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text("s3cret\n")
+    file.chmod(0o644)
+    link = TwinLink("https://h", token_file="token")
+    with pytest.raises(InvalidInput, match="mode 0600") as refused:
+        token_of(link, tmp_path)
+    assert "s3cret" not in str(refused.value)
+    file.chmod(0o600)
+    assert token_of(link, tmp_path) == "s3cret"
+    assert token_of(TwinLink("https://h", token_env="T"), tmp_path, {"T": "other"}) == "other"
+    with pytest.raises(InvalidInput, match="variable T: holds no token"):
+        token_of(TwinLink("https://h", token_env="T"), tmp_path, {})

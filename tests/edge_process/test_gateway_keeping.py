@@ -1,0 +1,105 @@
+"""The link process without a process: keeper, boots, counts, troubles."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from gateway_parts import CONFIG, cut
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.store import FileStore, kept
+from servotwin.edge_process import frames
+from servotwin.edge_process.boots import next_boot
+from servotwin.edge_process.keeping import Keeper
+from servotwin.edge_process.log import Troubles
+from servotwin.edge_process.run import first_parameters
+from servotwin.edge_process.ticks import Counts, summary
+from servotwin.link.sqlite_outbox import SqliteOutbox
+
+
+@pytest.fixture
+def keeper(tmp_path: Path) -> Iterator[Keeper]:
+    outbox = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1")
+    yield Keeper(replace(CONFIG, folder=tmp_path), outbox)
+    outbox.close()
+
+
+def test_a_cut_that_comes_again_is_kept_and_counted_once(keeper: Keeper, tmp_path: Path) -> None:
+    bad = cut(1)
+    bad.signals["position"][3] = math.nan
+    for serial, each in enumerate([cut(0), bad, cut(0), bad, cut(2)], 1):
+        assert keeper.take(frames.framed(each, "b1", serial)) == [serial]
+    outbox = keeper._outbox
+    assert outbox.pending() == [("b1", 0), ("b1", 2)]
+    assert outbox.dropped == {"sample not finite": 1}
+    assert outbox.get(("b1", 0)).boot == "b1"
+
+
+def test_proved_parameters_are_written_or_tried_again(keeper: Keeper, tmp_path: Path) -> None:
+    store = FileStore(tmp_path / "parameters.json")
+    (tmp_path / "parameters.json.new").mkdir()
+    assert keeper.take(frames.SaveFrame(1, kept(Parameters(1, 1e-4)))) == []
+    assert keeper.take(frames.SaveFrame(2, kept(Parameters(2, 2e-4)))) == [1]
+    assert keeper.faults["parameters not written"] == 2
+    (tmp_path / "parameters.json.new").rmdir()
+    assert keeper.tend() == [2]
+    assert keeper.tend() == []
+    found = store.load()
+    assert found is not None
+    assert found.version == 2
+
+
+def test_the_cursor_only_rises(keeper: Keeper) -> None:
+    for serial in (3, 7, 5):
+        keeper.take(frames.HandledFrame(serial))
+    assert keeper._outbox.recall("cursor") == 7
+
+
+def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
+    file = tmp_path / "boots"
+    assert [next_boot(file, bytes([k])) for k in range(3)] == ["b1-00", "b2-01", "b3-02"]
+    file.write_text("rubbish")
+    assert next_boot(file, b"\x07") == "b1-07"
+    assert next_boot(tmp_path / "absent" / "boots", b"\x08") == "b1-08"
+
+
+def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:
+    file = tmp_path / "parameters.json"
+    assert first_parameters(file) is None
+    FileStore(file).save(Parameters(4, 1e-4))
+    found = first_parameters(file)
+    assert found is not None
+    assert found.version == 4
+    file.write_text("rubbish")
+    assert first_parameters(file) is None
+    assert (tmp_path / "parameters.json.broken").read_text() == "rubbish"
+
+
+@given(st.lists(st.floats(0.0, 2e-3), min_size=1, max_size=300))
+def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float]) -> None:
+    counts = Counts()
+    for each in durations:
+        counts.add(each)
+    found = summary(counts.dumps(), counts.longest)
+    ordered = sorted(durations)
+    for name, share in (("median_us", 0.5), ("p99_us", 0.99)):
+        exact = ordered[max(0, math.ceil(share * len(ordered)) - 1)] * 1e6
+        assert found[name] == pytest.approx(exact, abs=1.001)
+    assert found["number"] == len(durations)
+    assert found["max_us"] == pytest.approx(ordered[-1] * 1e6, abs=0.06)
+
+
+def test_a_trouble_is_told_when_it_comes_when_it_is_another_one_and_when_it_is_over(capfd: pytest.CaptureFixture[str]):
+    troubles = Troubles()
+    for why in ("", "", "refused", "refused", "away", "", ""):
+        troubles.look("to the twin", why)
+    troubles.look("disk", "")
+    told = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
+    assert [(line["event"], line["where"], line.get("why")) for line in told] == [
+        ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)
+    ]  # fmt: skip

@@ -1,0 +1,171 @@
+"""What must not take the controller, or a window, along when it fails: disk, judge, log, drive, an old file."""
+
+import math
+import os
+import sys
+from array import array
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.edge.cut import Cut
+from servotwin.edge.drive import DriveLost
+from servotwin.edge.limits import Limits
+from servotwin.edge.packing import CHANNELS
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge_process import frames, keeping, log
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.edge_process.keeping import UNJUDGED, Keeper
+from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.edge_process.run import Stop, go_on, permitted
+from servotwin.edge_process.ticks import Counts
+from servotwin.link.sqlite_outbox import SqliteOutbox
+
+LAW = Controller(200.0, 0.0, 0.0, 0.1, sample_rate=100.0)
+SETTINGS = AgentSettings("axis-1", UNBOOTED, 100.0, 0.1, limits=Limits(maximum=1e-3), controller=LAW)
+CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
+
+
+def cut(sequence: int, position: float = 1e-3) -> frames.CutFrame:
+    signals = {name: array("d", [0.0, position]) for name in CHANNELS}
+    return frames.framed(Cut(7, sequence, "reference", 3, 0.0, signals), "b1", 10 + sequence)
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Iterator[SqliteOutbox]:
+    """Its folder is not there yet."""
+    box = SqliteOutbox(tmp_path / "disk" / "outbox.sqlite", "axis-1")
+    yield box
+    box.close()
+
+
+@pytest.fixture
+def keeper(outbox: SqliteOutbox, tmp_path: Path) -> Keeper:
+    return Keeper(replace(CONFIG, folder=tmp_path), outbox)
+
+
+def test_what_is_not_on_the_disk_stays_with_the_control_process_too(keeper: Keeper, tmp_path: Path) -> None:
+    assert keeper.take(cut(0)) == []
+    assert keeper.take(frames.LetterFrame(20, b"letter")) == []
+    assert keeper.tend() == []
+    (tmp_path / "disk").mkdir()
+    assert keeper.tend() == [10, 20]
+    assert keeper.take(cut(1)) == [11]
+
+
+def test_what_the_twin_has_need_not_be_on_the_disk(keeper: Keeper, outbox: SqliteOutbox) -> None:
+    keeper.take(cut(0))
+    keeper.take(cut(1))
+    outbox.remove(("b1", 0))
+    assert keeper.tend() == [10]
+
+
+def test_what_waits_for_the_disk_is_bounded(keeper: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeping, "MOST_OWED", 3 * 64)
+    assert [keeper.take(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
+
+
+def test_a_window_that_cannot_be_judged_is_sent(
+    keeper: Keeper, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judge(_: Cut) -> Cut:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(keeper, "_judge", lambda _: judge)
+    keeper.take(cut(0))
+    assert outbox.pending() == [("b1", 0)]
+    assert keeper.faults == {UNJUDGED: 1}
+
+
+def test_a_window_with_a_bad_sample_is_not_news(
+    keeper: Keeper, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeper, "_judge", lambda _: pytest.fail)
+    keeper.take(cut(0, math.nan))
+    assert outbox.pending() == []
+    assert outbox.dropped == {"sample not finite": 1}
+
+
+def test_an_edge_hears_that_nothing_is_owed_any_more() -> None:
+    """A window that was delivered before its link process died: the next one only says that it is done."""
+    box = PipeOutlet(True)
+    box.offer(cut(0).cut, 0.0)
+    assert box.waiting
+    heard = box._hear([frames.encode(frames.DoneFrame(1))])
+    assert heard.standing
+    assert not box.waiting
+
+
+def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as out, os.fdopen(writer, "w", encoding="utf-8") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        for k in range(2000):
+            log.say("event", number=k)
+        os.set_blocking(out.fileno(), False)
+        assert out.read().startswith(b'{"time":')
+        monkeypatch.undo()
+
+
+def test_without_a_standard_error_nothing_is_said(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log.say("heard")
+    with monkeypatch.context() as context:
+        context.setattr(sys, "stderr", None)
+        log.say("unheard")
+    out, said = capfd.readouterr()
+    assert out == ""
+    assert "heard" in said
+    assert "unheard" not in said
+
+
+class Failing:
+    """A role that ends by an error."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error, self.stopped = error, 0
+
+    def step(self) -> bool:
+        raise self.error
+
+    def lost(self) -> None:
+        """Nothing."""
+
+    def stop(self) -> None:
+        self.stopped += 1
+        raise DriveLost("gone too")
+
+
+@pytest.mark.parametrize(("error", "stopped"), [(RuntimeError("a bug"), 1), (DriveLost("gone"), 0)])
+def test_whatever_ends_the_loop_the_drive_gets_the_safe_voltage(error: Exception, stopped: int) -> None:
+    role = Failing(error)
+    with pytest.raises(type(error), match=str(error)):
+        go_on(Stop(), role)
+    assert role.stopped == stopped
+
+
+def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
+    gains = gains_of(LAW)
+    good = Parameters(3, 1e-3, gains=gains)
+    assert permitted(good, SETTINGS) is good
+    assert permitted(None, SETTINGS) is None
+    assert permitted(replace(good, tolerance=1.1e-3), SETTINGS) is None
+    assert permitted(good, replace(SETTINGS, limits=Limits(maximum=1e-4))) is None
+    assert permitted(good, replace(SETTINGS, controller=None)) is None
+    assert permitted(good, replace(SETTINGS, controller=LAW.replace(Kp=20.0))) is None
+    fallback = Parameters(4, 2e-3, fallback=True)
+    assert permitted(fallback, SETTINGS) is fallback
+
+
+def test_ticks_are_counted_for_years() -> None:
+    counts = Counts()
+    counts.bins[30] = 2**40
+    counts.add(30.5e-6)
+    assert counts.bins[30] == 2**40 + 1
+    assert counts.bins.itemsize == 8

@@ -1,0 +1,151 @@
+"""Between the control and the link process, without processes: frames, pipe, outlet."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+from gateway_parts import RATE, Far, cut, pumped
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.edge.parameters import Parameters
+from servotwin.edge_process import frames, outlet
+from servotwin.edge_process.outlet import BEHIND, PipeOutlet
+from servotwin.edge_process.pipe import Pipe
+from servotwin.messages import (
+    Acknowledge,
+    Hello,
+    InvalidMessage,
+    encode,
+)
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    yield ours, theirs
+    ours.close()
+    theirs.close()
+
+
+@pytest.fixture
+def far() -> Iterator[Far]:
+    made = Far()
+    yield made
+    made.close()
+
+
+@given(st.lists(st.binary(max_size=200_000), max_size=5), st.integers(1, 50_000))
+def test_frames_cross_a_pipe_whole_and_in_order(sent: list[bytes], piece: int) -> None:
+    ours, theirs = socket.socketpair()
+    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, piece)
+    near, far = Pipe(ours), Pipe(theirs)
+    for frame in sent:
+        near.post(frame)
+    came: list[bytes] = []
+    while near.backlog:
+        near.pump()
+        came += far.take()
+    for _ in range(3):
+        came += far.take()
+    assert came == sent
+    near.close()
+    far.close()
+
+
+def test_a_pipe_never_waits_and_knows_when_the_other_end_is_gone(ends: tuple[socket.socket, socket.socket]) -> None:
+    near = Pipe(ends[0])
+    assert near.take() == []
+    near.post(bytes(10_000_000))
+    for _ in range(1000):
+        near.pump()
+    assert near.backlog > 0
+    assert not near.broken
+    ends[1].close()
+    near.pump()
+    assert near.broken
+
+
+def test_a_frame_that_is_longer_than_any_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
+    ends[1].sendall(b"\xff\xff\xff\xff")
+    with pytest.raises(InvalidMessage, match="4294967295 bytes"):
+        Pipe(ends[0]).take()
+
+
+def test_a_cut_crosses_as_it_is() -> None:
+    frame = frames.to_link(frames.encode(frames.framed(cut(), "b0", 5)))
+    assert isinstance(frame, frames.CutFrame)
+    assert (frame.cut, frame.boot, frame.serial) == (cut(), "b0", 5)
+    with pytest.raises(InvalidMessage):
+        frames.to_link(b"rubbish")
+    with pytest.raises(InvalidMessage):
+        frames.to_control(frames.encode(frame))
+
+
+def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.boot = "b0"
+    box.offer(cut(0), 0.0)
+    assert box.waiting
+    box.connect(far.near)
+    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, 0.0, ""))
+    box.save(Parameters(3, 1e-4))
+    pumped(box)
+    assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
+    far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
+    heard = box.exchange()
+    assert heard is not None
+    assert heard.standing
+    assert box.waiting
+    assert box.dropped == {"outbox full": 2}
+    again = Far()
+    box.connect(again.near)
+    pumped(box)
+    assert [type(frame).__name__ for frame in again.heard()] == ["SaveFrame"]
+    assert not box.settled
+    again.say(frames.DoneFrame(3), frames.StandingFrame(0, {}))
+    pumped(box)
+    assert box.settled
+    assert not box.waiting
+    again.close()
+
+
+def test_the_twins_messages_count_once_whoever_repeats_them(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    body = encode(Acknowledge("axis-1", "b0", 0))
+    far.say(frames.HeardFrame(4, body), frames.HeardFrame(0, body), frames.HeardFrame(4, body), frames.BackFrame())
+    heard = box.exchange()
+    assert heard is not None
+    assert len(heard.messages) == 2
+    assert heard.back
+    pumped(box)
+    assert far.heard() == [frames.HandledFrame(4), frames.HandledFrame(4)]
+
+
+def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
+    far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outlet, "MOST", 100_000)
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    for k in range(20):
+        box.offer(cut(k, 500), 0.0)
+    assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.framed(cut(0, 500), "", 1)))
+    assert not box.connected
+
+
+def test_without_a_twin_nobody_owes_an_answer() -> None:
+    box = PipeOutlet(False)
+    box.offer(cut(), 0.0)
+    assert not box.waiting
+
+
+def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    far.pipe.post(b"rubbish")
+    while far.pipe.backlog:
+        far.pipe.pump()
+    assert box.exchange() is None
+    assert not box.connected

@@ -1,0 +1,371 @@
+"""The edge as real processes: it controls without numbers libraries and without a twin, and survives kill -9."""
+
+import contextlib
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faketwin import FakeTwin, Handler
+from stubmachine import StubMachine
+
+import servotwin
+from servotwin.control.controller import Controller
+from servotwin.edge.limits import Limits
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
+from servotwin.edge_process.config_file import edge_toml
+from servotwin.edge_process.status import read_status
+from servotwin.link.session import Retry
+from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.messages import Hello, Receipt, Refusal, Update, Window
+
+RATE = 500.0
+LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
+BLOCKER = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("numpy", "scipy", "numba", "matplotlib", "typer", "rich", "fastapi", "sqlalchemy"):
+            raise ModuleNotFoundError(f"{name} is not installed here")
+sys.meta_path.insert(0, Absent())
+"""
+
+
+class Gateway:
+    """A folder with an edge.toml, and the process that runs it."""
+
+    def __init__(self, folder: Path, machine: StubMachine, twin: TwinLink | None) -> None:
+        self.folder = folder
+        agent = AgentSettings("axis-1", UNBOOTED, RATE, 0.2, retry=Retry(0.1, 2.0, 0.5), limits=Limits(maximum=1e-3))
+        drive = {"kind": "simulated", "address": machine.address}
+        self.config = EdgeConfig(agent, "control", LAW, drive, twin, folder=folder)
+        (folder / "token").touch(0o600)
+        (folder / "token").write_text("secret")
+        self.write()
+        blocked = folder / "blocked"
+        blocked.mkdir()
+        (blocked / "sitecustomize.py").write_text(BLOCKER)
+        root = Path(servotwin.__file__).parents[1]
+        self._environment = {**os.environ, "PYTHONPATH": f"{blocked}{os.pathsep}{root}"}
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def write(self, **changes: Any) -> None:
+        self.config = replace(self.config, **changes)
+        (self.folder / "edge.toml").write_text(edge_toml(self.config))
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "servotwin.edge_process", str(self.folder / "edge.toml")]
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(command, stderr=log, env=self._environment, start_new_session=True)
+
+    def signal(self, number: int) -> int:
+        assert self.process is not None
+        self.process.send_signal(number)
+        return self.process.wait(60)
+
+    def kill(self) -> None:
+        """All of it at once, as a power cut does to processes."""
+        if self.process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+    def status(self) -> dict[str, Any]:
+        return read_status(self.folder / "status.json") or {}
+
+    def outbox(self) -> list[tuple[str, int]]:
+        box = SqliteOutbox(self.folder / "outbox.sqlite", "axis-1")
+        box.settle()
+        keys = box.pending()
+        box.close()
+        return keys
+
+    def log(self) -> str:
+        return (self.folder / "log").read_text()
+
+
+@pytest.fixture
+def machine() -> Iterator[StubMachine]:
+    with StubMachine(RATE) as machine:
+        yield machine
+
+
+@pytest.fixture
+def twin() -> Iterator[FakeTwin]:
+    with FakeTwin() as twin:
+        yield twin
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, machine: StubMachine, twin: FakeTwin) -> Iterator[Gateway]:
+    made = Gateway(tmp_path, machine, TwinLink(twin.url, "token", timeout_s=5.0, wait_s=1.0))
+    yield made
+    made.kill()
+
+
+def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def sequences(twin: FakeTwin) -> dict[str, list[int]]:
+    found: dict[str, list[int]] = {}
+    for boot, sequence in sorted(twin.windows):
+        found.setdefault(boot, []).append(sequence)
+    return found
+
+
+def whole(sequence: list[int]) -> bool:
+    return sequence == list(range(len(sequence)))
+
+
+def test_it_controls_records_and_sends_without_numbers_libraries(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    gateway.start()
+    until(lambda: len(twin.windows) >= 4 and gateway.status().get("samples", 0) > 0)
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    left = {sequence for _, sequence in gateway.outbox()}
+    assert whole(sorted({*found, *left}))
+    window = next(iter(twin.windows.values()))
+    assert (window.samples, window.rate, window.reason) == (100, RATE, "reference")
+    assert isinstance(twin.letters[0], Hello)
+    assert max(machine.voltages) > 0.1
+    assert machine.voltages[-1] == 0.0
+    status = gateway.status()
+    assert (status["servo"], status["role"], status["version"]) == ("axis-1", "control", 0)
+    assert status["tick"]["number"] == status["samples"]
+    assert "secret" not in gateway.log()
+
+
+def test_the_link_process_is_killed_again_and_again_and_the_controller_ticks_on(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    gateway.start()
+    for _ in range(3):
+        until(lambda: gateway.status().get("link_process", 0) > 0)
+        os.kill(gateway.status()["link_process"], signal.SIGKILL)
+        (gateway.folder / "status.json").unlink()
+        machine.wait_for(machine.number + 300)
+    count = len(twin.windows)
+    until(lambda: len(twin.windows) >= count + 3)
+    assert gateway.signal(signal.SIGINT) == 0
+    (found,) = sequences(twin).values()  # one boot: no sample was missed
+    assert whole(found)
+    assert machine.clients == 1
+    assert gateway.log().count("link process gone") == 3
+
+
+def test_kill_9_of_the_whole_edge_loses_at_most_the_window_being_cut(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    twin.fault = lambda handler, _: bool(handler.refuse(503, Refusal.UNAVAILABLE)) or True
+    for _ in range(3):
+        gateway.start()
+        before = len(gateway.outbox())
+        until(lambda: len(gateway.outbox()) >= before + 3)  # noqa: B023
+        gateway.kill()
+    kept = gateway.outbox()
+    twin.fault = None
+    gateway.start()
+    until(lambda: set(kept) <= set(twin.windows))
+    until(lambda: len(sequences(twin)) == 4)
+    assert gateway.signal(signal.SIGTERM) == 0
+    assert len({boot.split("-")[0] for boot in sequences(twin)}) == 4
+    assert all(map(whole, sequences(twin).values()))
+
+
+def test_without_a_twin_it_controls_and_keeps(gateway: Gateway, machine: StubMachine) -> None:
+    gateway.write(twin=None)
+    gateway.start()
+    until(lambda: len(gateway.outbox()) >= 3)
+    assert gateway.signal(signal.SIGTERM) == 0
+    assert "up" not in gateway.status()
+
+
+def test_a_terminal_that_is_closed_leaves_the_safe_voltage(gateway: Gateway, machine: StubMachine) -> None:
+    gateway.start()
+    until(lambda: gateway.status().get("samples", 0) > 0)
+    assert gateway.process is not None
+    os.killpg(gateway.process.pid, signal.SIGHUP)
+    assert gateway.process.wait(60) == 0
+    assert machine.voltages[-1] == 0.0
+    assert "link process gone" not in gateway.log()
+
+
+def update(window: Window, version: int) -> Update:
+    known = (None, None, (None, None))
+    identity, values = (window.boot, window.sequence), (1e-5 * version, window.start + 1000.0)
+    return Update("axis-1", version, version - 1, identity, window.start, *known, "OK", *values)
+
+
+def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    """Answers fail before or after the twin has the window; updates come twice, sealed by others, and again later."""
+    chance, versions = random.Random(1), iter(range(1, 1000))
+
+    def fault(handler: Handler, _: bytes) -> bool:
+        kind = chance.random()
+        if kind < 0.2:
+            handler.refuse(503, Refusal.UNAVAILABLE)
+        elif kind < 0.4:
+            handler.close_connection = True
+        return kind < 0.4
+
+    def answer(window: Window) -> None:
+        if (window.boot, window.sequence) not in answered:
+            answered.add((window.boot, window.sequence))
+            said = update(window, next(versions))
+            serial = twin.say(said)
+            twin.say(said, serial)  # the same serial once more
+            twin.say(said)  # the same update under another one
+            twin.say(said, token="another servo's")
+
+    answered: set[tuple[str, int]] = set()
+    twin.fault, twin.on_window = fault, answer
+    gateway.start()
+    until(lambda: len(twin.windows) >= 8)
+    twin.fault = None
+    until(lambda: len([x for x in twin.letters if isinstance(x, Receipt) and x.applied]) >= 3)
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert whole(found)
+    receipts = {receipt.version: receipt for receipt in twin.letters if isinstance(receipt, Receipt)}
+    applied = sorted(version for version, receipt in receipts.items() if receipt.applied)
+    assert applied == list(range(1, len(applied) + 1))
+    samples = [receipts[version].sample for version in applied]
+    assert samples == sorted(samples)
+    assert gateway.status()["down"]["broken seal"] > 0
+
+
+def test_a_wrong_token_costs_no_window(gateway: Gateway, machine: StubMachine, twin: FakeTwin) -> None:
+    twin.token = "changed"
+    gateway.start()
+    until(lambda: gateway.status().get("up", {}).get("refused: bad_token", 0) > 1)
+    assert len(twin.windows) == 0
+    twin.token = "secret"
+    until(lambda: len(twin.windows) >= 3)
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert whole(found)
+
+
+def test_samples_that_are_no_numbers_hold_the_voltage_then_make_it_safe(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    bad = range(300, 340)
+    machine.spoil = lambda n, *rest: (n, rest[0], float("nan"), float("nan")) if n in bad else (n, *rest)
+    gateway.start()
+    machine.wait_for(500)
+    assert gateway.signal(signal.SIGTERM) == 0
+    hold = round(0.01 * RATE)
+    assert machine.voltages[300 : 300 + hold] == [machine.voltages[299]] * hold
+    assert machine.voltages[300 + hold : 340] == [0.0] * (40 - hold)
+    assert machine.voltages[340] != 0.0
+    assert gateway.status()["bad samples"] == 40
+    assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
+
+
+def test_a_few_missing_samples_cost_their_window_only(gateway: Gateway, machine: StubMachine, twin: FakeTwin) -> None:
+    machine.spoil = lambda n, *rest: (n if n < 300 else n + 7, *rest)
+    gateway.start()
+    until(lambda: len(twin.windows) >= 4)
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert sorted({*found, 1}) == list(range(len(found) + 1))  # cut from sample 250 on
+    assert gateway.status()["samples missed"] == 7
+    assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
+    assert twin.windows[next(reversed(twin.windows))].start * RATE % machine.every == 7
+
+
+def test_many_missing_samples_begin_a_new_boot_and_the_law_goes_on(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    machine.spoil = lambda n, *rest: (n if n < 300 else n + 700, *rest)
+    gateway.start()
+    until(lambda: len(sequences(twin)) == 2)
+    assert gateway.signal(signal.SIGTERM) == 0
+    first, second = sequences(twin)
+    assert second == f"{first}.1"
+    assert gateway.status()["boot: samples missing"] == 1
+    assert machine.voltages[300] == pytest.approx(machine.voltages[299], rel=0.2)
+
+
+def test_a_wrong_configuration_ends_with_one_sentence(gateway: Gateway, machine: StubMachine) -> None:
+    (gateway.folder / "token").chmod(0o644)
+    gateway.start()
+    assert gateway.process is not None
+    assert gateway.process.wait(60) == 2
+    assert "mode 0600" in gateway.log()
+    assert "Traceback" not in gateway.log()
+
+
+def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
+    gateway: Gateway, machine: StubMachine
+) -> None:
+    gateway.start()
+    until(lambda: len(machine.voltages) > 100)
+    command = [sys.executable, "-m", "servotwin.edge_process", str(gateway.folder / "edge.toml")]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (second.returncode, second.stderr.count("\n")) == (2, 1)
+    assert "another edge runs on its files" in second.stderr
+    other = replace(gateway.config, keeping=replace(gateway.config.keeping, parameters="other.json"))
+    (gateway.folder / "other.toml").write_text(edge_toml(other))
+    third = subprocess.run([*command[:-1], str(gateway.folder / "other.toml")], timeout=60, check=False)
+    assert third.returncode == 2
+    before = len(machine.voltages)
+    until(lambda: len(machine.voltages) > before + 100)
+    gateway.kill()
+    gateway.start()
+    until(lambda: len(machine.voltages) > before + 300)
+    assert gateway.signal(signal.SIGTERM) == 0
+
+
+def test_a_full_disk_stops_neither_the_controller_nor_the_link(
+    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+) -> None:
+    """A limit on the size of the link process's files stands for the disk; later there is room again."""
+    gateway.start()
+    until(lambda: gateway.status().get("link_process", 0) > 0)
+    link, count = gateway.status()["link_process"], len(twin.windows)
+    before = resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+    until(lambda: not gateway.status()["disk"]["safe"])
+    until(lambda: len(twin.windows) >= count + 4)
+    assert gateway.status()["disk"]["faults"]["disk not writable"] > 0
+    resource.prlimit(link, resource.RLIMIT_FSIZE, before)
+    until(lambda: gateway.status()["disk"]["safe"])
+    assert gateway.signal(signal.SIGTERM) == 0
+    (found,) = sequences(twin).values()
+    assert whole(found)
+    assert gateway.status()["windows"]["dropped"] == {}
+    assert gateway.status()["link_process"] == link
+
+
+def test_a_link_process_that_is_killed_on_a_full_disk_takes_no_window_along(
+    gateway: Gateway, machine: StubMachine
+) -> None:
+    gateway.write(twin=None)
+    gateway.start()
+    until(lambda: gateway.status().get("link_process", 0) > 0)
+    link = gateway.status()["link_process"]
+    resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+    until(lambda: not gateway.status()["disk"]["safe"])
+    machine.wait_for(machine.number + 500)
+    os.kill(link, signal.SIGKILL)
+    until(lambda: gateway.status()["link_process"] != link and gateway.status()["disk"]["safe"])
+    assert gateway.signal(signal.SIGTERM) == 0
+    assert whole([sequence for _, sequence in gateway.outbox()])
+    assert len(gateway.outbox()) >= 4

@@ -1,0 +1,360 @@
+"""The control process without a process: the law's guard, both roles, drives that are lost, refuse or wait."""
+
+import math
+from array import array
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+from gateway_parts import CONFIG, LAW, RATE, Far, cut, pumped
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.control.law import start, tick
+from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
+from servotwin.edge.parameters import Parameters
+from servotwin.edge_process import frames, outlet
+from servotwin.edge_process.config import EdgeConfig
+from servotwin.edge_process.control import Controlling, Law
+from servotwin.edge_process.edge import Edge
+from servotwin.edge_process.outlet import BEHIND, PipeOutlet
+from servotwin.edge_process.run import Stop, until
+from servotwin.edge_process.supervise import Supervising
+from servotwin.errors import InvalidInput
+from servotwin.messages import (
+    Answer,
+    Cause,
+    Fallback,
+    Probe,
+    Receipt,
+    Request,
+    Update,
+    decode,
+    encode,
+)
+
+
+@pytest.fixture
+def far() -> Iterator[Far]:
+    made = Far()
+    yield made
+    made.close()
+
+
+POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e308, -1e308])
+
+
+@given(st.lists(st.tuples(POSITIONS, POSITIONS), max_size=30), st.booleans())
+def test_the_law_never_gives_what_is_no_number_and_forgets_it(
+    samples: list[tuple[float, float]], limited: bool
+) -> None:
+    controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
+    guarded = Law(controller.law(1e-5), 2, 0.0)
+    for reference, position in samples:
+        assert math.isfinite(guarded.tick(reference, position))
+    for _ in range(4):
+        guarded.tick(0.0, math.nan)
+    assert guarded.tick(1e-3, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
+
+
+def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
+    law = LAW.replace(Ki=500.0).law()
+    guarded, plain = Law(law, 2, 0.5), start(0.0)
+    for k in range(5):
+        plain = tick(law, plain, 1e-3, 1e-4 * k)
+        assert guarded.tick(1e-3, 1e-4 * k) == plain.voltage
+    assert [guarded.tick(1e-3, math.nan) for _ in range(2)] == [plain.voltage] * 2
+    assert guarded.tick(1e-3, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
+    assert [guarded.tick(1e-3, math.nan) for _ in range(3)][-1] == 0.5
+
+
+class ScriptedDrive:
+    """Both drives: gives what it is told, notes what it is given."""
+
+    machine, lag, can_move, patient, rate = "m", 0.0, True, False, RATE
+
+    def __init__(self, given: list[Sample | Block | Exception | None]) -> None:
+        self.given, self.voltages, self.log = given, [], []
+        self.connects = 0
+        self.refuse = False
+
+    def connect(self) -> None:
+        self.connects += 1
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def read(self, most: int = 0) -> Sample | Block | None:
+        self.log.append(most)
+        found = self.given.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def write(self, value: float | Parameters) -> None:
+        if self.refuse and isinstance(value, Parameters):
+            raise DriveRefused("no")
+        self.voltages.append(value)
+
+    def move(self, offset: float) -> None:
+        self.log.append(f"move {offset}")
+
+
+class Clock:
+    """Time that only passes when somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 1e-4
+        return self.now
+
+    def pause(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class NoChild:
+    def tend(self, now: float) -> None:
+        """No link process."""
+
+
+def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> Edge:
+    clock = Clock()
+    return Edge(config, "b0", box, NoChild(), None, clock, clock.pause)
+
+
+def samples(first: int, count: int, reference: float = 1e-3) -> list[Sample]:
+    return [Sample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
+
+
+def letters(far: Far, kind: type | tuple[type, ...]) -> list[object]:
+    found = [decode(frame.body) for frame in far.heard() if isinstance(frame, frames.LetterFrame)]
+    return [message for message in found if isinstance(message, kind)]
+
+
+def update(version: int, tolerance: float, sequence: int = 0, boot: str = "b0") -> Update:
+    known = (None, None, (None, None))
+    return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", tolerance, 1e6)
+
+
+def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    drive = ScriptedDrive([*samples(0, 30)])
+    role = Controlling(edge, drive)
+    for _ in range(15):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 5e-3 / 10))))
+    for _ in range(10):
+        role.step()
+    assert edge.agent.parameters.version == 1
+    assert drive.voltages[16] == pytest.approx(drive.voltages[15], rel=1e-6)
+    pumped(box)
+    (receipt,) = letters(far, Receipt)
+    assert isinstance(receipt, Receipt)
+    assert receipt.applied
+
+
+def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    drive = ScriptedDrive([*samples(0, 15), *samples(1000, 15), *samples(0, 3)])
+    role = Controlling(edge, drive)
+    for _ in range(14):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(10):
+        role.step()
+    assert (edge.agent.settings.boot, edge.agent.parameters.version) == ("b0.1", 1)
+    while role.step() and drive.given:
+        pass
+    assert edge.agent.settings.boot == "b0.2"
+    assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
+
+
+@pytest.mark.parametrize("then", [samples(1000, 3), [Sample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])
+def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far: Far, then: list[Sample]) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    role = Controlling(edge, ScriptedDrive([*samples(0, 15), *then]))
+    for _ in range(14):
+        role.step()
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    role.step()
+    assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 0.0))
+    voltage = role.law.voltage
+    for _ in then:
+        role.step()
+    assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 1e-4))
+    assert role.law.voltage == pytest.approx(voltage)
+
+
+def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge, stop = edge_of(box), Stop()
+    drive = ScriptedDrive([*samples(0, 5), DriveLost("gone"), *samples(5, 5), None])
+    roles = []
+
+    def role_of() -> Controlling:
+        roles.append(Controlling(edge, drive))
+        return roles[-1]
+
+    until(stop, edge, drive, role_of)
+    assert (drive.connects, len(roles), edge.counts["drive lost"]) == (2, 1, 1)
+    assert edge.agent.samples == 10
+    assert len(drive.voltages) == 10
+
+
+def test_a_drive_that_was_right_before_may_come_right_again() -> None:
+    """As a server that is up before its variables are there."""
+    edge = edge_of(PipeOutlet(False))
+    drive = ScriptedDrive([*samples(0, 5), DriveLost("gone"), *samples(5, 5), None])
+    reach, refusals = drive.connect, [None, InvalidInput("no such variable"), None]
+
+    def connect() -> None:
+        reach()
+        refused = refusals.pop(0)
+        if refused is not None:
+            raise refused
+
+    drive.connect = connect
+    until(Stop(), edge, drive, lambda: Controlling(edge, drive))
+    assert (refusals, edge.counts["drive lost"], edge.agent.samples) == ([], 2, 10)
+
+
+@pytest.mark.parametrize("role", [Controlling, Supervising])
+def test_another_machine_under_the_due_number_begins_a_new_boot(role: type) -> None:
+    supervised = role is Supervising
+    edge = edge_of(PipeOutlet(False), SUPERVISED if supervised else CONFIG)
+    given = [block(0, 5), block(5, 5), block(10, 5)] if supervised else samples(0, 3)
+    drive = ScriptedDrive(given)
+    running = role(edge, drive)
+    running.step()
+    running.lost()
+    running.step()
+    assert edge.agent.settings.boot == "b0"
+    running.lost()
+    drive.machine = "another"
+    running.step()
+    assert edge.agent.settings.boot == "b0.1"
+
+
+def test_a_drive_of_another_rate_is_refused() -> None:
+    drive = ScriptedDrive([])
+    drive.rate = 99.0
+    with pytest.raises(InvalidInput, match=r"sample_rate_hz = 100.0 Hz: the drive's rate is 99.0 Hz"):
+        until(Stop(), edge_of(PipeOutlet(False)), drive, lambda: Controlling(edge_of(PipeOutlet(False)), drive))
+
+
+def block(first: int, count: int, reference: float = 1e-3) -> Block:
+    return Block(first, 0, *(array("d", [value]) * count for value in (reference, 0.0, 0.0, 0.1)))
+
+
+SUPERVISED = replace(CONFIG, role="supervise")
+
+
+def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, Edge, ScriptedDrive, Supervising]:
+    """A connected edge that has supervised a first block."""
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box, SUPERVISED)
+    drive = ScriptedDrive([block(5 * k, 5) for k in range(blocks)])
+    role = Supervising(edge, drive)
+    role.step()
+    return box, edge, drive, role
+
+
+def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
+    box, _, drive, role = supervising(far, 12)
+    assert [p.version for p in drive.voltages] == [0]
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(5):
+        role.step()
+    assert [p.version for p in drive.voltages] == [0, 1]
+    far.say(frames.HeardFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
+    for _ in range(2):
+        role.step()
+    assert "move 0.0005" in drive.log
+    pumped(box)
+    (answer,) = letters(far, Answer)
+    assert isinstance(answer, Answer)
+    assert answer.taken
+    role.stop()
+    assert drive.log[-1] == "move 0.0"
+
+
+def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> None:
+    """The agent runs on what the drive runs on, under a version of its own; the twin hears of it after the receipt."""
+    box, edge, drive, role = supervising(far, 40)
+    drive.refuse = True
+    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    for _ in range(5):
+        role.step()
+    drive.refuse = False
+    for _ in range(3):
+        role.step()
+    in_force = edge.agent.parameters
+    assert (in_force.version, in_force.tolerance) == (2, drive.voltages[0].tolerance)
+    assert [p.version for p in drive.voltages] == [0]
+    pumped(box)
+    receipt, fallback = letters(far, (Receipt, Fallback))
+    assert isinstance(receipt, Receipt)
+    assert receipt.applied
+    assert isinstance(fallback, Fallback)
+    assert (fallback.cause, fallback.replaced, fallback.parameter_version) == (Cause.DRIVE, 1, 2)
+    role.lost()
+    role.step()
+    assert drive.voltages[-1] == in_force
+
+
+def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlet, "MOST", 2000)
+    dropped = {}
+    for patient in (False, True):
+        box = PipeOutlet(True)
+        box.connect(far.near)
+        edge = edge_of(box, SUPERVISED)
+        drive = ScriptedDrive([block(10 * k, 10, 1e-3 * k) for k in range(12)])
+        drive.patient = patient
+        monkeypatch.setattr(edge, "pause", lambda _, box=box: [box._done(serial) for serial in list(box._kept)[:1]])
+        role = Supervising(edge, drive)
+        for _ in range(12):
+            role.step()
+        dropped[patient] = box.dropped[BEHIND]
+    assert dropped[False] > 0
+    assert dropped[True] == 0
+
+
+def test_the_end_waits_while_the_link_process_takes_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = PipeOutlet(True)
+    edge = edge_of(box)
+    for k in range(50):
+        box.offer(cut(k), 0.0)
+    clock = edge.clock
+
+    def pause(seconds: float) -> None:
+        clock.pause(200.0 * seconds)
+        if len(box._cuts) > 3:
+            box._done(min(box._cuts))
+
+    monkeypatch.setattr(edge, "pause", pause)
+    edge.finish(3.0)
+    assert box.untaken == 3
+    assert 47.0 < clock.now < 55.0
+
+
+def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:
+    box = PipeOutlet(True)
+    edge = edge_of(box, SUPERVISED)
+    drive = ScriptedDrive([block(0, 5), block(8, 5), block(13, 0), block(500, 5), None])
+    drive.refuse = True
+    role = Supervising(edge, drive)
+    while role.step():
+        pass
+    assert edge.counts["parameters refused by the drive"] >= 1
+    assert (edge.counts["samples missed"], edge.counts["boot: samples missing"]) == (3, 1)

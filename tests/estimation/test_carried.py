@@ -1,0 +1,173 @@
+"""The encoder's offset carried from window to window: one contact becomes enough, and only within a boot."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from servotwin.cosim import Loop, cosimulate
+from servotwin.cosim.scenario import Scenario
+from servotwin.estimation import whitened
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.offset import estimate_carrying
+from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.simulation import simulate
+from servotwin.twin.decode import decode_window
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+
+DEG = math.radians(1.0)
+SERVO = Servo.preset("paper").replace(Ki=0.0)
+GAP = 12.0 * DEG
+REFUSED = {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND}
+
+
+@cache
+def loop() -> Loop:
+    """A calm loop whose windows, once the gap has grown, end before the screw is pushed the other way."""
+    scenario = Scenario.preset("calm")
+    return cosimulate(scenario.replace(recording=replace(scenario.recording, window=1.0, pre_trigger=0.0)))
+
+
+def truth(estimate: GapEstimate) -> float:
+    return float(loop().scenario.gap.pieces(loop().scenario.duration).value(estimate.time))
+
+
+def holds(estimate: GapEstimate, gap: float) -> bool:
+    return estimate.interval[0] <= gap <= estimate.interval[1]
+
+
+def one_sided() -> list[int]:
+    return [k for k, e in enumerate(loop().estimates) if isinstance(e.offset, CarriedOffset)]
+
+
+def test_one_contact_is_enough_after_a_window_with_two():
+    assert len(one_sided()) >= 5
+    for k in one_sided():
+        estimate = loop().estimates[k]
+        assert estimate.ok
+        assert holds(estimate, truth(estimate))
+        assert estimate.gap == pytest.approx(truth(estimate), abs=0.005 * DEG)
+    alone = [estimate_gap(decode_window(loop().windows[k]), loop().scenario.servo) for k in one_sided()]
+    assert sum(e.status in REFUSED for e in alone) >= len(alone) - 1
+    assert {type(e.offset) for e in loop().estimates[:3]} == {OffsetReading}
+
+
+def replay(changed_boot: bool) -> GapEstimate:
+    """What the twin says of the first window that can hardly stand alone, in the boot of those before it or another."""
+    scenario, store = loop().scenario, MemoryStore()
+    twin = Twin.of(scenario.name, scenario.servo, store, scenario.twin)
+    last = one_sided()[1]
+    for message in loop().windows[: last + 1]:
+        new = changed_boot and message is loop().windows[last]
+        twin.receive(msgspec.structs.replace(message, boot="new") if new else message, message.start + 2.0)
+    return list(store.estimates.values())[-1]
+
+
+def test_a_new_boot_forgets_the_offset():
+    kept, forgotten = replay(False), replay(True)
+    assert kept.ok
+    assert holds(kept, truth(kept))
+    assert forgotten.status in REFUSED
+    assert "needed both ways" in forgotten.reasons[0]
+
+
+@cache
+def stretch(start: float, duration: float) -> Window:
+    run = simulate(SERVO, 12.0, reference=SquareWave(1e-3, 10.0), gap=GAP)
+    return Window.from_run(run, start, duration)
+
+
+def noisy(window: Window, seed: int, shift: float = 0.0) -> Window:
+    noise = 1e-6 * np.random.default_rng(seed).standard_normal(window.position.size)
+    return window.replace(position=window.position + noise, theta_m=window.theta_m + shift)
+
+
+def carried(trend: Trend) -> tuple[float, float]:
+    return trend.prior.offset, trend.prior.offset_std
+
+
+def test_spreads_and_the_trend_hold_what_they_say():
+    """An encoder that is 40 deg off, 1 um of noise: the trend's gap and offset after one window of each kind."""
+    settings = whitened.Settings(model_error=0.0, largest_std=DEG)
+    scores = []
+    for seed in range(20):
+        both = noisy(stretch(5.0, 2.0), seed, 40.0 * DEG)
+        first = estimate_carrying(both, SERVO, None, settings, None)
+        trend = Trend.start(0.0, TrendSettings(shared_error_rad=0.0)).update(first)
+        one = noisy(stretch(5.0, 1.2), 100 + seed, 40.0 * DEG)
+        second = estimate_carrying(one, SERVO, trend.as_estimate(), settings, carried(trend))
+        assert isinstance(second.offset, CarriedOffset)
+        after = trend.update(replace(second, time=first.time))
+        assert after.gap_std <= trend.gap_std
+        offset = (trend.mean[2] + 40.0 * DEG) / trend.prior.offset_std
+        scores.append([offset, (second.gap - GAP) / second.std_total, (after.gap - GAP) / after.gap_std])
+    assert np.all(np.mean(np.abs(scores) < 1.96, axis=0) >= 0.85)
+
+
+def test_a_window_with_two_contacts_is_never_told_of_the_offset():
+    window = noisy(stretch(5.0, 2.0), 1)
+    alone = estimate_gap(window, SERVO)
+    told = estimate_carrying(window, SERVO, None, whitened.Settings(), (3.0, 1e-6))
+    assert replace(told, offset=None) == alone
+    assert told.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
+
+
+def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
+    """However sure it is: an offset that is right does not change what is left over."""
+    window, true = noisy(stretch(5.0, 1.2), 1), whitened.estimate
+
+    def lost(window, servo, prior, settings):
+        found = true(window, servo, prior, settings)
+        return found if settings.offset is None else replace(found, gap=found.gap + DEG, rms=100.0 * found.rms)
+
+    known = (0.0, 0.01 * DEG)
+    assert estimate_carrying(window, SERVO, None, whitened.Settings(), known).ok
+    monkeypatch.setattr(whitened, "estimate", lost)
+    refused = estimate_carrying(window, SERVO, None, whitened.Settings(), known)
+    assert refused.status in REFUSED
+    assert "times as much is left over" in refused.reasons[-1]
+
+
+def test_what_is_known_too_badly_is_not_carried():
+    window = noisy(stretch(5.0, 1.2), 1)
+    for known in (None, (0.0, 0.1 * DEG)):
+        assert estimate_carrying(window, SERVO, None, whitened.Settings(), known).status in REFUSED
+
+
+def test_an_encoder_that_slipped_is_read_anew_or_doubted():
+    """A window with two contacts counts all the same. One that rests on the old offset is sure of a gap that is 6 deg
+    off: the trend refuses it, and ends the offset's use."""
+    trend = Trend.start(0.0, TrendSettings.for_wear(GAP, 1e5))
+    for k in range(3):
+        window = noisy(stretch(5.0, 2.0), k)
+        trend = trend.update(replace(estimate_carrying(window, SERVO, None, whitened.Settings(), None), time=20.0 * k))
+    slip = -3.0 * DEG
+    both = estimate_carrying(noisy(stretch(5.0, 2.0), 5, slip), SERVO, None, whitened.Settings(), carried(trend))
+    moved = trend.update(replace(both, time=60.0))
+    assert (moved.refused, moved.updates) == (0, 4)
+    assert "read anew" in moved.reasons[0]
+    assert moved.prior.offset == pytest.approx(-slip, abs=0.02 * DEG)
+    window = noisy(stretch(5.0, 1.2), 6, slip)
+    told = estimate_carrying(window, SERVO, None, whitened.Settings(), carried(trend))
+    assert told.ok
+    assert abs(told.gap - GAP) > 5.0 * DEG
+    doubted = trend.update(replace(told, time=60.0))
+    assert doubted.refused == 1
+    assert doubted.gap == pytest.approx(GAP, abs=0.1 * DEG)
+    assert "forgotten" in doubted.reasons[1]
+    assert doubted.prior.offset_std == doubted.settings.offset_std_rad
+
+
+def test_a_loop_tells_bias_and_reason_for_every_window():
+    assert len(loop().disturbances) == len(loop().redesigns) == len(loop().estimates) == 10
+    for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):
+        assert (redesign.tolerance is not None) == estimate.ok == (redesign.reason == "")
+    assert {len(d.reasons) for d in loop().disturbances if not d.known} <= {1}

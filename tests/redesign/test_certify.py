@@ -1,0 +1,343 @@
+"""Proving a setting: members, measures against single runs, demands, the choice, the refusal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servotwin.control.law import start, tick
+from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.trend import Trend
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.assess import STILL, Trial, assess
+from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.certify import candidates_of, certify
+from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
+from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy, gap_range
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.setting import Setting
+from servotwin.redesign.settling import settling_map
+from servotwin.simulation import simulate
+
+DEG = math.pi / 180.0
+SERVO = Servo.preset("paper")
+OWN = SERVO.controller
+CALM = Setting(OWN.replace(Ki=0.0))
+SMALL = Demands(plants=4, conditions=4, screened=2)
+SHORT = Trial(duration=30.0, last=10.0)
+
+
+def gaps(low: float, high: float) -> tuple[float, float]:
+    return low * DEG, high * DEG
+
+
+def estimated(degrees: float, std: float = 0.02, status: GapStatus = GapStatus.OK) -> GapEstimate:
+    gap, spread = degrees * DEG, std * DEG
+    return GapEstimate(gap, spread, spread, (gap - 2.0 * spread, gap + 2.0 * spread), status, 1.0)
+
+
+def at_rest(bias: float, std: float = 1e-5, noise: float = 0.0) -> Disturbance:
+    return Disturbance(bias, std, noise, 0.3, 0.0)
+
+
+# --- members
+
+
+def test_members_fill_their_ranges_and_hold_the_corners() -> None:
+    known = Uncertainty(gap=gaps(2, 8), input_bias=(-0.1, 0.3), friction=(0.0, 1e-3))
+    members = draw(SERVO, known, 16, 8)
+    assert members.plants[0] == SERVO
+    assert members.count == 128
+    for values, (low, high) in (
+        (members.gap, known.gap),
+        (members.step, known.step),
+        (members.input_bias, known.input_bias),
+        (members.friction, known.friction),
+    ):
+        assert low - 1e-12 <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high + 1e-12
+    assert np.all(members.gap[:, 0] == known.gap[1])
+    assert np.all(members.input_bias[:, 1] == known.input_bias[0])
+    assert np.all(np.abs(members.theta_d0) <= 0.5 * members.gap)
+
+
+def test_plants_stay_within_the_stated_widths() -> None:
+    plants = drawn_plants(SERVO, Uncertainty(k=0.1, c=0.5, k_B=0.0, m=0.02), 64, 3)
+    ratios = np.array([[p.k / SERVO.k, p.c / SERVO.c, p.k_B / SERVO.k_B, p.m / SERVO.m] for p in plants])
+    assert np.all(np.abs(ratios - 1.0) <= [0.1, 0.5, 1e-15, 0.02])
+    assert np.all(np.abs(ratios - 1.0).max(axis=0)[[0, 1, 3]] > [0.08, 0.4, 0.016])
+
+
+def test_equal_calls_draw_equal_members() -> None:
+    first, second = (draw(SERVO, Uncertainty(), 8, 4, seed=5) for _ in range(2))
+    assert np.array_equal(first.gap, second.gap)
+    assert first.plants == second.plants
+    assert not np.array_equal(first.gap, draw(SERVO, Uncertainty(), 8, 4, seed=6).gap)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"k": 1.0}, "uncertainty k = 1.0"),
+        ({"gap": (2.0, 1.0)}, "uncertainty gap = \\(2.0, 1.0\\) rad"),
+        ({"step": (0.0, 1e-3)}, "steps greater than 0"),
+        ({"input_bias": (0.0, math.inf)}, "input_bias = \\(0.0, inf\\) V"),
+        ({"friction": (-1e-3, 0.0)}, "friction must be 0 or more"),
+    ],
+)
+def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        Uncertainty(**changes)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="no value named 'kk'"):
+        Uncertainty().replace(kk=0.1)
+
+
+# --- measures
+
+
+@settings(max_examples=6)
+@given(seed=st.integers(0, 1000), share=st.sampled_from([0.0, 0.01, 0.05]))
+def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
+    """The oracle: one `simulate` per member, and the measures by numpy."""
+    setting = Setting(OWN.replace(Ki=share * OWN.Ki, feedforward=0.02))
+    known = Uncertainty(gap=gaps(3, 30), input_bias=(-0.05, 0.05))
+    members = draw(SERVO, known, 2, 2, seed)
+    (found,) = assess([setting], members, SHORT)
+    for p, c in np.ndindex(2, 2):
+        run = simulate(
+            members.plants[p],
+            SHORT.duration,
+            controller=setting.controller,
+            reference=members.step[p, c],
+            gap=members.gap[p, c],
+            theta_d0=members.theta_d0[p, c],
+            input_bias=members.input_bias[p, c],
+            sample_rate=SHORT.rate,
+        )
+        error, step = run.reference - run.position, members.step[p, c]
+        last = error[-round(SHORT.last * SHORT.rate) :]
+        assert found.ripple[p, c] == pytest.approx(0.5 * np.ptp(last), rel=1e-6, abs=1e-13)
+        assert found.tail[p, c] == pytest.approx(np.abs(last).max(), rel=1e-6, abs=1e-13)
+        assert found.cost[p, c] == pytest.approx(np.abs(error).mean() * SHORT.duration / step, rel=1e-6)
+        assert found.effort[p, c] == pytest.approx(
+            np.sqrt(np.mean(run.voltage[-last.size :] ** 2)), rel=1e-6, abs=1e-12
+        )
+
+
+def test_what_hunts_is_not_settled_and_what_is_calm_is() -> None:
+    members = draw(SERVO, Uncertainty(gap=gaps(9, 11)), 4, 4)
+    own, calm = assess([Setting(OWN), CALM], members, SHORT)
+    assert not own.settled.any()
+    assert calm.settled.all()
+    assert calm.tail.max() < 2.0 * STILL < own.tail.min()
+
+
+def test_a_feedforward_against_the_bias_leaves_the_unbiased_loop() -> None:
+    free = draw(SERVO, Uncertainty(gap=gaps(5, 6)), 2, 4)
+    biased = replace(free, input_bias=np.full_like(free.gap, 0.08))
+    (plain,) = assess([CALM], free, SHORT)
+    (fed,) = assess([Setting(CALM.controller.replace(feedforward=-0.08))], biased, SHORT)
+    assert np.allclose(plain.cost, fed.cost, rtol=1e-9)
+
+
+def test_a_met_voltage_limit_is_told() -> None:
+    members = draw(SERVO, Uncertainty(gap=gaps(5, 6), step=(2e-3, 2.5e-3)), 2, 2)
+    limited, free = assess(
+        [Setting(CALM.controller.replace(voltage_limit=limit)) for limit in (0.5, 50.0)], members, SHORT
+    )
+    assert limited.saturated.all()
+    assert not free.saturated.any()
+
+
+def test_noise_in_the_voltage_is_what_the_law_passes() -> None:
+    """Against the sampled law itself, driven by white noise on a reference at rest."""
+    rate, noise = 5000.0, 1e-4
+    law = OWN.replace(Ki=0.0, sample_rate=rate)
+    parameters = law.law()
+    state, voltages = start(0.0), []
+    for value in np.random.default_rng(0).normal(0.0, noise, 50_000):
+        state = tick(parameters, state, 0.0, float(value))
+        voltages.append(state.voltage)
+    predicted = Setting(law).noise_effort(noise, (0.01, 0.5 * rate))
+    assert np.std(voltages) == pytest.approx(predicted, rel=0.05)
+
+
+# --- the choice
+
+
+def test_candidates_keep_to_the_bound_on_Ms_and_to_what_there_is_to_do() -> None:
+    demands = Demands()
+    quiet = candidates_of(SERVO, demands, 0.1, disturbed=False, noisy=False)
+    assert all(s.controller.Ki == 0.0 and s.tolerance == 0.0 for s in quiet)
+    assert all(SERVO.margins(s.controller).Ms <= demands.Ms for s in quiet)
+    assert {s.controller.Ki for s in candidates_of(SERVO, demands, 0.1, True, False)} > {0.0}
+    noisy = candidates_of(SERVO, demands, 0.1, False, True)
+    assert {s.tolerance for s in noisy} == {0.0, SERVO.tolerance_for(0.1)}
+
+
+def test_a_wider_gap_gets_a_gentler_controller() -> None:
+    narrow, wide = (certify(SERVO, Uncertainty(gap=gaps(*ends)), SMALL, SHORT) for ends in ((0, 1), (39, 41)))
+    assert isinstance(narrow, Certificate)
+    assert isinstance(wide, Certificate)
+    assert narrow.setting.controller.Kp > wide.setting.controller.Kp
+    assert narrow.cost < wide.cost
+    assert narrow.settled >= SMALL.settled <= wide.settled
+    assert max(narrow.Ms, wide.Ms) <= SMALL.Ms
+
+
+def test_a_decision_is_the_same_whenever_it_is_made() -> None:
+    ticking = iter(range(100))
+    first, second = (
+        certify(SERVO, Uncertainty(gap=gaps(9, 10)), SMALL, SHORT, clock=lambda: float(next(ticking))) for _ in range(2)
+    )
+    assert first == second
+    assert first.seconds == 1.0
+
+
+def test_no_candidate_is_one_sentence() -> None:
+    with pytest.raises(InvalidInput, match=r"no candidate has Ms <= 1\.01 on this servo"):
+        certify(SERVO, Uncertainty(), replace(SMALL, Ms=1.01), SHORT)
+
+
+def test_what_cannot_be_proved_is_refused_with_the_best_found() -> None:
+    found = certify(SERVO, Uncertainty(gap=gaps(29, 31)), replace(SMALL, overshoot=1e-6), SHORT)
+    assert isinstance(found, Refusal)
+    assert "candidates is proved: the best overshoots by" in found.reason
+    assert found.best is not None
+    assert found.best.overshoot > 1e-6
+
+
+# --- policies
+
+
+@pytest.fixture(scope="module")
+def policy() -> CertifiedPolicy:
+    return CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), SMALL, SHORT)
+
+
+def test_the_proof_covers_the_interval_not_the_point(policy: CertifiedPolicy) -> None:
+    made = policy.redesign(Evidence(estimated(10.0, 0.5), at_rest(0.0)))
+    assert made.certificate is not None
+    low, high = made.certificate.gap
+    assert (low, high) == pytest.approx(gap_range(estimated(10.0, 0.5)))
+    assert low < 9.1 * DEG < 10.9 * DEG < high
+
+
+def test_a_bias_seen_at_rest_is_fed_forward(policy: CertifiedPolicy) -> None:
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.05, 1e-4)))
+    assert made.controller is not None
+    assert made.certificate is not None
+    assert made.controller.feedforward == -0.05
+    assert made.certificate.input_bias[0] < 0.05 < made.certificate.input_bias[1]
+    assert made.band == band_of(made.certificate)
+
+
+def test_a_bias_beyond_the_limit_is_fed_forward_up_to_it(policy: CertifiedPolicy) -> None:
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(-5.0)))
+    assert made.controller is not None
+    assert made.controller.feedforward == policy.feedforward_limit
+
+
+def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: CertifiedPolicy) -> None:
+    made = policy.redesign(Evidence(estimated(59.9, 0.5), at_rest(0.01)))
+    assert (made.tolerance, made.controller) == (None, None)
+    assert "at most 60 deg are certified: nothing is sent" in made.reason
+
+
+def test_where_nothing_is_proved_the_fallback_set_goes_out_with_the_bias(policy: CertifiedPolicy) -> None:
+    """The fallback set is proved for an unknown bias, where no overshoot is asked."""
+    strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))
+    made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
+    assert "none of" in made.reason
+    assert "the fallback set is sent" in made.reason
+    assert made.controller is not None
+    assert made.controller.replace(feedforward=0.0) == strict.fallback().setting.controller
+    assert made.controller.feedforward == -0.01
+
+
+def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: CertifiedPolicy) -> None:
+    refused = estimated(3.0, status=GapStatus.UNIDENTIFIABLE)
+    assert policy.redesign(Evidence(refused, at_rest(0.05))).tolerance is None
+    trend = Trend.start(0.0).update(estimated(10.0))
+    made = policy.redesign(Evidence(refused, at_rest(0.05), trend))
+    assert made.controller is not None
+    assert made.controller.feedforward == -0.05
+    assert made.certificate is not None
+    assert made.certificate.gap[0] < 10.0 * DEG < made.certificate.gap[1]
+
+
+def test_what_is_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
+    evidence = Evidence(estimated(10.0), at_rest(0.05))
+    made = policy.redesign(evidence)
+    again = policy.redesign(replace(evidence, controller=made.controller, tolerance=made.tolerance))
+    assert again.tolerance is None
+    assert "in force already" in again.reason
+
+
+def test_a_voltage_at_rest_that_moved_speaks_of_friction(policy: CertifiedPolicy) -> None:
+    now = OWN.replace(Ki=0.0, feedforward=-0.05)
+    evidence = Evidence(estimated(10.0), at_rest(0.01), None, now, 0.0, tuned_for=10.0 * DEG)
+    made = policy.redesign(evidence)
+    assert made.certificate is not None
+    assert made.certificate.friction == pytest.approx((0.0, 0.04 * SERVO.k_T / SERVO.R))
+    first = policy.redesign(replace(evidence, tuned_for=None))
+    assert first.certificate is not None
+    assert first.certificate.friction == (0.0, 0.0)
+
+
+def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
+    rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
+    wide = rule.redesign(Evidence(estimated(10.0)))
+    unit = SERVO.tolerance_for(gap_range(estimated(10.0))[1])
+    assert wide.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
+    noisy = rule.redesign(Evidence(estimated(0.1), at_rest(0.0, noise=1e-3)))
+    assert noisy.tolerance == pytest.approx(3e-3)
+    assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).tolerance is None
+
+
+def test_the_settling_map_holds_for_every_gap() -> None:
+    """Homogeneity: a cell of the map, simulated at another gap."""
+    found = settling_map(SERVO)
+    least = found.least(2.0, 5.0)
+    gap = 7.0 * DEG
+    unit = SERVO.p * gap
+    for step, place in ((2.0, -0.4), (5.0, 0.3)):
+        run = simulate(
+            SERVO, 60.0, reference=step * unit, gap=gap, tolerance=least * unit, theta_d0=place * gap, sample_rate=100.0
+        )
+        assert 0.5 * np.ptp(run.position[-2000:]) < 1e-3 * unit
+    assert found.settled[0].mean() < 0.1
+    assert found.least(2.0, 5.0) >= found.least(4.0, 5.0)
+
+
+def test_hysteresis_enters_inside_and_leaves_outside() -> None:
+    made = HysteresisPolicy(SERVO).redesign(Evidence(estimated(10.0)))
+    assert made.controller is not None
+    assert (made.controller.enter, made.controller.leave) == (0.5, 1.5)
+    assert made.tolerance == SERVO.tolerance_for(10.0 * DEG)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0])
+def test_on_the_model_a_millimetre_step_is_quick_and_hardly_overshoots(degrees: float) -> None:
+    found = certify(SERVO, Uncertainty(gap=gaps(max(0.0, degrees - 0.1), degrees + 0.1)), SMALL, SHORT)
+    assert isinstance(found, Certificate)
+    run = simulate(
+        SERVO,
+        10.0,
+        controller=found.setting.controller,
+        reference=1e-3,
+        gap=degrees * DEG,
+        tolerance=found.setting.tolerance or None,
+        sample_rate=500.0,
+    )
+    off = run.position / 1e-3 - 1.0
+    assert off.max() <= 0.1
+    assert run.time[np.flatnonzero(np.abs(off) > 0.02)[-1]] <= 2.0

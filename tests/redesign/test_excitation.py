@@ -1,0 +1,177 @@
+"""What is asked for when windows tell too little: what, in which order, how large, and why not."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapStatus
+from servotwin.messages import Ask, LongerWindow, Outcome, Probe
+from servotwin.redesign.excitation import (
+    Decision,
+    ExcitationPolicy,
+    ExcitationSettings,
+    Memory,
+    Seen,
+    Stage,
+    long_enough,
+)
+
+PITCH = 1e-3 / math.pi
+DEG = math.pi / 180.0
+ALLOWED = ExcitationSettings(probe=2e-4)
+SHORT = Seen(0.0, GapStatus.UNIDENTIFIABLE, long=False, upper=20.0 * DEG)
+LONG = replace(SHORT, long=True)
+
+
+def run(settings: ExcitationSettings, seen: list[Seen], memory: Memory | None = None) -> list[Decision]:
+    policy, memory, found = ExcitationPolicy(PITCH, settings), memory or Memory(), list[Decision]()
+    for each in seen:
+        found.append(policy.look(memory, each))
+        memory = found[-1].memory
+    return found
+
+
+def asks(settings: ExcitationSettings, seen: list[Seen], memory: Memory | None = None) -> list[Ask | None]:
+    return [decision.ask for decision in run(settings, seen, memory)]
+
+
+def test_a_longer_window_is_asked_for_first() -> None:
+    assert asks(ALLOWED, [SHORT] * 4) == [None, LongerWindow(2.0, 0.3), None, None]
+
+
+def test_a_lower_bound_is_want_of_information_too() -> None:
+    assert asks(ALLOWED, [replace(SHORT, status=GapStatus.LOWER_BOUND), SHORT])[-1] == LongerWindow(2.0, 0.3)
+
+
+@pytest.mark.parametrize("status", [GapStatus.OK, GapStatus.MODEL_MISMATCH])
+def test_what_is_known_and_what_no_motion_cures_begin_the_count_anew(status: GapStatus) -> None:
+    assert asks(ALLOWED, [SHORT, replace(SHORT, status=status), SHORT]) == [None] * 3
+    assert asks(ALLOWED, [replace(SHORT, status=status)] * 9) == [None] * 9
+
+
+def test_a_probe_comes_only_after_long_windows_have_failed_as_often() -> None:
+    taken = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), Outcome.TAKEN)
+    found = asks(ALLOWED, [SHORT, LONG, LONG], taken)
+    assert found[:2] == [None, None]
+    assert found[2] == Probe(PITCH * 25.0 * DEG, 0.85, 1)
+
+
+def test_where_windows_are_long_already_nothing_else_is_asked_for_first() -> None:
+    assert [type(ask) for ask in asks(ALLOWED, [LONG, LONG])] == [type(None), Probe]
+
+
+def test_where_long_windows_are_refused_the_probe_is_what_is_left() -> None:
+    refused = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), Outcome.TOO_LARGE)
+    assert isinstance(asks(ALLOWED, [SHORT, SHORT], refused)[-1], Probe)
+
+
+def test_a_request_that_was_lost_is_made_again() -> None:
+    lost = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), None)
+    assert asks(ALLOWED, [SHORT, SHORT], lost) == [None, LongerWindow(2.0, 0.3)]
+
+
+def test_without_permission_there_is_no_probe_and_the_reason_says_so() -> None:
+    found = run(ExcitationSettings(), [LONG] * 50)
+    assert not any(decision.ask for decision in found)
+    assert found[-1].reason.endswith("and a probing move is not allowed")
+
+
+def test_a_limit_that_is_too_small_is_said_instead_of_probing_in_vain() -> None:
+    found = run(ExcitationSettings(probe=1e-4), [LONG] * 2)[-1]
+    assert found.ask is None
+    assert found.reason.endswith("a probing move must be 0.139 mm, where 0.1 mm are allowed")
+
+
+def test_probes_keep_their_distance() -> None:
+    seen = [replace(LONG, time=10.0 * k) for k in range(20)]
+    times = [each.time for each, ask in zip(seen, asks(ALLOWED, seen), strict=True) if ask]
+    assert times == [10.0, 70.0, 130.0, 190.0]
+    why = run(ALLOWED, seen)[4].reason
+    assert why.endswith("the last probing move was asked for 30 s ago, where 60 s must lie between two")
+
+
+@pytest.mark.parametrize("change", [{"upper": math.inf}, {"slack": math.nan}])
+def test_what_is_not_bounded_is_not_probed(change: dict[str, float]) -> None:
+    found = run(ALLOWED, [replace(LONG, **change)] * 2)[-1]
+    assert found.ask is None
+    assert "bounded" in found.reason
+
+
+@pytest.mark.parametrize("outcome", [Outcome.NOT_ALLOWED, Outcome.TOO_LARGE])
+def test_an_edge_that_refuses_is_not_asked_again_before_it_boots(outcome: Outcome) -> None:
+    late = replace(LONG, time=1e6)
+    refused = run(ALLOWED, [LONG, LONG])[-1].memory.answered(Probe(1e-4, 0.85), outcome)
+    assert asks(ALLOWED, [late] * 5, refused) == [None] * 5
+    assert run(ALLOWED, [late] * 5, refused)[-1].reason.endswith("this edge refuses probing moves")
+    assert isinstance(asks(ALLOWED, [late] * 2, refused.rebooted())[-1], Probe)
+
+
+def test_a_boot_forgets_the_windows_and_not_when_the_last_probe_was() -> None:
+    memory = Memory(3, Stage.TAKEN, Stage.REFUSED, 12.0)
+    assert memory.rebooted() == Memory(probed=12.0)
+
+
+@given(
+    upper=st.floats(0.0, 1.0),
+    slack=st.floats(0.0, 1e-3),
+    limit=st.floats(1e-6, 1e-2),
+    margin=st.floats(0.5 * DEG, 0.5),
+)
+def test_a_probe_crosses_gap_and_dead_zone_and_keeps_to_the_limit(
+    upper: float, slack: float, limit: float, margin: float
+) -> None:
+    settings = ExcitationSettings(probe=limit, margin=margin)
+    decision = run(settings, [replace(LONG, upper=upper, slack=slack)] * 2)[-1]
+    assert decision.reason
+    if isinstance(decision.ask, Probe):
+        assert limit >= decision.ask.size >= slack + PITCH * (upper + 0.5 * DEG) * (1.0 - 1e-12)
+    else:
+        assert slack + PITCH * (upper + margin) > limit
+
+
+@given(st.lists(st.tuples(st.sampled_from(GapStatus), st.booleans(), st.floats(0.0, 30.0)), max_size=60))
+def test_whatever_comes_probes_keep_distance_and_come_last(history: list[tuple[GapStatus, bool, float]]) -> None:
+    """Every stretch of statuses: at least `after` misses before each ask, no probe within the interval."""
+    time, seen = 0.0, list[Seen]()
+    for status, long, pause in history:
+        time += pause
+        seen.append(Seen(time, status, long, 10.0 * DEG))
+    found = run(ALLOWED, seen)
+    assert all(decision.reason for decision in found)
+    probed = [each.time for each, decision in zip(seen, found, strict=True) if isinstance(decision.ask, Probe)]
+    assert all(after - before >= ALLOWED.interval for before, after in pairwise(probed))
+    for k, decision in enumerate(found):
+        if decision.ask:
+            assert k >= 1
+            assert {s.status for s in seen[k - 1 : k + 1]} <= {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND}
+            assert seen[k].long == isinstance(decision.ask, Probe)
+
+
+def test_which_windows_are_long_enough() -> None:
+    assert long_enough(2.0, 0.3, ALLOWED)
+    assert long_enough(2.0 - 1e-9, 0.3, ALLOWED)
+    assert not long_enough(1.0, 0.3, ALLOWED)
+    assert not long_enough(2.0, 0.0, ALLOWED)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"after": 0}, "after = 0: must be 1 or more"),
+        ({"strokes": 0}, "strokes = 0"),
+        ({"window": math.inf}, "window = inf s"),
+        ({"pre_trigger": 2.0}, "pre_trigger = 2.0 s: must be 0 or more, below window"),
+        ({"probe": -1e-4}, "probe = -0.0001 m"),
+        ({"interval": 0.0}, "interval = 0.0 s"),
+        ({"hold": math.nan}, "hold = nan s"),
+        ({"margin": 0.0}, "margin = 0.0 rad"),
+    ],
+)
+def test_bad_settings_are_named(changes: dict[str, float], words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        ExcitationSettings(**changes)

@@ -1,0 +1,319 @@
+"""Settings proved beforehand: what is looked up holds for the region that was asked, and foreign tables are refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.assess import Trial
+from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.lookup import (
+    CertifiedTable,
+    Grid,
+    Key,
+    TablePolicy,
+    cell_range,
+    keys_of,
+    proved,
+    table_of,
+)
+from servotwin.redesign.certified.lookup_file import build, load
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.region import Region
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.setting import Setting
+from servotwin.twin.policies import policy_of
+from servotwin.twin.settings import TwinSettings
+
+DEG = math.pi / 180.0
+SERVO = Servo.preset("paper")
+GRID = Grid(finest=15.0 * DEG, biases=(1e-2, 5e-2), noises=(0.0, 1e-5))
+POLICY = CertifiedPolicy(
+    SERVO,
+    Uncertainty(gap=(0.0, 30.0 * DEG), input_bias=(-0.1, 0.1)),
+    Demands(plants=8, conditions=4, screened=2),
+    Trial(duration=30.0, last=10.0),
+    clock=lambda: 0.0,
+)
+
+
+@cache
+def table() -> CertifiedTable:
+    return table_of(POLICY, GRID, {key: proved(POLICY, GRID, key) for key in keys_of(GRID, POLICY.uncertainty.gap)})
+
+
+def region(low=9.0, high=10.0, feedforward=0.0, left=1e-3, noise=0.0, friction=(0.0, 0.0)) -> Region:
+    """With a bias of up to `left` V beside the feedforward."""
+    return Region((low * DEG, high * DEG), feedforward, (-feedforward - left, -feedforward + left), friction, noise)
+
+
+def evidence(degrees=10.0, bias=0.05, noise=0.0, std=0.02, **changes) -> Evidence:
+    gap, spread = degrees * DEG, std * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - 2.0 * spread, gap + 2.0 * spread), GapStatus.OK, 1.0)
+    return Evidence(estimate, Disturbance(bias, 1e-5, noise, 0.3, 0.0), **changes)
+
+
+# --- the grid
+
+
+@given(st.floats(0.0, 60.0), st.floats(0.0, 60.0), st.floats(0.5, 100.0))
+def test_every_interval_lies_in_a_cell_at_most_four_times_as_wide(one: float, other: float, finest: float) -> None:
+    stated, grid = (2.0 * DEG, 62.0 * DEG), Grid(finest * DEG)
+    low, high = sorted((stated[0] + one * DEG, stated[0] + other * DEG))
+    found = replace(table(), grid=grid, stated=stated)
+    region = Region((low, high), 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
+    (key, *_) = found._containing(region)
+    cell = cell_range(grid, stated, key)
+    assert cell[0] <= low <= high <= cell[1] + 1e-12
+    assert key.level == 0 or cell[1] - cell[0] <= 4.0 * (high - low) * (1.0 + 1e-9)
+    assert cell[1] - cell[0] <= max(grid.levels(stated)[0], 4.0 * (high - low)) * (1.0 + 1e-9)
+    assert key in set(keys_of(grid, stated))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"finest": 0.0}, "finest"),
+        ({"biases": ()}, "biases"),
+        ({"biases": (0.1, 0.05)}, "biases"),
+        ({"noises": (-1.0,)}, "noises"),
+        ({"noises": (0.0, math.inf)}, "noises"),
+    ],
+)
+def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        Grid(**changes)
+
+
+# --- what is looked up
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.floats(0.0, 30.0),
+    st.floats(0.0, 30.0),
+    st.floats(-0.1, 0.1),
+    st.floats(2e-4, 5e-2),
+    st.sampled_from((0.0, 1e-7, 1e-4)),
+)
+def test_what_is_looked_up_is_proved_for_the_region(one, other, fed, left, noise) -> None:
+    """The invariant that everything stands on: another draw of machines, from the region alone, says the same."""
+    low, high = sorted((one, other))
+    asked = region(low, high, fed, left, noise)
+    found = table().find(asked)
+    if isinstance(found, Refusal):
+        assert asked.largest_bias > GRID.biases[-1] * (1.0 - 1e-9)
+        return
+    assert found.gap[0] <= asked.gap[0]
+    assert asked.gap[1] <= found.gap[1]
+    assert found.input_bias[0] <= asked.input_bias[0] + 1e-12
+    assert asked.input_bias[1] <= found.input_bias[1] + 1e-12
+    assert found.setting.controller.feedforward == fed
+    exact = POLICY.confirm(asked, found.setting)
+    assert isinstance(exact, Certificate), exact
+    assert exact.gap == asked.gap
+
+
+def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
+    """So that a cell, proved without one, holds for all."""
+    setting = table().fallback.setting
+    fed = replace(setting, controller=setting.controller.replace(feedforward=0.07))
+    plain = POLICY.confirm(region(left=5e-3), setting)
+    other = POLICY.confirm(region(feedforward=0.07, left=5e-3), fed)
+    assert isinstance(plain, Certificate)
+    assert isinstance(other, Certificate)
+    assert other.tail == pytest.approx(plain.tail, rel=1e-6)
+    assert other.overshoot == pytest.approx(plain.overshoot, rel=1e-6)
+    assert other.cost == pytest.approx(plain.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        (region(left=0.06), "60 mV of bias"),
+        (region(high=31.0), "gaps of 9 to 31 deg"),
+        (region(friction=(0.0, 1e-3)), "friction of up to 0.001 N m"),
+        (region(feedforward=0.3), "a feedforward of 0.3 V"),
+    ],
+)
+def test_what_no_cell_contains_is_not_covered(asked: Region, why: str) -> None:
+    found = table().find(asked)
+    assert isinstance(found, Refusal)
+    assert why in found.reason
+
+
+def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
+    asked = region(1.0, 2.0)
+    cells = dict(table().cells)
+    narrow = [key for key in cells if key.level == 0]
+    wide = replace(table(), cells={**cells, **dict.fromkeys(narrow)}).find(asked)
+    assert isinstance(wide, Certificate)
+    assert wide.gap == POLICY.uncertainty.gap
+    none = replace(table(), cells=dict.fromkeys(cells)).find(asked)
+    assert isinstance(none, Refusal)
+
+
+def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
+    asked = region(1.0, 2.0, feedforward=0.03)
+    narrow = table().find(asked)
+    other = Setting(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
+    cells = {key: found if key.level == 0 else replace(found, setting=other) for key, found in table().cells.items()}
+    changed = replace(table(), cells=cells)
+    kept = changed.find(asked, replace(other, controller=other.controller.replace(feedforward=-0.01)))
+    assert kept.setting.controller == other.controller.replace(feedforward=0.03)
+    assert kept.gap == POLICY.uncertainty.gap
+    assert changed.find(asked).setting == narrow.setting
+    assert changed.find(asked, replace(other, controller=other.controller.replace(Ki=1.0))).setting == narrow.setting
+
+
+def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
+    fine = Grid(2.0 * DEG, (1e-2,), (0.0,))
+    narrow, wide = (table().cells[Key(level, 0, 0, 0)] for level in (0, 1))
+    other = Setting(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
+    widest = len(fine.levels(POLICY.uncertainty.gap)) - 1
+    assert widest > 3
+    cells = {Key(0, 0, 0, 0): narrow, Key(widest, 0, 0, 0): replace(wide, setting=other)}
+    found = replace(table(), grid=fine, cells=cells).find(region(0.1, 0.2), other)
+    assert found.setting == narrow.setting
+
+
+def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
+    """Cells with more bias than is called known are proved without a bound on the overshoot."""
+    cells = {key: found for key, found in table().cells.items() if key.bias == 1}
+    assert isinstance(replace(table(), cells=cells).find(region(left=5e-3)), Refusal)
+    assert isinstance(replace(table(), cells=cells).find(region(left=2e-2)), Certificate)
+
+
+def test_a_cell_whose_voltage_meets_its_limit_is_not_proved() -> None:
+    """There a feedforward would leave less on one side."""
+    tight = replace(POLICY, servo=SERVO.replace(voltage_limit=1.0))
+    loose = replace(POLICY, servo=SERVO.replace(voltage_limit=40.0))
+    key = Key(0, 0, 0, 0)
+    assert proved(tight, GRID, key) is None
+    found = proved(loose, GRID, key)
+    assert found is not None
+    assert found.setting.controller.voltage_limit == 40.0
+
+
+# --- the policy
+
+
+def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
+    exact, looked_up = POLICY.redesign(evidence()), TablePolicy(POLICY, table()).redesign(evidence())
+    assert looked_up.controller is not None
+    assert looked_up.controller.feedforward == exact.controller.feedforward == -0.05
+    assert exact.owed is None
+    assert looked_up.owed is not None
+    assert looked_up.owed.gap == exact.certificate.gap
+    assert isinstance(POLICY.confirm(looked_up.owed, looked_up.certificate.setting), Certificate)
+
+
+def test_what_is_not_covered_gets_the_fallback_set_and_owes_nothing() -> None:
+    made = TablePolicy(POLICY, table()).redesign(replace(evidence(), disturbance=Disturbance(0, math.inf, 0.0, 0, 0)))
+    assert "the fallback set is sent" in made.reason
+    assert made.controller == table().fallback.setting.controller
+    assert made.owed is None
+
+
+def test_what_is_in_force_is_not_sent_again() -> None:
+    policy = TablePolicy(POLICY, table())
+    made = policy.redesign(evidence())
+    again = policy.redesign(evidence(10.1, controller=made.controller, tolerance=made.tolerance))
+    assert again.tolerance is None
+    assert again.owed is None
+    assert "in force already" in again.reason
+
+
+# --- files
+
+
+def built(path: Path, policy: CertifiedPolicy = POLICY, grid: Grid = GRID, cells: int | None = None) -> Path:
+    """A table, or its first few cells."""
+    steps = build(path, policy, grid)
+    for done, _ in steps:
+        if done == cells:
+            steps.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(tmp_path_factory.mktemp("tables") / "paper.table")
+
+
+def test_a_table_comes_back_from_its_file_as_it_was(file: Path) -> None:
+    assert load(file, POLICY) == table()
+
+
+def test_a_table_goes_on_where_it_was_interrupted(file: Path, tmp_path: Path, monkeypatch) -> None:
+    path = built(tmp_path / "part.table", cells=3)
+    with pytest.raises(InvalidInput, match=r"part\.table: \d+ cells of this table are not proved yet"):
+        load(path, POLICY)
+    looked_at = []
+
+    def counted(policy, grid, key):
+        looked_at.append(key)
+        return proved(policy, grid, key)
+
+    monkeypatch.setattr("servotwin.redesign.certified.lookup_file.proved", counted)
+    assert load(built(path), POLICY) == table()
+    assert len(looked_at) == len(table().cells) - 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"servo": SERVO.replace(k=9e3)}, r"servo\.\w+"),
+        ({"servo": SERVO.replace(Kd=-130.0)}, r"servo\.controller\.Kd = -135\.1"),
+        ({"demands": replace(POLICY.demands, Ms=1.9)}, r"demands\.Ms = 2\.0, and this is 1\.9"),
+        ({"uncertainty": POLICY.uncertainty.replace(m=0.2)}, r"uncertainty\.m = 0\.1, and this is 0\.2"),
+        ({"trial": Trial(duration=40.0, last=10.0)}, r"trial\.duration"),
+        ({"feedforward_limit": 0.1}, "feedforward_limit"),
+    ],
+)
+def test_a_foreign_table_is_refused_by_name(file: Path, changes: dict, named: str) -> None:
+    with pytest.raises(InvalidInput, match=named):
+        load(file, replace(POLICY, **changes))
+
+
+def test_a_table_of_another_version_is_refused(file: Path, monkeypatch) -> None:
+    monkeypatch.setattr("servotwin.__version__", "99.0")
+    with pytest.raises(InvalidInput, match=r"servotwin = .*, and this is 99\.0"):
+        load(file, POLICY)
+
+
+def test_a_table_on_another_grid_is_not_gone_on_with(file: Path) -> None:
+    with pytest.raises(InvalidInput, match="another grid"):
+        next(build(file, POLICY, Grid(30.0 * DEG)))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80", b"no table", b"\x81\xa4type\xa1x"])
+def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.table"
+    path.write_bytes(content)
+    with pytest.raises(InvalidInput, match=r"x\.table: is no table"):
+        load(path, POLICY)
+
+
+def test_a_missing_table_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"none\.table: cannot be read"):
+        load(tmp_path / "none.table", POLICY)
+
+
+def test_settings_name_the_table(tmp_path: Path) -> None:
+    known = TwinSettings(table=str(tmp_path / "none.table"))
+    with pytest.raises(InvalidInput, match=r"none\.table: cannot be read"):
+        policy_of(SERVO, known)
+    with pytest.raises(InvalidInput, match="belongs to policy 'certified'"):
+        TwinSettings(policy="paper", table="x.table")

@@ -1,0 +1,155 @@
+"""`servotwin reproduce`: figures, report and selection, from end to end on a small part."""
+
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from servotwin.errors import InvalidInput
+from servotwin.report import page, style
+from servotwin.reproduction import claims, everything, figures, report
+from servotwin.reproduction.claims import Finding, Result, Verdict
+from servotwin.reproduction.figures import fig7, fig10b, figA1
+from servotwin.reproduction.runs import Runs
+from servotwin.reproduction.tasks import Drawn
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return Runs("paper")
+
+
+def quiet():
+    return Console(file=io.StringIO())
+
+
+def test_every_figure_of_the_paper_is_there_and_ours_come_last():
+    names = [plate.name for plate in figures.PLATES]
+    ours = ["estimator", "policies", "policies-noise", "policies-bias"]
+    assert names == [*("fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1"), *ours]
+    assert all(plate.title and plate.caption for plate in figures.PLATES)
+
+
+@given(st.integers(1, 30000), st.integers(0, 2**32 - 1), st.integers(2, 400))
+def test_the_envelope_keeps_extremes_and_ends(size, seed, columns):
+    values = np.random.default_rng(seed).standard_normal(size)
+    time = np.arange(size) * 0.1
+    t, v = style.envelope(time, values, columns)
+    assert len(t) <= max(4 * columns, 2 * columns + 2)
+    assert (v.min(), v.max()) == (values.min(), values.max())
+    assert (t[0], t[-1], v[0], v[-1]) == (time[0], time[-1], values[0], values[-1])
+    assert np.all(np.diff(t) > 0.0)
+
+
+def test_the_same_figure_is_the_same_bytes(runs):
+    vectors = [style.svg(figures.fig7.PLATE.draw(runs), "fig7") for _ in range(2)]
+    assert vectors[0] == vectors[1]
+
+
+@pytest.mark.parametrize("name", ["fig4", "fig5", "fig10b", "fig12", "figA1"])
+def test_figures_have_labels_with_units_and_a_legend(runs, name):
+    plate = next(one for one in figures.PLATES if one.name == name)
+    drawn = plate.draw(runs)
+    labels = [text for axes in drawn.axes for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
+    assert labels
+    assert all(re.search(r"\((s|mm|deg|V|rad/s|dB.*)\)|dB", label) for label in labels)
+    assert name == "fig4" or any(axes.get_legend() for axes in drawn.axes)
+
+
+def test_fig_7_is_a_play_of_20_degrees():
+    d = fig7.data()
+    assert np.ptp(np.degrees(d.theta_m - d.theta_d)) == pytest.approx(20.0)
+
+
+def test_fig_10b_switches_where_the_error_crosses_the_tolerance(runs):
+    d = fig10b.data(runs)
+    for begin, end in fig10b.open_intervals(d):
+        inside = (d.time > begin) & (d.time < end)
+        assert np.all(np.abs(d.error[inside]) <= d.tolerance * (1.0 + 1e-9))
+        assert np.all(d.dead_zone_error[inside] == 0.0)
+        assert np.all(d.voltage[inside] == 0.0)
+
+
+def test_fig_a1_observers_forget_as_their_formula_says(runs):
+    """The simulated observers against the matrix exponential of their error."""
+    d = figA1.data(runs)
+    for alpha, estimate in d.estimates.items():
+        one = figA1.observer(runs.servo, alpha)
+        exact = one.error(one.initial_state(figA1.INITIAL), d.time[250::500])
+        assert (d.position - estimate)[250::500] == pytest.approx(exact, abs=2e-5)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Two figures in this process."""
+    out = tmp_path_factory.mktemp("reproduction") / "new"
+    everything.reproduce(out, only=("fig7,fig4",), console=quiet())
+    return out
+
+
+def test_a_small_reproduction_writes_what_it_says(small):
+    names = ["claims.json", "fig4.png", "fig4.svg", "fig7.png", "fig7.svg", "report.html"]
+    assert sorted(path.name for path in small.iterdir()) == names
+    assert json.loads((small / "claims.json").read_text())["claims"] == []
+    assert (small / "fig4.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_pool_of_processes_gives_the_same(small, tmp_path):
+    everything.reproduce(tmp_path, only=("fig7", "crossover"), workers=2, console=quiet())
+    assert (tmp_path / "fig7.svg").read_bytes() == (small / "fig7.svg").read_bytes()
+    (claim,) = json.loads((tmp_path / "claims.json").read_text())["claims"]
+    assert list(claim["results"]) == ["paper", "table1", "paper-gain2"]
+
+
+def assert_self_contained(text):
+    for match in re.finditer(r"""(?:src|href)\s*=\s*["']([^"']*)""", text):
+        assert match[1].startswith(("data:", "#")), match[1][:80]
+    assert not re.search(r"<(script|link|iframe)|url\(|@import", text)
+
+
+def test_the_report_is_self_contained_and_responsive(small):
+    text = (small / "report.html").read_text()
+    assert_self_contained(text)
+    assert 'name="viewport"' in text
+    assert "@media (max-width" in text
+    assert text.count("data:image/svg+xml;base64,") == 2
+
+
+def test_the_report_holds_every_erratum():
+    listed = report.errata()
+    assert [erratum["id"] for erratum in listed] == [f"E{i}" for i in range(1, 22)]
+    text = report.report([], [], "paper")
+    assert all(page.escape(erratum["decision"]) in text for erratum in listed)
+
+
+def test_the_report_shows_verdicts_first_and_escapes_texts():
+    claim = claims.claims()[0]
+    results = [Result(claim, p, Finding(Verdict.NOT_AS_STATED, "a < b & c")) for p in ("paper", "table1")]
+    text = report.report(results, [Drawn("fig4", b"<svg/>")], "paper")
+    assert_self_contained(text)
+    assert text.index("Verdicts</h2>") < text.index("Figures</h2>") < text.index("Errata and decisions")
+    assert "a &lt; b &amp; c" in text
+    assert "0 of 1" in text
+
+
+def test_selection_takes_commas_repeats_and_keeps_the_papers_order():
+    chosen = everything.select(("fig12,crossover", "fig4"))
+    assert chosen.figures == ("fig4", "fig12")
+    assert [claim.id for claim in chosen.claims] == ["crossover"]
+    assert len(everything.select(()).claims) == len(claims.claims())
+
+
+def test_an_unknown_name_is_refused():
+    with pytest.raises(InvalidInput, match="did you mean 'fig12'"):
+        everything.select(("fig112",))
+
+
+def test_every_claim_is_planned_once_per_preset():
+    tasks = everything.planned(everything.select(()), "paper", None)
+    planned = [(task.preset, claim.id) for task in tasks if hasattr(task, "claims") for claim in task.claims]
+    assert len(planned) == len(set(planned)) == 3 * len(claims.claims())

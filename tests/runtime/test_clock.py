@@ -1,0 +1,103 @@
+"""One event queue for virtual and real time."""
+
+import math
+from functools import partial
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from servotwin.runtime.clock import VirtualClock, WallClock
+
+
+class Wall:
+    """A wall clock that passes only by sleeping, and a little by being read."""
+
+    def __init__(self) -> None:
+        self.time = 1e9
+        self.slept: list[float] = []
+
+    def read(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.time += seconds
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 1)), max_size=30))
+def test_order_is_time_then_priority_then_insertion(plan: list[tuple[int, int]]) -> None:
+    clock = VirtualClock()
+    done: list[tuple[int, int, int]] = []
+    for serial, (time, priority) in enumerate(plan):
+        clock.schedule(time, partial(done.append, (time, priority, serial)), priority)
+    clock.run_until(10.0)
+    assert done == sorted(done)
+    assert len(done) == len(plan)
+    assert clock.now == 10.0
+
+
+def test_events_see_their_own_time_and_may_schedule_more() -> None:
+    clock, seen = VirtualClock(1.0), []
+
+    def again() -> None:
+        seen.append(clock.now)
+        clock.schedule(clock.now + 0.5, again)
+
+    clock.schedule(1.0, again)
+    clock.run_until(2.5)
+    assert seen == [1.0, 1.5, 2.0, 2.5]
+    assert clock.next_time == 3.0
+
+
+def test_what_lies_later_stays() -> None:
+    clock, seen = VirtualClock(), []
+    clock.schedule(2.0, lambda: seen.append(2))
+    clock.run_until(1.0)
+    assert (seen, clock.next_time, clock.now) == ([], 2.0, 1.0)
+    clock.run_until(0.5)
+    assert clock.now == 1.0
+
+
+def test_cancelled_events_do_not_happen() -> None:
+    clock, seen = VirtualClock(), []
+    events = [clock.schedule(float(k), partial(seen.append, k)) for k in range(6)]
+    assert clock.cancel(events[2])
+    assert not clock.cancel(events[2])
+    clock.run_until(10.0)
+    assert seen == [0, 1, 3, 4, 5]
+    assert not clock.cancel(events[0])
+
+
+@pytest.mark.parametrize("time", [0.5, math.nan])
+def test_the_past_is_refused(time: float) -> None:
+    clock = VirtualClock(1.0)
+    with pytest.raises(ValueError, match="cannot schedule"):
+        clock.schedule(time, lambda: None)
+
+
+def test_the_wall_clock_only_sleeps() -> None:
+    wall = Wall()
+    clock = WallClock(wall.read, wall.sleep)
+    seen: list[tuple[str, float]] = []
+    clock.schedule(0.5, lambda: seen.append(("b", clock.now)))
+    clock.schedule(0.25, lambda: seen.append(("a", clock.now)))
+    clock.run_until(1.0)
+    assert seen == [("a", 0.25), ("b", 0.5)]
+    assert wall.slept == [0.25, 0.25, 0.5]
+    assert clock.now == 1.0
+
+
+def test_the_wall_clock_does_late_events_at_once() -> None:
+    wall = Wall()
+    clock = WallClock(wall.read, wall.sleep)
+    seen = []
+    clock.schedule(0.5, lambda: seen.append(clock.now))
+    wall.time += 2.0
+    event = clock.schedule(3.0, lambda: seen.append(-1.0))
+    clock.schedule(1.0, lambda: seen.append(clock.now))
+    assert clock.next_time == 0.5
+    assert clock.cancel(event)
+    clock.run_until(2.0)
+    assert seen == [2.0, 2.0]
+    assert wall.slept == []

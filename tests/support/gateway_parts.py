@@ -1,0 +1,52 @@
+"""What the tests of the gateway's parts share: a configuration, and the far end of its pipe."""
+
+import socket
+from array import array
+
+from servotwin.control.controller import Controller
+from servotwin.edge.cut import Cut
+from servotwin.edge.limits import Limits
+from servotwin.edge.packing import CHANNELS
+from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge_process import frames
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.edge_process.pipe import Pipe
+
+RATE = 100.0
+LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
+SETTINGS = AgentSettings("axis-1", UNBOOTED, RATE, 0.1, limits=Limits(maximum=1e-3), probe=ProbeLimits(1e-3, 0.0, 0.05))
+CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
+
+
+def cut(sequence: int = 0, samples: int = 10) -> Cut:
+    signals = {name: array("d", [1e-3 * k for k in range(samples)]) for name in CHANNELS}
+    return Cut(7, sequence, "reference", 3, 0.0, signals, 0.1, None)
+
+
+class Far:
+    """The link process's end of an outlet, spoken to by the test."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.pipe = Pipe(theirs)
+        self.near = Pipe(ours)
+
+    def heard(self) -> list[frames.ToLink]:
+        return [frames.to_link(data) for data in self.pipe.take()]
+
+    def say(self, *said: frames.ToControl) -> None:
+        for frame in said:
+            self.pipe.post(frames.encode(frame))
+        while self.pipe.backlog:
+            self.pipe.pump()
+
+    def close(self) -> None:
+        self.pipe.close()
+        self.near.close()
+
+
+def pumped(box: PipeOutlet) -> None:
+    for _ in range(20):
+        box.exchange()

@@ -1,0 +1,146 @@
+"""Both ends of the link over MQTT, without the rest of edge and twin, for its tests."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from mosquitto import Mosquitto
+
+from servotwin.link.broker import Broker, Connection, Events, Wanted
+from servotwin.link.mqtt import MqttTransport
+from servotwin.link.seal import verifier_of
+from servotwin.link.transport import Parcel, Unreachable, squeezed
+from servotwin.messages import Window, checksum, encode, pack_channel
+from servotwin.store.groupcommit import GroupCommit
+from servotwin.store.rows import Outcome, Posted
+from servotwin.store.store import Store
+from servotwin.twin_service.auth import Authority
+from servotwin.twin_service.broker_desk import Desk, Parts
+from servotwin.twin_service.future import Boots
+from servotwin.twin_service.ingest import Ingest
+from servotwin.twin_service.landing import Landing
+from servotwin.twin_service.limits import Buckets
+from servotwin.twin_service.metrics import Metrics
+from servotwin.twin_service.mqtt import Bridge
+from servotwin.twin_service.outgoing import Outgoing
+from servotwin.twin_service.tokens import Verifiers
+
+CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
+SERVOS = ("axis-1", "axis-2")
+TOKENS = {servo: f"token of {servo}" for servo in SERVOS}
+VERIFIERS = Verifiers({servo: verifier_of(token) for servo, token in TOKENS.items()})
+PATIENCE = 60.0
+
+
+def window(sequence: int, servo: str = "axis-1") -> Window:
+    return Window(servo, "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+
+
+def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
+    return Parcel(servo, *squeezed(encode(window(sequence, servo))), "b0", sequence)
+
+
+class Twin:
+    """The service without HTTP and without estimation, on a thread of its own."""
+
+    def __init__(self, at: Broker, store: Store) -> None:
+        self.metrics, self.store = Metrics(), store
+        self.commits = GroupCommit(store)
+        self._broker, self._began, self._thread = at, threading.Event(), threading.Thread(target=self._run)
+        self._thread.start()
+        assert self._began.wait(PATIENCE)
+
+    def post(self, servo: str, body: bytes) -> None:
+        """What a worker's outcome does."""
+        (claim,) = (each for each in self.store.claim("test", 10, 60.0, 0.0) if each.servo == servo)
+        done = tuple(message.id for message in claim.messages)
+        assert self.store.commit([Outcome(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [True]
+        self._loop.call_soon_threadsafe(self.outgoing.post, servo)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(PATIENCE)
+        self.commits.close()
+
+    def _run(self) -> None:
+        asyncio.run(self._main())
+
+    async def _main(self) -> None:
+        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), Landing()
+        self.outgoing = Outgoing(self._posted, 100, 0.2)
+        boots = Boots(1.0, 1e9)
+        ingest = Ingest(lambda incoming: landing(self.commits.put(incoming)), SERVOS.__contains__, boots, self.metrics)
+        buckets = Buckets(1e6, 1e6, self._loop.time)
+        parts = Parts(
+            Authority(VERIFIERS), SERVOS.__contains__, buckets, ingest, self.outgoing, lambda: None, self.metrics
+        )
+        bridge = Bridge(self._broker, Desk(parts), "twins")
+        await bridge.begin()
+        while not bridge.connected:
+            await asyncio.sleep(0.01)
+        self._began.set()
+        await self._stop.wait()
+        self.outgoing.close()
+        await bridge.end()
+
+    async def _posted(self, servo: str, serial: int) -> list[Posted]:
+        return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
+
+
+@contextmanager
+def twin(at: Broker, store: Store) -> Iterator[Twin]:
+    running = Twin(at, store)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@contextmanager
+def edge(at: Broker, servo: str = "axis-1", token: str | None = None, **times: float) -> Iterator[MqttTransport]:
+    options = {"timeout_s": 10.0, "wait_s": 5.0} | times
+    transport = MqttTransport(at, servo, TOKENS[servo] if token is None else token, **options)
+    try:
+        yield transport
+    finally:
+        transport.close()
+
+
+def insist(deliver: Callable[[], None]) -> int:
+    """As an outbox does: again and again; how often it took."""
+    for times in range(1, 100):
+        try:
+            deliver()
+        except Unreachable:
+            continue
+        return times
+    raise AssertionError("never delivered")
+
+
+def kept(store: Store, servo: str = "axis-1") -> list[int]:
+    """Sequences of the windows in the store."""
+    return sorted(held.sequence for held in store.windows(servo, 10_000))
+
+
+def refusals(running: Twin) -> dict[str, int]:
+    return {code: number for (code,), number in running.metrics.refused.values.items()}
+
+
+def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
+    """Publish as anybody may."""
+    arrived, ready = threading.Event(), threading.Event()
+
+    def message(_topic: str, _payload: bytes, acknowledge: Callable[[], None]) -> None:
+        acknowledge()
+        arrived.set()
+
+    events = Events(message, lambda _: ready.set(), lambda _: None)
+    wanted = Wanted("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
+    connection = Connection(Broker(server.url), wanted, events)
+    try:
+        assert ready.wait(PATIENCE)
+        assert connection.publish(topic, payload, 60.0) is not None
+        assert arrived.wait(PATIENCE)
+    finally:
+        connection.close()

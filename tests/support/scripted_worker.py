@@ -1,0 +1,37 @@
+"""A worker that does what the body of a window's channel says: "die", "hang", "raise", or its work."""
+
+import os
+import sys
+import time
+
+from servotwin.messages import decode
+from servotwin.store.rows import Claim, Evidence, Outcome
+from servotwin.twin_service import worker
+
+GIVEN_UP = 3
+
+
+def work(claim: Claim, now: float) -> Outcome:
+    """One piece of evidence for each message; a message that others died of is given up."""
+    messages = claim.messages[:1] if claim.attempts > 1 else claim.messages
+    evidence = []
+    for message in messages:
+        wanted = decode(message.body).reason
+        if claim.attempts >= GIVEN_UP:
+            evidence.append(Evidence("estimate", message.id, b"\xc0", status="failed: given up"))
+            continue
+        if wanted == "die":
+            os._exit(9)
+        if wanted == "hang":
+            time.sleep(600.0)
+        if wanted == "raise":
+            raise ValueError("this one cannot be worked on")
+        evidence.append(Evidence("estimate", message.id, b"\xc0", status=f"at {now:.0f}"))
+    done = tuple(message.id for message in messages)
+    sent = tuple(b"news" for _ in messages)
+    return Outcome(claim.servo, claim.serial, claim.state + b"x" * len(done), None, done, tuple(evidence), sent)
+
+
+if __name__ == "__main__":
+    worker._work_of = lambda _start: work
+    worker.main(int(sys.argv[1]))

@@ -1,0 +1,63 @@
+"""Messages, a fake estimator and a policy of one line, for tests of the twin."""
+
+import numpy as np
+
+from servotwin import messages
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.window import Window
+from servotwin.messages import (
+    Reason,
+    Receipt,
+    pack_channel,
+)
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Redesign
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+from servotwin.twin.wear import Expectation
+
+PITCH = 3e-4
+
+
+def window_message(sequence=0, start=0.0, boot="boot-1", servo="axis", version=0, channels=None):
+    rng = np.random.default_rng(sequence)
+    channels = channels or tuple(
+        pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
+    )
+    return messages.Window(
+        servo, boot, sequence, start, 100.0, channels, (), version, "model", "test", messages.checksum(channels)
+    )
+
+
+def known_gap(window: Window, _expected: Expectation) -> GapEstimate:
+    """A fake estimator: the gap grows by 0.01 rad/s."""
+    gap = 0.01 * window.start
+    return GapEstimate(gap, 0.0, 0.0, (gap, gap), GapStatus.OK, window.mid_time)
+
+
+class Rule:
+    """A policy of one line."""
+
+    needs_estimate = True
+
+    def __init__(self, rule):
+        self.rule, self.asked = rule, []
+
+    def redesign(self, evidence: Evidence) -> Redesign:
+        self.asked.append(evidence)
+        return self.rule(evidence)
+
+
+def eq_21() -> Rule:
+    return Rule(lambda evidence: Redesign(PITCH * evidence.estimate.gap, evidence.estimate.gap, ""))
+
+
+def make(estimator=known_gap, **settings):
+    store = MemoryStore()
+    return Twin("axis", estimator, eq_21(), store, TwinSettings(**settings)), store
+
+
+def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):
+    in_force = update.version if in_force is None else in_force
+    return Receipt("axis", update.version, reason is Reason.APPLIED, 10, reason, in_force, boot)

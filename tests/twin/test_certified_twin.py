@@ -1,0 +1,121 @@
+"""The certified policy in the twin: what is sent where something is wrong, and what is not."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from servotwin import messages
+from servotwin.control.gains import gains_of
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.messages import Acknowledge, Gains, Update, pack_channel
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.policy import band_of
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.twin.in_force import InForce
+from servotwin.twin.policies import certified, policy_of
+from servotwin.twin.proof import proof_of
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+
+PAPER = Servo.preset("paper")
+FEW = Demands(plants=4, screened=2, scales=(0.7, 1.0))
+SETTINGS = TwinSettings(demands=FEW)
+
+
+def disturbed(bias, noise=0.0):
+    """As a long rest shows it."""
+    return Disturbance(bias, 1e-4, noise, 10.0, abs(bias))
+
+
+def window(sequence=0, start=20.0):
+    rng = np.random.default_rng(sequence)
+    channels = tuple(
+        pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
+    )
+    crc = messages.checksum(channels)
+    return messages.Window("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
+
+
+def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK):
+    """What the twin says to a window, and its reason."""
+    low, high = map(math.radians, gap_deg)
+    middle = 0.5 * (low + high) if math.isfinite(high) else low
+
+    def estimator(_window, _expected):
+        return GapEstimate(middle, 0.0, 0.0, (low, high), status, 21.0)
+
+    store = MemoryStore()
+    policy = policy_of(PAPER, settings)
+    start = InForce(PAPER.controller, 0.0)
+    twin = Twin("axis", estimator, policy, store, settings, lambda _window: told or disturbed(0.05), start)
+    acknowledge, *sent = twin.receive(window(), 0.0)
+    assert isinstance(acknowledge, Acknowledge)
+    return sent, store.redesigns["axis", "boot-1", 0]
+
+
+def test_what_is_proved_is_sent_with_its_proof_and_band():
+    (update,), redesign = answer()
+    assert isinstance(update, Update)
+    assert update.controller.feedforward == pytest.approx(-0.05)
+    assert update.controller.Ki == 0.0
+    assert update.proof == proof_of(redesign.certificate)
+    assert update.proof.members == redesign.certificate.members
+    assert update.band == redesign.band
+    assert redesign.reason == ""
+
+
+@pytest.mark.parametrize("gap_deg", [(55.0, 61.0), (70.0, 80.0), (10.0, math.inf)])
+def test_an_interval_wider_than_what_is_certified_sends_nothing(gap_deg):
+    sent, redesign = answer(gap_deg)
+    assert sent == []
+    assert redesign.tolerance is None
+    assert redesign.reason.startswith(f"the gap may be {gap_deg[0]:g} to ")
+    assert "at most 60 deg are certified" in redesign.reason
+
+
+def test_an_empty_set_of_candidates_sends_nothing():
+    sent, redesign = answer(settings=SETTINGS.replace(demands=replace(FEW, Ms=1.01)))
+    assert sent == []
+    assert "no candidate has Ms <= 1.01 on this servo" in redesign.reason
+
+
+def test_where_the_whole_range_cannot_be_proved_nothing_is_sent():
+    known = Uncertainty(input_bias=(0.0, 0.0))
+    settings = SETTINGS.replace(uncertainty=known, demands=replace(FEW, overshoot=0.001))
+    sent, redesign = answer(settings=settings)
+    assert sent == []
+    assert redesign.reason.startswith("no fallback set for the servo's stated range: none of ")
+
+
+def test_where_nothing_is_proved_the_fallback_set_is_sent_and_it_is_said():
+    """A bias beyond what may be fed forward leaves more error than the fallback set's band has room for."""
+    settings = SETTINGS.replace(demands=replace(FEW, integral=(0.0,)))
+    (update,), redesign = answer(settings=settings, told=disturbed(0.4))
+    proved = certified(PAPER, settings).fallback()
+    assert "is proved: the best is off by" in redesign.reason
+    assert redesign.reason.endswith("; the fallback set is sent")
+    assert update.controller == gains_of(proved.setting.controller.replace(feedforward=-0.1))
+    assert update.band == band_of(proved)
+
+
+def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window():
+    sent, redesign = answer(status=GapStatus.UNIDENTIFIABLE)
+    assert sent == []
+    assert "unidentifiable" in redesign.reason
+
+
+def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
+    """Whatever the noise: a dead zone opens the loop inside the band only."""
+    for gap in (2.0, 10.0, 40.0):
+        noisy = disturbed(0.0, 2e-4)
+        sent, redesign = answer((gap - 0.1, gap + 0.1), told=noisy)
+        proved = certified(PAPER, SETTINGS).fallback()
+        assert sent
+        assert isinstance(sent[0].controller, Gains)
+        assert redesign.certificate.tail <= proved.tail
+        assert sent[0].tolerance * sent[0].controller.leave <= band_of(proved).error

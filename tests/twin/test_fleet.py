@@ -1,0 +1,143 @@
+"""Which servo has which model: names first, then patterns, in the order of the file."""
+
+import math
+import pickle
+from pathlib import Path
+
+import pytest
+
+from servotwin.config.table import parse_toml
+from servotwin.control.gains import gains_of
+from servotwin.cosim.scenario import Scenario
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin.in_force import InForce
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.store import MemoryStore
+
+TEXT = """
+[models.plain]
+servo = "paper"
+[models.plain.twin]
+policy = "paper"
+initial_gap_deg = 1.0
+
+[models.calm]
+servo = "{servo}"
+[models.calm.controller]
+ki_v_per_m_s = 0.0
+[models.calm.twin]
+policy = "certified"
+
+[servos]
+"line-*" = "plain"
+"line-7" = "calm"
+"*-7" = "calm"
+"""
+
+
+def read(text: str = TEXT, folder: Path = Path(), servo: str = "paper") -> Fleet:
+    return Fleet.loads(text.replace("{servo}", servo), "twin.toml", folder)
+
+
+@pytest.mark.parametrize(
+    ("servo", "model"), [("line-1", "plain"), ("line-7", "calm"), ("line-77", "plain"), ("mill-7", "calm")]
+)
+def test_a_name_goes_before_patterns_and_the_first_pattern_counts(servo, model):
+    assert read().model_of(servo).name == model
+
+
+@pytest.mark.parametrize("servo", ["mill-8", "", "line-\n7", "Line-1", "line-*"])
+def test_a_servo_that_nothing_names_has_no_model(servo):
+    with pytest.raises(InvalidInput, match="has no model"):
+        read().model_of(servo)
+
+
+def test_models_carry_settings_controller_and_start():
+    plain, calm = read().models
+    wanted = TwinSettings(policy="paper", initial_gap=math.radians(1.0))
+    assert plain.settings.replace(estimator=None) == wanted
+    assert plain.servo == Servo.preset("paper")
+    assert plain.begins == InForce(plain.servo.controller, plain.servo.tolerance_for(plain.settings.initial_gap))
+    assert calm.servo == Servo.preset("paper").replace(Ki=0.0)
+    assert calm.begins == InForce(calm.servo.controller, 0.0)
+
+
+def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
+    scenario = Scenario.preset("certified")
+    model = Model("axis", scenario.model, scenario.twin)
+    assert model.begins == InForce(scenario.start_law, scenario.start_tolerance)
+    assert gains_of(model.begins.controller) != gains_of(scenario.law)
+
+
+def test_where_nothing_is_proved_nothing_is_known_of_the_start():
+    settings = TwinSettings(uncertainty=TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0)))
+    assert Model("axis", Servo.preset("paper"), settings).begins == InForce()
+
+
+def test_a_servos_file_lies_beside_the_fleets(tmp_path):
+    servo = Servo.preset("paper").replace(k=9e3)
+    (tmp_path / "axis.toml").write_text(servo.dumps())
+    calm = read(folder=tmp_path, servo="axis.toml").model_of("line-7")
+    assert calm.servo == servo.replace(Ki=0.0)
+
+
+def test_a_fleet_survives_the_way_to_a_worker():
+    fleet = read()
+    fleet.model_of("line-1").twin("line-1", MemoryStore())
+    again = pickle.loads(pickle.dumps(fleet))
+    assert again == fleet
+    assert again.model_of("line-1").twin("line-1", MemoryStore()).state()
+
+
+def test_other_tables_are_left_to_others():
+    table = parse_toml(TEXT.replace("{servo}", "paper") + "[service]\nport = 1\n", "twin.toml")
+    Fleet.read(table, Path())
+    with pytest.raises(InvalidInput, match="unknown key 'service'"):
+        table.done()
+    table.table("service")
+    table.done()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("ki_v_per_m_s", "ki", "twin.toml: unknown key 'models.calm.controller.ki'"),
+        ('policy = "certified"', 'policy = "best"', "twin.toml: models.calm.twin.policy = 'best'"),
+        ('"calm"\n"*-7"', '"clam"\n"*-7"', "servos.line-7 = 'clam': there is no such model (did you mean 'calm'?)"),
+        ('"line-7"', '"line 7"', "servos: 'line 7' names no servo"),
+        ("[models.calm]", '[models."c lm"]', "'c lm' is no model's name"),
+        ('servo = "{servo}"', 'servo = "axis.toml"', "twin.toml: models.calm.servo = 'axis.toml'"),
+        ('servo = "{servo}"', "", "twin.toml: key 'models.calm.servo' is missing"),
+        ("ki_v_per_m_s = 0.0", "ki_v_per_m_s = 1e9", "is unstable on this servo even without a gap"),
+        (
+            'policy = "certified"',
+            'policy = "margin"\n[models.calm.controller.x]\n',
+            "models.calm.controller.x",
+        ),
+        ("[servos]", "[servants]", "twin.toml: table [servos] is missing"),
+        ("[models.", "[mods.", "twin.toml: table [models] is missing"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence(old, new, said):
+    with pytest.raises(InvalidInput) as caught:
+        read(TEXT.replace(old, new))
+    assert said in str(caught.value)
+    assert str(caught.value).startswith("twin.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_policy_that_cannot_design_for_the_controller_is_refused_at_the_start():
+    text = TEXT.replace('policy = "certified"', 'policy = "margin"').replace(
+        "ki_v_per_m_s = 0.0", "ki_v_per_m_s = 0.0\nvoltage_limit_v = 24.0"
+    )
+    with pytest.raises(InvalidInput, match="policy 'margin'"):
+        read(text)
+
+
+@pytest.mark.parametrize(("models", "servos"), [(0, 1), (2, 1), (1, 0)])
+def test_a_fleet_has_models_with_names_of_their_own_and_servos(models, servos):
+    model = Model("axis", Servo.preset("paper"), TwinSettings())
+    with pytest.raises(InvalidInput):
+        Fleet((model,) * models, (("*", "axis"),) * servos)

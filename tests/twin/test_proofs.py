@@ -1,0 +1,233 @@
+"""The exact proof of what was looked up: queued with the update, kept as evidence, and what fails it is withdrawn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from servotwin.control.gains import gains_of
+from servotwin.cosim import cosimulate
+from servotwin.cosim.scenario import Scenario
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Update, Window, decode, encode
+from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.lookup import Grid, TablePolicy
+from servotwin.redesign.certified.lookup_file import build
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Stored
+from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin.in_force import InForce
+from servotwin.twin.lookups import Question, decode_question
+from servotwin.twin.policies import certified
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.triage_settings import TriageSettings
+from servotwin.twin.work import work
+
+DEG = math.pi / 180.0
+SCENARIO = Scenario.preset("certified").replace(gap=12.0 * DEG, duration=145.0, name="axis")
+GRID = Grid(finest=30.0 * DEG, biases=(1e-2,), noises=(0.0,))
+SETTINGS = TwinSettings(demands=Demands(plants=4, conditions=4, screened=2), triage=TriageSettings())
+SERVO = SCENARIO.model
+
+
+@cache
+def windows() -> tuple[Window, ...]:
+    return cosimulate(SCENARIO).windows
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("tables") / "axis.table"
+    for _ in build(path, certified(SERVO, SETTINGS), GRID):
+        pass
+    return path
+
+
+@pytest.fixture(scope="module")
+def fleet(file: Path) -> Fleet:
+    start = InForce(SCENARIO.start_law, SCENARIO.start_tolerance)
+    return Fleet((Model("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
+
+
+class Queue:
+    """What the store does between outcomes, without a store."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
+
+    def give(self, message: Window | Receipt | Fallback | Incoming) -> Outcome:
+        body, kind = (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), Kind.WINDOW)
+        self.serial += 1
+        stored = Stored(self.serial, kind, body, "", float(self.serial))
+        outcome = work(self.fleet, Claim("axis", self.state, self.serial - 1, (stored,)), float(self.serial))
+        self.state = outcome.state
+        self.outcomes.append(outcome)
+        return outcome
+
+    def window(self, number: int, version: int = 0, **changes) -> Outcome:
+        return self.give(msgspec.structs.replace(windows()[number], parameter_version=version, **changes))
+
+    def applied(self, update: Update) -> Outcome:
+        sample = round(update.data_time * 5000.0) + 20000
+        return self.give(
+            Receipt("axis", update.version, True, sample, Reason.APPLIED, update.version, update.window[0])
+        )
+
+
+def sent(outcome: Outcome) -> Update:
+    (body,) = outcome.outgoing
+    update = decode(body)
+    assert isinstance(update, Update)
+    return update
+
+
+def kinds(outcome: Outcome) -> list[str]:
+    return [row.kind for row in outcome.evidence]
+
+
+def failing(monkeypatch) -> None:
+    def refuted(_policy, _region, _setting):
+        return Refusal("the setting settles on 3.0 % of the members, and 99 % are asked")
+
+    monkeypatch.setattr(CertifiedPolicy, "confirm", refuted)
+
+
+def begun(fleet: Fleet) -> tuple[Queue, Update, Incoming]:
+    """After the first window: what was sent, and what is to be proved."""
+    queue = Queue(fleet)
+    outcome = queue.window(0)
+    update = sent(outcome)
+    queue.applied(update)
+    (asked,) = outcome.enqueue
+    return queue, update, asked
+
+
+def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: Fleet) -> None:
+    _, update, asked = begun(fleet)
+    question = decode_question(asked.body)
+    assert (asked.servo, asked.kind, asked.encoding) == ("axis", Kind.PROOF, "")
+    assert (question.version, question.window) == (update.version, update.window)
+    assert gains_of(question.setting.controller) == update.controller
+    assert question.region.gap[0] < 12.0 * DEG < question.region.gap[1]
+    assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
+
+
+def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: Fleet) -> None:
+    queue, update, asked = begun(fleet)
+    before = queue.state
+    outcome = queue.give(asked)
+    assert kinds(outcome) == ["proof"]
+    (row,) = outcome.evidence
+    assert (row.version, row.status, row.window) == (update.version, "", "{}/{}".format(*update.window))
+    body = msgspec.msgpack.decode(row.body)
+    assert body["certificate"]["gap"] == list(decode_question(asked.body).region.gap)
+    assert body["certificate"]["settled"] >= 0.99
+    assert queue.state == before
+    assert not outcome.outgoing
+
+
+def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: Fleet) -> None:
+    one, other = begun(fleet), begun(fleet)
+    assert one[2] == other[2]
+    assert one[0].give(one[2]) == other[0].give(other[2])
+
+
+def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: Fleet, monkeypatch) -> None:
+    queue, update, asked = begun(fleet)
+    with monkeypatch.context() as patched:
+        failing(patched)
+        outcome = queue.give(asked)
+    assert kinds(outcome) == ["proof", "withdrawn"]
+    assert "settles on 3.0 %" in outcome.evidence[0].status
+    assert f"the proof of version {update.version} failed" in outcome.evidence[1].status
+    assert not outcome.outgoing  # the edge takes nothing that stands on no newer window
+    following = queue.window(1, update.version)
+    back = sent(following)
+    proved = certified(SERVO, fleet.models[0].settings).fallback()
+    assert back.base_version == update.version
+    assert back.data_time > update.data_time
+    law = proved.setting.controller.replace(feedforward=back.controller.feedforward)
+    assert back.controller == gains_of(law)
+    assert not following.enqueue
+    said = {row.kind: row.status for row in following.evidence}
+    assert "the proof of version" in said["glance"]
+    assert said["redesign"].endswith("are asked; the fallback set is sent")
+
+
+def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet, monkeypatch) -> None:
+    queue, update, asked = begun(fleet)
+    with monkeypatch.context() as patched:
+        failing(patched)
+        queue.give(asked)
+    back = sent(queue.window(1, update.version))
+    queue.applied(back)
+    looked_up, made = [], []
+    plain, exact = TablePolicy.prove, CertifiedPolicy.prove
+    monkeypatch.setattr(TablePolicy, "prove", lambda *given: looked_up.append(1) or plain(*given))
+    monkeypatch.setattr(CertifiedPolicy, "prove", lambda *given: made.append(1) or exact(*given))
+    outcome = queue.window(2, back.version, reason="asked for")
+    assert "redesign" in kinds(outcome)
+    assert (len(looked_up), len(made)) == (0, 1)
+    assert not outcome.enqueue
+
+
+def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: Fleet, monkeypatch) -> None:
+    queue, _, asked = begun(fleet)
+    question = decode_question(asked.body)
+    law = question.setting.controller.replace(Kp=2.0 * question.setting.controller.Kp)
+    other = msgspec.structs.replace(question, setting=replace(question.setting, controller=law))
+    failing(monkeypatch)
+    before = queue.state
+    outcome = queue.give(asked._replace(body=msgspec.msgpack.encode(other)))
+    assert kinds(outcome) == ["proof"]
+    assert outcome.evidence[0].status == "not proved: another setting is in force by now"
+    assert queue.state == before
+
+
+def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> None:
+    queue, update, _ = begun(fleet)
+    quiet = queue.window(1, update.version)
+    assert kinds(quiet) == ["glance"]
+    told = Fallback("axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, 0.0)
+    queue.give(told)
+    outcome = queue.window(2, update.version + 1)
+    assert "estimate" in kinds(outcome)
+    assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
+
+
+def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Fleet, monkeypatch) -> None:
+    queue = Queue(fleet)
+    outcome = queue.window(0)
+    assert outcome.wake is not None
+    failing(monkeypatch)
+    after = queue.give(outcome.enqueue[0])
+    assert kinds(after) == ["proof", "withdrawn"]
+    assert after.wake is None
+
+
+def test_what_is_no_question_fails_alone(fleet: Fleet) -> None:
+    queue, _, asked = begun(fleet)
+    before = queue.state
+    outcome = queue.give(asked._replace(body=b"\x93"))
+    assert outcome.evidence[0].status.startswith("failed: InvalidInput: the proof that is asked for is not understood")
+    assert queue.state == before
+
+
+def test_without_a_table_a_question_fails_alone(fleet: Fleet) -> None:
+    queue, _, asked = begun(fleet)
+    model = replace(fleet.models[0], settings=SETTINGS)
+    queue.fleet = replace(fleet, models=(model,))
+    assert "no table is used any more" in queue.give(asked).evidence[0].status
+
+
+def test_a_question_comes_back_from_its_bytes(fleet: Fleet) -> None:
+    _, _, asked = begun(fleet)
+    question = decode_question(asked.body)
+    assert isinstance(question, Question)
+    assert msgspec.msgpack.encode(question) == asked.body
+    policy = certified(SERVO, fleet.models[0].settings)
+    assert isinstance(policy.confirm(question.region, question.setting), Certificate)

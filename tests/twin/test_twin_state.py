@@ -1,0 +1,320 @@
+"""A twin that is bytes between any two calls is the same twin, bit for bit."""
+
+import math
+import struct
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twin_messages import eq_21, known_gap, make, window_message
+
+from servotwin.control.gains import gains_of
+from servotwin.cosim import Cosimulation, Loop, simulation_of
+from servotwin.cosim.scenario import Recording, Scenario
+from servotwin.edge.agent import Agent
+from servotwin.edge.probe import ProbeLimits
+from servotwin.errors import InvalidInput
+from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.messages import (
+    Acknowledge,
+    Cause,
+    Fallback,
+    Gains,
+    Hello,
+    InvalidMessage,
+    Reason,
+    Receipt,
+    decode,
+    encode,
+)
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.redesign.excitation import ExcitationSettings
+from servotwin.twin.in_force import NEWEST, InForce
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import TrendState, restored_trend, trend_state
+from servotwin.twin.store import MemoryStore
+from servotwin.twin.twin import Twin
+from servotwin.twin.versions import EARLIER, Versions
+
+DEG = math.pi / 180.0
+SERVO = Servo.preset("paper")
+
+
+class Reborn:
+    """A twin that dies after every call; what is left of it is its state."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario, self.store, self.state, self.deaths = scenario, MemoryStore(), b"", 0
+
+    def twin(self) -> Twin:
+        s = self.scenario
+        start = InForce(s.start_law, s.start_tolerance)
+        return Twin.of(s.name, s.model, self.store, s.twin, start=start, state=self.state)
+
+    def receive(self, message, now):
+        return self._leaving(self.twin(), lambda twin: twin.receive(message, now))
+
+    def wake(self, now):
+        return self._leaving(self.twin(), lambda twin: twin.wake(now))
+
+    def next_wake(self):
+        return self.twin().next_wake()
+
+    def _leaving(self, twin, act):
+        sent = act(twin)
+        self.state, self.deaths = twin.state(), self.deaths + 1
+        return sent
+
+
+def run(scenario: Scenario, remote: Reborn | None = None) -> Loop:
+    machine = simulation_of(scenario)
+    loop = Cosimulation(scenario, machine, twin=remote)
+    if remote is not None:
+        loop.store = remote.store
+    while not loop.done:
+        loop.advance()
+    return loop.loop(machine.run())
+
+
+def probed() -> Scenario:
+    """Steps within the gap: the twin asks for longer windows, then for a probing move."""
+    calm = Scenario.preset("calm")
+    excitation = ExcitationSettings(probe=2e-4, interval=30.0)
+    twin = calm.twin.replace(excitation=excitation, uncertainty=calm.twin.uncertainty.replace(gap=(0.0, 25.0 * DEG)))
+    recording = Recording(probe=ProbeLimits(2e-4, 20.0))
+    reference = SquareWave(2e-5, 20.0)
+    return calm.replace(gap=10.0 * DEG, twin=twin, recording=recording, reference=reference, duration=35.0)
+
+
+SCENARIOS = {
+    "fig15": lambda: Scenario.preset("fig15").replace(duration=90.0),
+    "certified": lambda: Scenario.preset("certified").replace(duration=62.0),
+    "probed": probed,
+}
+
+
+@cache
+def both(name: str) -> tuple[Loop, Loop, Reborn]:
+    scenario = SCENARIOS[name]()
+    remote = Reborn(scenario)
+    return run(scenario), run(scenario, remote), remote
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_twin_that_dies_after_every_message_says_the_same(name):
+    living, reborn, remote = both(name)
+    assert living.digest() == reborn.digest()
+    assert remote.deaths >= 4
+    assert living.updates == reborn.updates
+    assert living.requests == reborn.requests
+    assert name != "probed" or living.requests
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_and_finds_the_same(name):
+    living, reborn, _ = both(name)
+    assert len(living.estimates) >= 2
+    for part in ("estimates", "disturbances", "excitations"):
+        assert repr(getattr(living, part)) == repr(getattr(reborn, part))
+    states = [
+        [trend and msgspec.msgpack.encode(trend_state(trend)) for trend in loop.trends] for loop in both(name)[:2]
+    ]
+    assert states[0] == states[1]
+    for one, other in zip(living.redesigns, reborn.redesigns, strict=True):
+        assert (one.tolerance, one.reason, one.controller, one.band) == (
+            other.tolerance,
+            other.reason,
+            other.controller,
+            other.band,
+        )
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_state_is_its_own_fixed_point(name):
+    _, _, remote = both(name)
+    assert remote.twin().state() == remote.state
+    assert 200 < len(remote.state) < 10_000
+
+
+FLOATS = st.floats(width=64)
+MATRIX = st.lists(FLOATS, min_size=9, max_size=9)
+
+
+@st.composite
+def trends(draw, depth: int = 2) -> Trend:
+    return Trend(
+        draw(FLOATS),
+        np.array(draw(st.lists(FLOATS, min_size=3, max_size=3))),
+        np.array(draw(MATRIX)).reshape(3, 3),
+        TrendSettings(),
+        draw(st.integers(0, 2**40)),
+        draw(st.integers(0, 2**40)),
+        tuple(draw(st.lists(st.text(), max_size=2))),
+        draw(trends(depth - 1)) if depth and draw(st.booleans()) else None,
+    )
+
+
+def bits(trend: Trend | None):
+    if trend is None:
+        return None
+    arrays = trend.mean.tobytes(), trend.covariance.tobytes()
+    return struct.pack("<d", trend.time), *arrays, trend.updates, trend.refused, trend.reasons, bits(trend.rival)
+
+
+@given(trends())
+def test_a_trend_keeps_every_bit(trend):
+    """NaN, infinities and the sign of zero too, in the rival of its rival as well."""
+    carried = msgspec.msgpack.decode(msgspec.msgpack.encode(trend_state(trend)), type=TrendState)
+    assert bits(restored_trend(carried, TrendSettings())) == bits(trend)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 12),
+            st.sampled_from(["boot-1", "boot-2", "boot-3"]),
+            st.floats(0.0, 1e4),
+            st.integers(0, 20),
+            st.sampled_from(["window", "hello", "receipt", "fallback", "wake"]),
+        ),
+        max_size=15,
+    )
+)
+@settings(max_examples=60)
+def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
+    """Boots that come back, old windows, receipts for nothing, a clock that jumps."""
+    lives, dies = make()[0], make()[0]
+    for number, boot, now, version, kind in events:
+        message = {
+            "window": window_message(number, 3.0 * number, boot, version=version),
+            "hello": Hello("axis", boot, 0.0, 100.0, version, 1e-5, "m", Gains(1.0, 2.0, 3.0, 0.1)),
+            "receipt": Receipt("axis", version, True, 3, Reason.APPLIED, version, boot),
+            "fallback": Fallback("axis", boot, 5, Cause.ERROR, 1.0, 0.5, version, version + 1, 2e-5),
+        }.get(kind)
+        said = [twin.wake(now) if message is None else twin.receive(message, now) for twin in (lives, dies)]
+        assert said[0] == said[1]
+        state = dies.state()
+        assert state == lives.state()
+        fresh = make()[0]
+        fresh._store = dies._store
+        fresh.restore(state)
+        assert fresh.state() == state
+        assert fresh.next_wake() == lives.next_wake()
+        dies = fresh
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_state_are_refused(data):
+    with pytest.raises(InvalidInput, match="the state of servo 'axis' is not understood"):
+        make()[0].restore(data)
+
+
+@given(st.data())
+def test_a_broken_state_is_refused_or_restored_never_anything_else(data):
+    twin = make()[0]
+    twin.receive(window_message(3, 20.0), 21.0)
+    state = bytearray(twin.state())
+    state[data.draw(st.integers(0, len(state) - 1))] = data.draw(st.integers(0, 255))
+    del state[data.draw(st.integers(0, len(state))) :]
+    fresh = make()[0]
+    try:
+        fresh.restore(bytes(state))
+    except InvalidInput:
+        assert fresh.state() == make()[0].state()
+
+
+def test_a_later_schema_and_another_servos_state_are_refused():
+    twin = make()[0]
+    later = twin.state().replace(b"twin-state/1", b"twin-state/2")
+    with pytest.raises(InvalidInput, match="not understood"):
+        twin.restore(later)
+    other = Twin("other", known_gap, eq_21(), MemoryStore())
+    with pytest.raises(InvalidInput, match=r"the state of servo 'other' is that of 'axis'"):
+        other.restore(twin.state())
+
+
+def test_settings_are_no_part_of_it():
+    twin = make(retry=5.0, initial_gap=0.5)[0]
+    twin.receive(window_message(0, 10.0), 11.0)
+    other = make(retry=9.0, initial_gap=0.1)[0]
+    other.restore(twin.state())
+    assert (twin.next_wake(), other.next_wake()) == (16.0, 20.0)
+
+
+def test_requests_come_and_go_with_the_settings():
+    asking = TwinSettings(policy="paper", excitation=ExcitationSettings())
+    quiet = asking.replace(excitation=None)
+    one, other = (Twin.of("axis", SERVO, MemoryStore(), each) for each in (asking, quiet))
+    with_requests, without = one.state(), other.state()
+    other.restore(with_requests)
+    assert other.state() == without
+    one.restore(without)
+    assert one.state() == with_requests
+
+
+def test_what_is_remembered_is_bounded():
+    """Ten thousand updates that nobody answers, and as many boots."""
+    twin, _ = make()
+    size = 0
+    for k in range(300):
+        twin.receive(window_message(k, 1.0 + k), 2.0 + k)
+        size = size or (len(twin.state()) if k == NEWEST + 2 else 0)
+    assert len(twin.state()) < 1.1 * size
+    versions = Versions()
+    for k in range(EARLIER + 10):
+        versions.hear(f"boot-{k}", 0)
+    assert len(versions.earlier) == EARLIER
+    assert not versions.hear(f"boot-{EARLIER}", 0)
+
+
+def test_what_runs_is_remembered_however_many_updates_follow():
+    twin, _ = make()
+    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 3, 1e-5, "m"), 0.0)
+    for k in range(3 * NEWEST):
+        twin.receive(window_message(k, 1.0 + k, version=3), 2.0 + k)
+    assert twin._known.of(3) == InForce(None, 1e-5)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_hello_tells_what_a_new_boot_runs(told):
+    """After a restart from what was proved last, under a version of which this twin never heard."""
+    store = MemoryStore()
+    twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), known_gap)
+    law = SERVO.controller.replace(Kp=1234.0)
+    hello = Hello("axis", "boot-2", 0.0, 100.0, 17, 3e-5, "m", gains_of(law) if told else None)
+    assert twin.receive(hello, 5.0) == []
+    assert store.hellos == [hello]
+    assert twin._known.of(17) == InForce(law if told else None, 3e-5)
+
+
+def test_a_hello_of_an_earlier_boot_tells_nothing():
+    twin, _ = make()
+    twin.receive(window_message(0, 1.0, boot="boot-1"), 0.0)
+    twin.receive(window_message(0, 1.0, boot="boot-2"), 1.0)
+    before = twin.state()
+    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 0, 7e-5, "m"), 2.0)
+    assert twin.state() == before
+
+
+def test_an_edge_says_which_gains_are_in_force():
+    scenario = Scenario.preset("certified")
+    hello = Agent(scenario.agent_settings()).hello()
+    assert hello.controller == gains_of(scenario.start_law)
+    assert decode(encode(hello)) == hello
+    silent = Hello("axis", "b", 0.0, 1.0, 0, 0.0, "m")
+    assert b"controller" not in encode(silent)
+    assert decode(encode(silent)).controller is None
+
+
+def test_a_window_that_is_safe_is_learnt_from_without_an_acknowledgement():
+    (one, _), (other, store) = make(), make()
+    acknowledge, *rest = one.receive(window_message(3, 20.0), 22.0)
+    assert isinstance(acknowledge, Acknowledge)
+    assert other.learn(window_message(3, 20.0), 22.0) == rest
+    assert store.windows == {}
+    with pytest.raises(InvalidMessage, match="came to the twin of"):
+        other.learn(window_message(3, 20.0, servo="mill"), 22.0)

@@ -1,0 +1,214 @@
+"""The twin's trend: what it expects of a window, what moves it, reboots; loops in which the gap wears."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from servotwin.cosim import Loop, cosimulate, quantisation
+from servotwin.cosim.scenario import Scenario
+from servotwin.errors import InvalidInput
+from servotwin.estimation import whitened
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.trend import TrendSettings
+from servotwin.twin.decode import decode_window
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.wear import Wear
+
+STD = math.radians(0.02)
+SETTINGS = TrendSettings.for_wear(math.radians(20.0), 200.0)
+
+
+def seen(gap_deg: float, time: float, status: GapStatus = GapStatus.OK) -> GapEstimate:
+    gap = math.radians(gap_deg)
+    return GapEstimate(gap, STD, STD, (gap - 2 * STD, gap + 2 * STD), status, time)
+
+
+def worn(rate_deg: float = 0.1, windows: int = 6) -> Wear:
+    """After windows every 20 s of a gap that grows steadily from 1 deg on."""
+    wear = Wear(0.0, SETTINGS)
+    for time in 20.0 * np.arange(windows):
+        wear.learn("boot-1", seen(1.0 + rate_deg * time, time), time + 2.0)
+    return wear
+
+
+def test_before_the_first_estimate_there_is_only_what_is_believed():
+    expected = Wear(0.3, SETTINGS).expect("boot-1", 10.0, 12.0)
+    assert (expected.prior, expected.trend) == (0.3, None)
+    assert expected.gap_rate(SETTINGS) == SETTINGS.rate_std_rad_per_s
+
+
+def test_it_predicts_the_next_window():
+    expected = worn().expect("boot-1", 120.0, 122.0)
+    assert expected.trend.time == expected.prior.time == 120.0
+    assert math.degrees(expected.prior.gap) == pytest.approx(13.0, abs=0.2)
+    assert STD < expected.prior.std_total < math.radians(1.0)
+    assert math.degrees(expected.gap_rate(SETTINGS)) == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("status", [s for s in GapStatus if s is not GapStatus.OK])
+def test_nothing_but_a_good_estimate_moves_it(status):
+    wear = worn()
+    before = wear.trend
+    wear.learn("boot-1", seen(40.0, 120.0, status), 122.0)
+    assert wear.trend is before
+
+
+def test_an_older_window_moves_nothing_and_is_expected_as_things_stand():
+    wear = worn()
+    before = wear.trend
+    wear.learn("boot-1", seen(3.0, 50.0), 130.0)
+    assert wear.trend is before
+    assert wear.expect("boot-1", 50.0, 130.0).trend.time == before.time == 100.0
+
+
+def test_a_reboot_starts_the_edges_clock_anew_but_not_the_wear():
+    """The edge was off from 102 s to 140 s of the twin's clock: at 5 s of its new sample time 43 s have passed."""
+    wear = worn()
+    expected = wear.expect("boot-2", 5.0, 145.0)
+    assert math.degrees(expected.prior.gap) == pytest.approx(1.0 + 0.1 * 143.0, abs=0.3)
+    wear.learn("boot-2", seen(15.3, 5.0), 145.0)
+    assert (wear.trend.time, wear.trend.updates) == (5.0, 7)
+    assert math.degrees(wear.trend.rate) == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_prior_must_not_be_counted_twice():
+    with pytest.raises(InvalidInput, match="combine"):
+        TwinSettings(estimator=whitened.Settings(combine=True))
+    with pytest.raises(InvalidInput, match=r"identify\.paper|identify\.settings"):
+        TwinSettings(method="paper", estimator=whitened.Settings())
+    with pytest.raises(InvalidInput, match="'best' does not exist"):
+        TwinSettings(method="best")
+    with pytest.raises(InvalidInput, match="gap_limit"):
+        TwinSettings(gap_limit=-1.0)
+
+
+@cache
+def loop_of(name: str, **changes: object) -> Loop:
+    return cosimulate(ours(Scenario.preset(name), **changes))
+
+
+def ours(scenario: Scenario, fine_angle: bool = True, **changes: object) -> Scenario:
+    """A packaged scenario with the default estimator."""
+    twin = scenario.twin.replace(method="whitened", estimator=None, **changes)
+    return scenario.replace(twin=twin, recording=replace(scenario.recording, fine_angle=fine_angle))
+
+
+def errors_deg(loop: Loop) -> np.ndarray:
+    """(n,) estimate less truth in the middle of the window, of the estimates that are OK."""
+    times = [e.time for e in loop.estimates if e.ok]
+    truth = loop.scenario.gap.pieces(loop.scenario.duration).value(times)
+    return np.degrees([e.gap for e in loop.estimates if e.ok] - truth)
+
+
+@pytest.mark.parametrize(("name", "largest"), [("fig15", 0.003), ("fig15-sampled", 0.003), ("calm", 0.003)])
+def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
+    loop = loop_of(name)
+    assert [e.status for e in loop.estimates] == [GapStatus.OK] * 10
+    errors = errors_deg(loop)
+    assert np.max(np.abs(errors)) < largest
+    assert all(abs(error) < 1.96 * math.degrees(e.std_total) for error, e in zip(errors, loop.estimates, strict=True))
+    assert [update.gap for update in loop.updates] == [e.gap for e in loop.estimates]
+
+
+@pytest.mark.parametrize("seed", [2023, 2024, 2025])
+def test_in_the_papers_noise_what_is_accepted_is_right(seed):
+    loop = cosimulate(ours(Scenario.preset("fig16")).replace(seed=seed))
+    assert sum(e.ok for e in loop.estimates) >= 9
+    assert np.max(np.abs(errors_deg(loop))) < 0.01
+    assert {update.data_time for update in loop.updates} <= {e.time - 0.4999 for e in loop.estimates if e.ok}
+
+
+def test_the_trend_follows_the_wear():
+    loop = loop_of("calm")
+    assert [trend.updates for trend in loop.trends] == list(range(1, 11))
+    truth = loop.scenario.gap.pieces(200.0)
+    for trend in loop.trends[2:]:
+        low, high = trend.gap_interval
+        assert low < float(truth.value(trend.time)) < high
+        rate = float(truth.value(trend.time + 0.5) - truth.value(trend.time - 0.5))
+        assert abs(trend.rate - rate) < 2.5 * trend.rate_std
+    assert loop.trend is loop.trends[-1]
+    until = loop.until_limit
+    assert until.interval[0] < until.median < until.interval[1]
+    assert loop_of("fig15").until_limit is None
+
+
+def test_without_a_window_there_is_no_trend():
+    scenario = Scenario.preset("calm").replace(duration=1.0)
+    assert cosimulate(scenario).trend is None
+
+
+def test_the_paper_starts_from_the_last_estimate_whatever_the_trend_says():
+    """Published results must not hang on settings of the trend."""
+    scenario = Scenario.preset("fig15").replace(duration=45.0)
+    other = scenario.replace(twin=scenario.twin.replace(trend=SETTINGS))
+    assert cosimulate(scenario).digest() == cosimulate(other).digest()
+
+
+def calm(window: float, pre_trigger: float, **twin: float) -> Loop:
+    scenario = Scenario.preset("calm")
+    recording = replace(scenario.recording, window=window, pre_trigger=pre_trigger)
+    return cosimulate(scenario.replace(recording=recording, twin=scenario.twin.replace(**twin)))
+
+
+def test_the_first_window_has_no_time_before_its_step():
+    """At t = 0 the window begins with the first sample and keeps its length; it shows the gap all the same."""
+    loop = loop_of("calm")
+    assert [window.start for window in loop.windows] == pytest.approx([0.0, *(20.0 * np.arange(1, 10) - 0.3)])
+    assert {window.samples for window in loop.windows} == {10_000}
+    assert loop.windows[0].reference_changes == ((0.0, 1e-3),)
+    assert loop.windows[1].reference_changes == ((20.0, -1e-3),)
+
+
+def test_a_calm_loop_does_not_show_its_gap_in_a_second_after_the_step():
+    """Not in the window alone; what the encoder's offset does for it is in test_carried.py."""
+    loop = calm(1.0, 0.0)
+    large = [decode_window(window) for window in loop.windows if window.start > 70.0]
+    alone = [estimate_gap(window, loop.scenario.servo) for window in large]
+    assert {e.status for e in alone} <= {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND, GapStatus.MODEL_MISMATCH}
+    assert all(e.reasons for e in alone)
+    assert np.max(np.abs(errors_deg(loop)), initial=0.0) < 0.05
+
+
+def test_what_was_known_of_the_offset_ends_with_the_boot():
+    wear = worn()
+    assert wear.expect("boot-1", 120.0, 122.0).offset is None
+    wear.learn("boot-1", replace(seen(13.0, 120.0), offset=OffsetReading(0.3, 0.1 * STD)), 122.0)
+    mean, std = wear.expect("boot-1", 140.0, 142.0).offset
+    assert mean == pytest.approx(0.3, abs=1e-4)
+    assert 0.1 * STD < std < STD
+    assert wear.expect("boot-2", 1.0, 142.0).offset is None
+    assert wear.expect("boot-2", 1.0, 142.0).prior.gap == pytest.approx(math.radians(15.0), abs=math.radians(0.5))
+
+
+def test_an_outlier_is_not_what_is_expected_next():
+    wear = worn()
+    assert not wear.learn("boot-1", seen(40.0, 120.0), 122.0)
+    expected = wear.expect("boot-1", 140.0, 142.0)
+    assert math.degrees(expected.prior.gap) == pytest.approx(15.0, abs=0.3)
+    assert math.degrees(expected.previous) == pytest.approx(11.0)
+    assert wear.learn("boot-1", seen(41.0, 140.0), 142.0)
+    assert math.degrees(wear.expect("boot-1", 140.0, 142.0).previous) == pytest.approx(41.0)
+
+
+def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
+    """Each step ends inside the dead zone, before the screw comes to the other side: the carried offset makes up for
+    it."""
+    loop = calm(2.0, 0.3, k_dz=1.0)
+    assert sum(e.ok and not isinstance(e.offset, CarriedOffset) for e in loop.estimates) < 8
+    assert sum(isinstance(e.offset, CarriedOffset) for e in loop.estimates) >= 2
+    assert np.max(np.abs(errors_deg(loop))) < 0.05
+
+
+def test_sixteen_bits_for_the_angle_cost_hundredths_of_a_degree():
+    """Decision 8: what the angle's rounding does, and that of the position does not."""
+    fine, coarse = (loop_of("fig15", fine_angle=fine) for fine in (True, False))
+    found = [max(abs(q.gap_change) for q in quantisation(loop)) for loop in (fine, coarse)]
+    assert found[0] < math.radians(0.003) < math.radians(0.005) < found[1]
+    assert 0.005 < np.max(np.abs(errors_deg(coarse))) < 0.05
+    names = [channel.name for channel in fine.windows[0].channels]
+    assert names == ["reference", "theta_m", "theta_m_fine", "position", "voltage"]

@@ -1,0 +1,105 @@
+"""The dispatcher beside a store, a pool and a commit that do as they are told: who is blamed, and who is given back."""
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+
+from servotwin.store.rows import Claim, Kind, Outcome, Stored
+from servotwin.twin_service.dispatcher import Dispatcher, Parts
+from servotwin.twin_service.ingest import Clocks
+from servotwin.twin_service.job import Done
+from servotwin.twin_service.metrics import Metrics
+from servotwin.twin_service.pool import WorkerLost
+from servotwin.twin_service.proofs import Allowance
+from servotwin.twin_service.shelf import Shelf
+
+DIES, FAILS = b"dies", b"fails"
+
+
+def claim(servo: str, body: bytes = b"", kind: Kind = Kind.WINDOW) -> Claim:
+    return Claim(servo, b"", 0, (Stored(1, kind, body, "", 0.0),))
+
+
+class Lender:
+    """A store that lends what it is told, one list after the other; and its workers."""
+
+    def __init__(self, turns: Sequence[Sequence[Claim]]) -> None:
+        self.turns = list(turns)
+        self.seen: list[tuple[str, int]] = []
+        self.released: list[frozenset[str]] = []
+        self.through = asyncio.Event()
+
+    def claim(self, _owner, _limit, _lease, _now, kinds, **_more) -> list[Claim]:
+        if Kind.PROOF in kinds:
+            return []
+        return list(self.turns.pop(0)) if self.turns else []
+
+    def release(self, _owner, servos=None) -> None:
+        if servos is not None:
+            self.released.append(servos)
+
+    async def lend(self) -> "Lender":
+        if not self.turns:
+            self.through.set()
+            await asyncio.Event().wait()
+        return self
+
+    def take_back(self, _worker) -> None:
+        pass
+
+    async def replace(self, _worker, _why) -> None:
+        pass
+
+    async def work(self, claims: Sequence[Claim], _now: float) -> AsyncIterator[Done]:
+        for each in claims:
+            self.seen.append((each.servo, each.attempts))
+            body = each.messages[0].body
+            if body == DIES:
+                raise WorkerLost("it died")
+            made = None if body == FAILS else Outcome(each.servo, each.serial, b"", None, (1,))
+            yield Done(made, "it failed", 0.0)
+
+
+def through(turns: Sequence[Sequence[Claim]], valid: bool = True) -> Lender:
+    """All turns, one after the other."""
+
+    async def commit(_outcome: Outcome) -> bool:
+        return valid
+
+    async def body() -> Lender:
+        lender, shelf = Lender(turns), Shelf()
+        parts = Parts(lender, shelf, lender, commit, lambda _servo: None, Metrics(), Clocks())
+        dispatcher = Dispatcher(parts, "me", Allowance(0.0))
+
+        async def one_by_one() -> "Lender":
+            while dispatcher._tasks:
+                await asyncio.wait(dispatcher._tasks)
+            return await Lender.lend(lender)
+
+        lender.lend = one_by_one
+        running = asyncio.create_task(dispatcher.run())
+        await asyncio.wait_for(lender.through.wait(), 30.0)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        await dispatcher.stop()
+        shelf.close()
+        return lender
+
+    return asyncio.run(body())
+
+
+def test_blamed_is_whom_the_worker_was_at_though_others_failed_before():
+    poison = claim("b", DIES)
+    lender = through([[claim("a", FAILS)], [claim("a"), poison], [claim("a"), poison]])
+    assert lender.seen == [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
+
+
+def test_a_proof_that_kills_its_workers_is_counted_though_windows_succeed():
+    proof, window = claim("a", DIES, Kind.PROOF), claim("a")
+    lender = through([[proof], [window], [proof], [window], [proof]])
+    assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
+
+
+def test_a_void_outcome_gives_nothing_back_that_another_may_have_borrowed():
+    lender = through([[claim("a")], [claim("b", FAILS)], [claim("b")]], valid=False)
+    assert [servos for servos in lender.released if "a" in servos] == []
+    assert frozenset({"b"}) in lender.released

@@ -1,0 +1,115 @@
+"""The link over MQTT: who may connect, how, and what the guide and the files say of it."""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mosquitto import Login, Tls, broker
+from mqttparts import edge, kept, parcel, twin
+from selfsigned import self_made
+
+from servotwin.config.table import parse_toml
+from servotwin.edge_process.config import password_of
+from servotwin.edge_process.config_file import load as gateway_config
+from servotwin.errors import InvalidInput
+from servotwin.link.broker import Broker
+from servotwin.link.mqtt import MqttTransport
+from servotwin.link.transport import Unreachable
+from servotwin.store.store import Store, open_store
+from servotwin.twin_service.config import service as read_service
+from servotwin.twin_service.secret_file import write_private
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = open_store(f"sqlite:///{tmp_path}/twin.db")
+    yield store
+    store.close()
+
+
+def shown(words: str) -> str:
+    """The block of the guide that has these words in it."""
+    text = (Path(__file__).parents[2] / "docs/howto/mqtt.md").read_text()
+    (block,) = (each for each in re.findall(r"```\w+\n(.*?)```", text, re.DOTALL) if words in each)
+    return block
+
+
+def test_the_files_that_the_guide_shows_are_read(tmp_path: Path) -> None:
+    for name in ("token", "broker-password"):
+        write_private(tmp_path / name, "secret")
+    text = 'servo = "axis-1"\nrole = "supervise"\nsample_rate_hz = 100.0\n[drive]\nkind = "simulated"\n'
+    (tmp_path / "edge.toml").write_text(text + shown("[twin]"))
+    config = gateway_config(tmp_path / "edge.toml")
+    assert config.twin is not None
+    assert (config.twin.over_mqtt, password_of(config.twin, tmp_path)) == (True, "secret")
+    (tmp_path / "tokens").touch(0o600)
+    twin_file = '[service]\ntokens = "tokens"\n' + shown("[service.mqtt]")
+    found = read_service(parse_toml(twin_file, "twin.toml").table("service"), tmp_path, {})
+    assert found.mqtt is not None
+    assert (found.mqtt.broker.password, found.mqtt.group, found.mqtt.local) == ("secret", "twins", False)
+
+
+def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path: Path, store: Store) -> None:
+    rules = shown("pattern write")
+    logins = Login("twins", "twin's password"), Login("axis-1", "edge's password")
+    with broker(tmp_path / "broker", logins, rules=rules) as server:
+        twins, edges = (Broker(server.url, *login) for login in logins)
+        with twin(twins, store), edge(edges, wait_s=0.1) as here, edge(edges, "axis-2", timeout_s=1.0) as other:
+            here.deliver(parcel(0))
+            assert here.listen(0) == []
+            with pytest.raises(Unreachable):
+                other.deliver(parcel(0, "axis-2"))
+    assert (kept(store), kept(store, "axis-2")) == ([0], [])
+
+
+def test_a_user_and_a_password_where_the_broker_asks_for_them(tmp_path: Path, store: Store) -> None:
+    logins = Login("edge", "edge's password"), Login("twin", "twin's password")
+    with broker(tmp_path / "broker", logins) as server:
+        twins, edges = (Broker(server.url, *login) for login in reversed(logins))
+        with twin(twins, store), edge(edges) as here, edge(Broker(server.url), timeout_s=1.0) as nobody:
+            here.deliver(parcel(0))
+            with pytest.raises(Unreachable, match="refuses the connection"):
+                nobody.deliver(parcel(1))
+    assert kept(store) == [0]
+    assert "password" not in repr(edges)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_over_tls_the_brokers_certificate_is_checked(tmp_path: Path, store: Store) -> None:
+    """The socket of a handshake that failed is left by paho to the garbage collector, which warns."""
+    files = Tls(*self_made(tmp_path))
+    with broker(tmp_path / "broker", tls=files) as server:
+        trusted = Broker(server.url, ca_file=str(files.certificate))
+        with twin(trusted, store), edge(trusted) as here, edge(Broker(server.url), timeout_s=1.0) as doubting:
+            here.deliver(parcel(0))
+            with pytest.raises(Unreachable, match="certificate verify failed"):
+                doubting.deliver(parcel(1))
+    assert kept(store) == [0]
+    with pytest.raises(InvalidInput, match="holds no certificates"):
+        MqttTransport(Broker("mqtts://127.0.0.1", ca_file=str(tmp_path / "absent.pem")), "axis-1", "token")
+
+
+@pytest.mark.parametrize(
+    "url", ["http://host", "mqtt://", "mqtt://host/path", "mqtt://me:secret@host", "mqtt://host:0", "mqtt://host:x"]
+)
+def test_an_address_that_is_none_is_named(url: str) -> None:
+    with pytest.raises(InvalidInput, match=r"give mqtt\(s\)://host"):
+        Broker(url)
+
+
+def test_without_paho_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "paho.mqtt.client", None)
+    with pytest.raises(InvalidInput, match=r"pip install 'servotwin\[mqtt\]'"):
+        MqttTransport(Broker("mqtt://127.0.0.1"), "axis-1", "token")
+
+
+def test_a_broker_elsewhere_asks_for_tokens(tmp_path: Path) -> None:
+    for text, what in (
+        ('[service.mqtt]\nurl = "mqtts://elsewhere"', "asks for tokens"),
+        ('[service]\nlockstep = true\n[service.mqtt]\nurl = "mqtt://localhost"', "exclude each other"),
+        ('[service.mqtt]\nurl = "mqtt://localhost"\ngroup = "a/b"', "a name without"),
+    ):
+        with pytest.raises(InvalidInput, match=what):
+            read_service(parse_toml(text, "twin.toml").table("service"), tmp_path, {})

@@ -1,0 +1,382 @@
+"""The twin's HTTP API: what is taken, what is refused and how, and that nothing is acknowledged that is not kept."""
+
+import asyncio
+import threading
+import zlib
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import httpx
+import msgspec
+import pytest
+from service_system import (
+    MSGPACK,
+    OPERATOR,
+    OTHER,
+    TOKEN,
+    bearer,
+    hello,
+    place,
+    served,
+    twin_file,
+    unpacked,
+    window,
+)
+
+from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
+from servotwin.messages import Acknowledge, Update, decode, encode
+from servotwin.messages.compression import compress
+from servotwin.store.errors import StoreUnavailable
+from servotwin.store.rows import Outcome
+from servotwin.twin_service.system import System
+from servotwin.twin_service.tokens import read_tokens, write_tokens
+
+Body = Callable[[System, httpx.AsyncClient], Coroutine[Any, Any, None]]
+
+
+@pytest.fixture
+def serving(tmp_path):
+    """Runs a coroutine function against a service that has no workers."""
+
+    def run(body: Body, service: str = "", tokens: bool = True) -> None:
+        async def both() -> None:
+            async with served(twin_file(tmp_path, service, tokens)) as (system, client):
+                await body(system, client)
+
+        asyncio.run(both())
+
+    run.folder = tmp_path
+    return run
+
+
+async def put(client: httpx.AsyncClient, sent, token=TOKEN, to=None, **headers) -> httpx.Response:
+    body = sent if isinstance(sent, bytes) else encode(sent)
+    named = {**bearer(token), **MSGPACK, **{key.replace("_", "-"): value for key, value in headers.items()}}
+    return await client.put(to or place(sent), content=body, headers=named)
+
+
+def code(answer: httpx.Response) -> tuple[int, str]:
+    said = answer.json()
+    assert set(said) == {"code", "detail"}
+    assert said["detail"].strip()
+    return answer.status_code, said["code"]
+
+
+def test_a_window_is_committed_then_acknowledged_and_known_the_second_time(serving):
+    async def body(system, client):
+        sent = window(3)
+        first, second = await put(client, sent), await put(client, sent)
+        assert (first.status_code, second.status_code) == (201, 200)
+        for answer in (first, second):
+            [acknowledged] = unpacked(answer.content)
+            assert decode(acknowledged) == Acknowledge("ax-1", "b", 3)
+        assert system.store.window("ax-1", "b", 3).body == encode(sent)
+        kept = await client.get(place(sent), headers=bearer(OPERATOR))
+        assert decode(kept.content) == sent
+
+    serving(body)
+
+
+@pytest.mark.parametrize("encoding", ["deflate", "zstd", "identity"])
+def test_a_compressed_window_is_the_same_window(serving, encoding):
+    async def body(_system, client):
+        sent = window(3)
+        packed = compress(encode(sent), "" if encoding == "identity" else encoding)
+        assert (await put(client, packed, to=place(sent), content_encoding=encoding)).status_code == 201
+        assert (await put(client, sent)).status_code == 200
+
+    serving(body)
+
+
+def test_another_window_of_the_same_identity_is_a_conflict(serving):
+    async def body(system, client):
+        assert (await put(client, window(3))).status_code == 201
+        assert code(await put(client, window(3, samples=100))) == (409, "conflict")
+        assert system.store.window("ax-1", "b", 3).body == encode(window(3))
+
+    serving(body)
+
+
+def test_windows_may_come_in_any_order(serving):
+    async def body(system, client):
+        assert (
+            await client.post("/v1/servos/ax-1/letters", content=hello(time=100.0), headers=bearer())
+        ).status_code == 202
+        for sequence in (7, 2, 9, 0):
+            assert (await put(client, window(sequence))).status_code == 201
+        assert system.store.servo("ax-1").windows == 4
+
+    serving(body)
+
+
+def test_who_may_do_what(serving):
+    async def body(_system, client):
+        path = place(window())
+        assert code(await client.put(path, content=encode(window()))) == (401, "bad_token")
+        assert code(await put(client, window(), "guess")) == (401, "bad_token")
+        assert code(await put(client, window(), OTHER)) == (403, "bad_token")
+        assert code(await put(client, window(), OPERATOR)) == (403, "bad_token")
+        assert code(await put(client, window(), "x" * 5000)) == (401, "bad_token")
+        for reading in ("/v1/servos", "/v1/servos/ax-1", "/v1/servos/ax-1/audit", "/v1/servos/ax-1/events", path):
+            assert code(await client.get(reading)) == (401, "bad_token")
+            assert code(await client.get(reading, headers=bearer(TOKEN))) == (403, "bad_token")
+        assert code(await client.get("/v1/servos/ax-1/outgoing", headers=bearer(OTHER))) == (403, "bad_token")
+        assert (await client.get("/v1/servos", headers=bearer(OPERATOR))).json() == []
+
+    serving(body)
+
+
+def test_a_servo_that_nobody_looks_after_may_come_again(serving):
+    async def body(_system, client):
+        stranger = window(servo="stranger")
+        assert code(await put(client, stranger, "any")) == (404, "unknown_servo")
+
+    serving(body, tokens=False)
+
+
+def test_a_message_must_be_what_its_address_says(serving):
+    async def body(_system, client):
+        assert code(await put(client, encode(window(servo="ax-2")), to=place(window()))) == (400, "other_name")
+        assert code(await put(client, encode(window(4)), to=place(window(5)))) == (400, "other_name")
+        assert code(await put(client, encode(window(boot="c")), to=place(window()))) == (400, "other_name")
+        letters = "/v1/servos/ax-1/letters"
+        assert code(await client.post(letters, content=encode(window()), headers=bearer())) == (400, "not_understood")
+        assert code(await put(client, hello(), to=place(window()))) == (400, "not_understood")
+        acknowledge = encode(Acknowledge("ax-1", "b", 1))
+        assert code(await client.post(letters, content=acknowledge, headers=bearer())) == (400, "not_understood")
+
+    serving(body)
+
+
+def test_what_is_no_message_is_told_apart(serving):
+    async def body(system, client):
+        path, whole = place(window()), encode(window())
+        middle = len(whole) // 3
+        flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+        assert code(await put(client, whole[:-5], to=path)) == (400, "not_understood")
+        assert code(await put(client, b"", to=path)) == (400, "not_understood")
+        assert code(await put(client, flipped, to=path)) == (400, "bad_checksum")
+        newer = msgspec.msgpack.encode({"type": "window/2", "servo": "ax-1"})
+        assert code(await put(client, newer, to=path)) == (400, "unknown_schema")
+        assert code(await put(client, whole, to=path, content_encoding="br")) == (400, "not_understood")
+        assert code(await put(client, whole, to=path, content_encoding="deflate")) == (400, "not_understood")
+        counted = (await client.get("/metrics")).text
+        assert 'servotwin_refused_total{code="not_understood"} 4' in counted
+        assert 'servotwin_refused_total{code="bad_checksum"} 1' in counted
+        assert 'servotwin_refused_total{code="unknown_schema"} 1' in counted
+        assert system.store.servo("ax-1") is None
+
+    serving(body)
+
+
+def test_what_is_too_large_is_refused_however_it_comes(serving):
+    async def pieces():
+        for _ in range(100):
+            yield bytes(1000)
+
+    async def body(system, client):
+        path = place(window())
+        assert code(await put(client, bytes(20_001), to=path)) == (413, "too_large")
+        streamed = await client.put(path, content=pieces(), headers=bearer())
+        assert code(streamed) == (413, "too_large")
+        bomb = zlib.compress(bytes(10_000_000))
+        assert len(bomb) < 20_000
+        assert code(await put(client, bomb, to=path, content_encoding="deflate")) == (413, "too_large")
+        bomb = compress(bytes(50_000_000), "zstd")
+        assert code(await put(client, bomb, to=path, content_encoding="zstd")) == (413, "too_large")
+        assert code(await put(client, window(), content_length="9" * 30)) == (413, "too_large")
+
+    serving(body, "max_body_bytes = 20000")
+
+
+def test_a_body_that_does_not_come_is_not_waited_for(serving):
+    async def slowly():
+        yield b"x"
+        await asyncio.sleep(30.0)
+
+    async def body(_system, client):
+        answer = await client.put(place(window()), content=slowly(), headers=bearer())
+        assert code(answer) == (503, "unavailable")
+        assert answer.headers["connection"] == "close"
+
+    serving(body, "body_timeout_s = 0.2")
+
+
+def test_a_window_from_the_future_is_refused_until_that_is_the_present(serving):
+    async def body(_system, client):
+        assert (await put(client, window(0))).status_code == 201
+        assert code(await put(client, window(1, start=1000.0))) == (422, "future")
+        letters = "/v1/servos/ax-1/letters"
+        assert (await client.post(letters, content=hello(time=1001.0), headers=bearer())).status_code == 202
+        assert (await put(client, window(1, start=1000.0))).status_code == 201
+        assert code(await put(client, window(2, boot="c", start=1e12))) == (422, "future")
+
+    serving(body, "future_slack_s = 10.0")
+
+
+def test_a_servo_that_sends_too_much_waits(serving):
+    async def body(_system, client):
+        answers = [await put(client, window(sequence)) for sequence in range(4)]
+        assert [answer.status_code for answer in answers[:3]] == [201, 201, 201]
+        assert code(answers[3]) == (429, "too_many")
+        assert answers[3].headers["retry-after"]
+        assert (await put(client, window(0, "ax-2"), OTHER)).status_code == 201
+
+    serving(body, "rate_limit_per_s = 0.001\nrate_burst = 3.0")
+
+
+def test_a_full_queue_and_a_store_that_cannot_write_are_for_later(serving):
+    async def body(system, client):
+        writing, held, write = threading.Event(), threading.Event(), system.store.write
+
+        def slow(*what):
+            writing.set()
+            assert held.wait(30.0)
+            return write(*what)
+
+        system.store.write = slow
+        sent = [asyncio.create_task(put(client, window(0)))]
+        # From here on the first one is in a transaction of its own, so that two may wait and three may not.
+        assert await asyncio.to_thread(writing.wait, 30.0)
+        sent += [asyncio.create_task(put(client, window(sequence))) for sequence in range(1, 6)]
+        done: set[asyncio.Task[httpx.Response]] = set()
+        async with asyncio.timeout(30.0):
+            while len(done) < 3:
+                done, _ = await asyncio.wait(sent, timeout=0.05)
+        assert [code(task.result()) for task in done] == [(503, "unavailable")] * 3
+        held.set()
+        assert {(await task).status_code for task in set(sent) - done} == {201}
+
+        def full(*_what):
+            raise StoreUnavailable("the disk is full")
+
+        system.store.write = full
+        assert code(await put(client, window(9))) == (503, "unavailable")
+        system.store.write = write
+        assert (await put(client, window(9))).status_code == 201
+        assert system.store.servo("ax-1").windows == 4
+
+    serving(body, "queue = 2")
+
+
+def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
+    update = Update("ax-1", 1, 0, ("b", 0), 0.0, 0.1, 0.01, (0.0, None), "ok", 1e-4, 100.0)
+
+    async def body(system, client):
+        await client.post("/v1/servos/ax-1/letters", content=hello(), headers=bearer())
+        asked = client.get("/v1/servos/ax-1/outgoing?after=0&wait=20", headers=bearer())
+        waiting = asyncio.create_task(asked)
+        await asyncio.sleep(0.1)
+        assert not waiting.done()
+        [claim] = system.store.claim("me", 1, 10.0, system.clocks.wall())
+        done = tuple(message.id for message in claim.messages)
+        made = Outcome("ax-1", claim.serial, b"state", None, done, outgoing=(encode(update),))
+        assert await system.dispatcher._committed(made)
+        again = await client.get("/v1/servos/ax-1/outgoing", headers=bearer())
+        for answer in (await waiting, again):
+            [sealed] = unpacked(answer.content)
+            found = opened(key_of(verifier_of(TOKEN)), TO_EDGE, "ax-1", sealed, 10_000)
+            assert (found.serial, decode(found.body)) == (1, update)
+        nothing = await client.get("/v1/servos/ax-1/outgoing?after=1&wait=0.05", headers=bearer())
+        assert unpacked(nothing.content) == []
+
+    serving(body)
+
+
+@pytest.mark.parametrize(
+    "query", ["after=x", "after=-1", "after=" + "9" * 5000, "wait=31", "wait=nan", "wait=-1", "wait=inf", "after=%00"]
+)
+def test_arguments_that_are_none_are_refused(serving, query):
+    async def body(_system, client):
+        answer = await client.get("/v1/servos/ax-1/outgoing?" + query, headers=bearer())
+        assert code(answer) == (400, "not_understood")
+
+    serving(body)
+
+
+def test_only_so_many_polls_wait(serving):
+    async def body(system, client):
+        path = "/v1/servos/ax-1/outgoing?wait=20"
+        first = asyncio.create_task(client.get(path, headers=bearer()))
+        while not system.outgoing.polls:
+            await asyncio.sleep(0.01)
+        assert code(await client.get(path, headers=bearer())) == (429, "too_many")
+        system.outgoing.close()
+        assert unpacked((await first).content) == []
+
+    serving(body, "long_polls = 1")
+
+
+def test_an_unknown_path_and_method_are_told_in_the_same_form(serving):
+    async def body(_system, client):
+        assert code(await client.get("/nowhere")) == (404, "not_understood")
+        assert code(await client.delete("/v1/servos")) == (405, "not_understood")
+        huge = f"/v1/servos/ax-1/windows/b/{'9' * 6000}"
+        assert code(await client.get(huge, headers=bearer(OPERATOR))) == (400, "not_understood")
+
+    serving(body)
+
+
+def test_a_token_counts_as_soon_as_its_file_says_so_and_no_longer(serving):
+    async def body(system, client):
+        path = serving.folder / "tokens.toml"
+        known = read_tokens(path)
+        assert (await put(client, window())).status_code == 201
+        fresh = {**known.servos, "ax-1": verifier_of("another")}
+        write_tokens(path, known.__class__(fresh, known.operators))
+        assert system.tokens.refresh()
+        assert code(await put(client, window())) == (401, "bad_token")
+        assert (await put(client, window(), "another")).status_code == 200
+        path.write_text("[servos]\n'ax 1' = 3\n")
+        assert not system.tokens.refresh()
+        assert (await put(client, window(), "another")).status_code == 200
+
+    serving(body)
+
+
+def test_nothing_that_is_said_or_logged_holds_a_token(serving, caplog):
+    caplog.set_level("DEBUG")
+    said = []
+
+    async def body(system, client):
+        for token in (TOKEN, OTHER, OPERATOR, "guess-of-a-token"):
+            answers = await put(client, window(), token), await client.get("/v1/servos", headers=bearer(token))
+            said.extend(answer.text + str(dict(answer.headers)) for answer in answers)
+        said.append((await client.get("/metrics")).text)
+        said.append(repr(system.config) + repr(read_tokens(system.config.tokens)))
+
+    serving(body)
+    everything = " ".join(said) + "".join(str(vars(record)) for record in caplog.records)
+    for token in (TOKEN, OTHER, OPERATOR, "guess-of-a-token"):
+        assert token not in everything
+        assert verifier_of(token).hex() not in everything
+
+
+def test_health_says_what_is_not_well(serving):
+    async def body(system, client):
+        answer = await client.get("/healthz")
+        assert answer.status_code == 503
+        said = answer.json()
+        assert said["store"] is True
+        assert said["workers"] == 0
+        assert said["waiting"]["messages"] == 0
+        system.shelf.fault = "gone"
+        assert (await client.get("/healthz")).status_code == 503
+
+    serving(body)
+
+
+def test_a_store_that_takes_no_writes_is_not_well_though_it_can_be_read(serving):
+    async def body(system, client):
+        write, system.store.write = system.store.write, full
+        assert code(await put(client, window(0))) == (503, "unavailable")
+        assert (await client.get("/healthz")).json()["store"] is False
+        assert "servotwin_store_ok 0\n" in (await client.get("/metrics")).text
+        system.store.write = write
+        assert (await put(client, window(0))).status_code == 201
+        assert (await client.get("/healthz")).json()["store"] is True
+
+    def full(*_args):
+        raise StoreUnavailable("store: not available now (database or disk is full)")
+
+    serving(body)

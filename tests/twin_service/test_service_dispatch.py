@@ -1,0 +1,170 @@
+"""Work on what came: once, whatever becomes of workers; shared by processes; proofs at their rate."""
+
+import asyncio
+import contextlib
+import sys
+from pathlib import Path
+
+import httpx
+import msgspec
+import pytest
+from service_system import bearer, place, twin_file, unpacked, window
+from store_cases import SYSTEMS, addresses
+
+from servotwin.messages import encode
+from servotwin.store.errors import StoreUnavailable
+from servotwin.store.store import open_store
+from servotwin.twin_service.pool import Pool
+from servotwin.twin_service.proofs import Allowance
+from servotwin.twin_service.system import System
+from servotwin.twin_service.twin_file import read_twin
+
+WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
+PATIENCE = 60.0
+
+
+@contextlib.asynccontextmanager
+async def working(path, url=None, workers=1, timeout=30.0):
+    """A service with scripted workers, and a client."""
+    twin = read_twin(path)
+    store = open_store(url or twin.service.store)
+    system = System(twin, store, pool=Pool(workers, twin.start, timeout, WORKER))
+    app = system.app
+    try:
+        async with app.api.router.lifespan_context(app.api):
+            transport = httpx.ASGITransport(app)
+            async with httpx.AsyncClient(transport=transport, base_url="http://twin") as client:
+                yield system, client
+    finally:
+        store.close()
+
+
+async def put(client, sequence, reason="work", servo="ax-1", token="token-of-ax-1", tries=1):
+    """Send a window, as often as an edge would where the store may fail meanwhile."""
+    sent = msgspec.structs.replace(window(sequence, servo, start=0.001 * sequence), reason=reason)
+    for _ in range(tries):
+        answer = await client.put(place(sent), content=encode(sent), headers=bearer(token))
+        if answer.status_code != 503:
+            break
+    assert answer.status_code == 201, answer.text
+
+
+async def until(condition):
+    async with asyncio.timeout(PATIENCE):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+def done(system, servo="ax-1"):
+    found = system.store.servo(servo)
+    return found is not None and found.waiting == 0
+
+
+def statuses(system, servo="ax-1"):
+    """Of each window by its sequence: what was found of it."""
+    links = system.store.audit(servo, limit=1000)
+    return {link.window.sequence: [found.status[:8] for found in link.found] for link in links}
+
+
+@pytest.mark.parametrize("fault", ["die", "hang", "raise"])
+def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_once(tmp_path, fault, caplog):
+    async def body():
+        async with working(twin_file(tmp_path), timeout=5.0 if fault == "hang" else 30.0) as (system, client):
+            for sequence in range(6):
+                await put(client, sequence, fault if sequence == 3 else "work")
+                await put(client, sequence, servo="ax-2", token="token-of-ax-2")
+            await until(lambda: done(system) and done(system, "ax-2"))
+            found = statuses(system)
+            assert found.pop(3) == ["failed: "]
+            assert all(len(each) == 1 and each[0].startswith("at ") for each in found.values())
+            assert len(found) == 5
+            assert [len(each) for each in statuses(system, "ax-2").values()] == [1] * 6
+            # The state holds one letter for each message: nothing counted twice.
+            [posted] = {summary.posted for summary in system.store.servos()}
+            assert posted == 6
+            assert system.pool.lost >= (2 if fault != "raise" else 0)
+            assert system.pool.alive == 1
+            counted = (await client.get("/metrics")).text
+            assert 'servotwin_evidence_total{kind="failed"} 1\n' in counted
+            assert 'servotwin_evidence_total{kind="estimate"} 11\n' in counted
+            [alarm] = [record for record in caplog.records if record.message == "failed"]
+            assert (alarm.levelname, alarm.servo, alarm.window) == ("WARNING", "ax-1", "b/3")
+
+    asyncio.run(body())
+
+
+def test_what_was_not_committed_is_worked_on_again_when_the_store_is_back(tmp_path):
+    async def body():
+        async with working(twin_file(tmp_path)) as (system, client):
+            write, failures = system.store.write, []
+
+            def full(items, made, now):
+                if made and len(failures) < 2:
+                    failures.append(made)
+                    raise StoreUnavailable("the disk is full")
+                return write(items, made, now)
+
+            system.store.write = full
+            # A window may be in one of the transactions that fail: it is refused and sent again.
+            for sequence in range(5):
+                await put(client, sequence, tries=3)
+            await until(lambda: done(system))
+            assert len(failures) == 2
+            assert {len(each) for each in statuses(system).values()} == {1}
+            assert system.store.servo("ax-1").posted == 5
+
+    asyncio.run(body())
+
+
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_windows_are_worked_on_and_the_edge_is_told(tmp_path, kind):
+    async def body(url):
+        async with working(twin_file(tmp_path, f'store = "{shown(url)}"'), url) as (system, client):
+            asked = client.get("/v1/servos/ax-1/outgoing?after=0&wait=30", headers=bearer())
+            poll = asyncio.create_task(asked)
+            await asyncio.sleep(0.05)
+            await put(client, 0)
+            assert len(unpacked((await poll).content)) == 1
+            await until(lambda: done(system))
+
+    with addresses(kind, tmp_path) as new:
+        asyncio.run(body(new()))
+
+
+def shown(url):
+    """An address as a twin's file may name it: without a password."""
+    head, _, rest = url.partition("://")
+    who, at, where = rest.rpartition("@")
+    return f"{head}://{who.split(':')[0]}{at}{where}"
+
+
+def test_processes_share_one_database_and_tell_each_other_s_edges(tmp_path):
+    async def body(url):
+        file = twin_file(tmp_path, f'store = "{shown(url)}"')
+        async with working(file, url) as (one, here), working(file, url) as (two, there):
+            poll = asyncio.create_task(
+                there.get("/v1/servos/ax-2/outgoing?after=0&wait=30", headers=bearer("token-of-ax-2"))
+            )
+            for sequence in range(40):
+                await put(here if sequence % 2 else there, sequence)
+            await put(here, 0, servo="ax-2", token="token-of-ax-2")
+            assert len(unpacked((await poll).content)) == 1
+            await until(lambda: done(one))
+            assert {len(each) for each in statuses(two).values()} == {1}
+            assert one.store.servo("ax-1").posted == 40
+
+    with addresses("postgresql", tmp_path) as new:
+        asyncio.run(body(new()))
+
+
+def test_proofs_are_saved_up_to_two_and_then_come_at_their_rate():
+    allowance = Allowance(6.0)
+    begun = []
+    for tick in range(1, 6001):
+        now = 0.01 * tick
+        if allowance.may(now):
+            allowance.take()
+            begun.append(now)
+    assert begun[:2] == [0.01, 0.02]
+    assert len(begun) == 2 + 5
+    assert not Allowance(0.0).may(1e6)

@@ -1,0 +1,350 @@
+"""Parts of the service by themselves: future, limits, metrics, logs, polls, tokens, the file."""
+
+import asyncio
+import io
+import json
+import logging
+import math
+import stat
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from service_system import SERVO, twin_file
+
+from servotwin.config.table import Table
+from servotwin.errors import InvalidInput
+from servotwin.link.seal import verifier_of
+from servotwin.messages import Refusal
+from servotwin.store.rows import Posted
+from servotwin.twin_service import logs
+from servotwin.twin_service.config import PASSWORD, ServiceConfig, service
+from servotwin.twin_service.future import Boots
+from servotwin.twin_service.limits import Bodies, Buckets, Disconnected
+from servotwin.twin_service.metrics import Count, Gauge, Histogram, Metrics
+from servotwin.twin_service.outgoing import Outgoing
+from servotwin.twin_service.refused import STATUS, Refused
+from servotwin.twin_service.secret_file import read_secret, write_private
+from servotwin.twin_service.tokens import Verifiers, read_tokens, write_tokens
+from servotwin.twin_service.twin_file import read_twin
+
+
+def refusal(act):
+    with pytest.raises(Refused) as refused:
+        act()
+    return refused.value.refusal
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_every_reason_has_a_status():
+    assert set(STATUS) == set(Refusal)
+    assert {status for reason, status in STATUS.items() if reason.passing} == {401, 404, 422, 429, 503}
+
+
+@given(
+    speed=st.floats(0.1, 20.0),
+    slack=st.floats(0.0, 100.0),
+    first=st.floats(0.0, 1e6),
+    later=st.lists(st.tuples(st.floats(0.0, 1e4), st.floats(-1e4, 1e6)), max_size=20),
+)
+def test_a_boot_s_sample_time_runs_no_faster_than_it_can(speed, slack, first, later):
+    boots, now = Boots(speed, slack), 1000.0
+    boots.check("a", "b", first, now)
+    for passed, end in later:
+        now += passed
+        reached = first + speed * (now - 1000.0) + slack
+        if end <= reached * (1.0 - 1e-12):
+            boots.check("a", "b", end, now)
+        elif end > reached * (1.0 + 1e-12) + 1e-9:
+            assert refusal(lambda end=end, now=now: boots.check("a", "b", end, now)) is Refusal.FUTURE
+    boots.check("a", "c", 5.0, now)
+    boots.check("other", "b", 7.0, now)
+
+
+def test_a_hello_moves_a_boot_s_time_on_but_never_back():
+    boots = Boots(1.0, 0.0)
+    boots.hello("a", "b", 100.0, 0.0)
+    boots.hello("a", "b", 50.0, 1.0)
+    boots.check("a", "b", 101.0, 1.0)
+    boots.hello("a", "b", 500.0, 2.0)
+    boots.check("a", "b", 500.0, 2.0)
+    assert refusal(lambda: boots.hello("a", "c", 1e12, 2.0)) is Refusal.FUTURE
+
+
+@given(st.floats(0.1, 100.0), st.integers(1, 50), st.lists(st.floats(0.0, 2.0), max_size=200))
+def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(rate, burst, pauses):
+    clock, taken = Clock(), 0
+    buckets = Buckets(rate, burst, clock)
+    for pause in pauses:
+        clock.now += pause
+        try:
+            buckets.take("a")
+            taken += 1
+        except Refused as refused:
+            assert refused.refusal is Refusal.TOO_MANY  # noqa: PT017
+    assert taken <= burst + rate * clock.now + 1e-6
+    assert taken >= min(len(pauses), burst)
+    buckets.take("b")
+
+
+def received(*parts, end=True):
+    """An ASGI receive that gives these parts, and then nothing any more."""
+    events = [{"type": "http.request", "body": part, "more_body": True} for part in parts]
+    if end:
+        events.append({"type": "http.request", "body": b"", "more_body": False})
+    else:
+        events.append({"type": "http.disconnect"})
+    iterator = iter(events)
+
+    async def receive():
+        return next(iterator)
+
+    return receive
+
+
+@given(st.lists(st.binary(max_size=40), max_size=10), st.integers(0, 150), st.none() | st.integers(0, 300))
+def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, declared):
+    bodies, whole = Bodies(limit, 10.0), b"".join(parts)
+    length = None if declared is None else str(declared)
+    try:
+        found = asyncio.run(bodies.read(length, received(*parts)))
+    except Refused as refused:
+        assert refused.refusal is Refusal.TOO_LARGE  # noqa: PT017
+        assert max(len(whole), declared or 0) > limit
+    else:
+        assert found == whole
+        assert len(whole) <= limit
+    assert bodies.held == 0
+
+
+def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
+    bodies = Bodies(100, 10.0, memory=150)
+    with pytest.raises(Disconnected):
+        asyncio.run(bodies.read(None, received(b"x", end=False)))
+    assert bodies.held == 0
+
+    async def two():
+        gate = asyncio.Event()
+
+        async def slow():
+            if not gate.is_set():
+                gate.set()
+                return {"type": "http.request", "body": bytes(90), "more_body": True}
+            await asyncio.sleep(60.0)
+            return None
+
+        first = asyncio.create_task(bodies.read(None, slow))
+        await gate.wait()
+        with pytest.raises(Refused) as refused:
+            await bodies.read(None, received(bytes(90)))
+        first.cancel()
+        await asyncio.gather(first, return_exceptions=True)
+        return refused.value.refusal
+
+    assert asyncio.run(two()) is Refusal.UNAVAILABLE
+    assert bodies.held == 0
+
+
+def test_metrics_are_prometheus_text():
+    count, told = Count("a_total", "How many.", "kind", "put"), Metrics()
+    count.add('w"\n\\', "new", by=2)
+    assert list(count.lines()) == ['a_total{kind="w\\"\\n\\\\",put="new"} 2']
+    assert list(Gauge("g", "Now.", lambda: {"x": 1.5}, "of").lines()) == ['g{of="x"} 1.5']
+    histogram = Histogram("h", "Times.", (0.1, 1.0))
+    for value in (0.05, 0.1, 0.5, 7.0):
+        histogram.observe(value)
+    lines = ['h_bucket{le="0.1"} 2', 'h_bucket{le="1"} 3', 'h_bucket{le="+Inf"} 4', "h_sum 7.65", "h_count 4"]
+    assert list(histogram.lines()) == lines
+    told.watch("w", "Watched.", lambda: True)
+    text = told.text()
+    assert text.endswith("# HELP w Watched.\n# TYPE w gauge\nw 1\n")
+    assert len({line for line in text.splitlines() if line.startswith("# TYPE")}) == text.count("# TYPE")
+
+
+def test_a_log_line_is_one_json_object_whatever_it_holds():
+    stream = io.StringIO()
+    handler = logs.configure("info", stream)
+    log = logging.getLogger("servotwin.test")
+    try:
+        log.info("a\nb", extra={"servo": "x\ny", "number": math.nan, "thing": object()})
+        log.debug("unseen")
+        try:
+            raise ValueError("it")
+        except ValueError:
+            log.exception("bad")
+    finally:
+        for name in ("servotwin", "uvicorn"):
+            logging.getLogger(name).removeHandler(handler)
+            logging.getLogger(name).propagate = True
+            logging.getLogger(name).setLevel(logging.NOTSET)
+    first, second = (json.loads(line) for line in stream.getvalue().splitlines())
+    assert (first["message"], first["servo"], first["level"], first["where"]) == (
+        "a\nb",
+        "x\ny",
+        "info",
+        "servotwin.test",
+    )
+    assert "ValueError: it" in second["exception"]
+
+
+def test_polls_ask_the_store_only_when_something_may_be_there():
+    posted, asked = [], []
+
+    async def read(servo, serial):
+        asked.append(serial)
+        return [each for each in posted if each.serial > serial]
+
+    async def body():
+        outgoing = Outgoing(read, 10)
+        for _ in range(5):
+            assert list(await outgoing.after("a", 0, 0.0)) == []
+        assert len(asked) == 1
+        waiting = [asyncio.create_task(outgoing.after("a", 0, 60.0)) for _ in range(3)]
+        await asyncio.sleep(0.01)
+        posted.append(Posted(1, b"x"))
+        outgoing.post("b")
+        await asyncio.sleep(0.01)
+        assert not any(task.done() for task in waiting)
+        outgoing.post("a")
+        assert [await task for task in waiting] == [posted] * 3
+        assert outgoing.polls == 0
+        assert list(await outgoing.after("a", 1, 0.01)) == []
+        assert not outgoing._waiting
+
+    asyncio.run(body())
+
+
+def test_a_message_posted_while_the_store_is_asked_is_not_missed():
+    posted = []
+
+    async def body():
+        begun, go_on = asyncio.Event(), asyncio.Event()
+
+        async def read(_servo, serial):
+            found = [each for each in posted if each.serial > serial]
+            begun.set()
+            await go_on.wait()
+            return found
+
+        outgoing = Outgoing(read, 10)
+        poll = asyncio.create_task(outgoing.after("a", 0, 60.0))
+        await begun.wait()
+        posted.append(Posted(1, b"x"))
+        outgoing.post("a")
+        go_on.set()
+        assert await asyncio.wait_for(poll, 10.0) == posted
+
+    asyncio.run(body())
+
+
+@given(
+    servos=st.dictionaries(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,20}\Z"), st.binary(min_size=32, max_size=32)),
+    operators=st.dictionaries(st.sampled_from(["me", "you"]), st.binary(min_size=32, max_size=32)),
+)
+def test_a_file_of_tokens_reads_as_it_was_written(tmp_path_factory, servos, operators):
+    path = tmp_path_factory.mktemp("tokens") / "tokens.toml"
+    every = [*servos.values(), *operators.values()]
+    write_tokens(path, Verifiers(servos, operators))
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    if len(set(every)) < len(every):
+        with pytest.raises(InvalidInput, match="same token"):
+            read_tokens(path)
+    else:
+        assert read_tokens(path) == Verifiers(servos, operators)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[servos]\n"ax-1" = "secret"', "no verifier"),
+        ('[servos]\n"a b" = "00"', "a name has"),
+        (f'[servos]\na = "{"0" * 64}"\nb = "{"0" * 64}"', "same token"),
+        ('[servo]\na = "00"', "did you mean 'servos'"),
+        ('[operators]\n"x" = 3', "no verifier"),
+    ],
+)
+def test_a_file_of_tokens_that_is_wrong_is_one_sentence_without_what_it_holds(tmp_path, text, said):
+    path = tmp_path / "tokens.toml"
+    write_private(path, text)
+    with pytest.raises(InvalidInput) as error:
+        read_tokens(path)
+    assert said in str(error.value)
+    assert "secret" not in str(error.value)
+    path.chmod(0o640)
+    with pytest.raises(InvalidInput, match="chmod 600"):
+        read_tokens(path)
+
+
+def config(folder, values, environment=None):
+    return service(Table("twin.toml", values, "service"), folder, environment or {})
+
+
+def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not_shown(tmp_path):
+    url = "postgresql://me@host/twin"
+    write_private(tmp_path / "password", "hunter2\n")
+    for found in (
+        config(tmp_path, {"store": url, "store_password_file": "password"}),
+        config(tmp_path, {"store": url}, {PASSWORD: "hunter2"}),
+    ):
+        assert found.store_password == "hunter2"
+        assert "hunter2" not in repr(found)
+    assert config(tmp_path, {}).store == f"sqlite:///{tmp_path / 'twin.db'}"
+    for holding in ("postgresql://me:hunter2@host/twin", "postgresql://me@host/twin?password=hunter2"):
+        with pytest.raises(InvalidInput, match="holds a password") as error:
+            config(tmp_path, {"store": holding})
+        assert "hunter2" not in str(error.value)
+    (tmp_path / "password").chmod(0o604)
+    with pytest.raises(InvalidInput, match="others"):
+        read_secret(tmp_path / "password")
+
+
+def test_another_address_needs_tokens_and_tls_or_a_proxy(tmp_path):
+    for values in ({}, {"tokens": "tokens.toml"}, {"behind_proxy": True}):
+        with pytest.raises(InvalidInput, match="only with tokens"):
+            config(tmp_path, {"bind": "0.0.0.0", **values})
+    assert not config(tmp_path, {"bind": "::", "tokens": "tokens.toml", "behind_proxy": True}).local
+    with pytest.raises(InvalidInput, match="asks for tokens"):
+        config(tmp_path, {"bind": "127.0.0.1", "behind_proxy": True})
+    for address in ("localhost", "127.0.0.2", "::1"):
+        assert config(tmp_path, {"bind": address}).local
+    assert ServiceConfig().local
+
+
+def test_a_whole_file_knows_its_service_and_its_fleet(tmp_path):
+    found = read_twin(twin_file(tmp_path, "speed = 5.0"))
+    assert found.service.speed == 5.0
+    assert found.fleet.model_of("ax-9").name == "axis"
+    assert verifier_of("token-of-ax-1") in read_tokens(found.service.tokens).servos.values()
+    with pytest.raises(InvalidInput, match="unknown key 'servo'"):
+        read_twin(twin_file(tmp_path, servos="[servo]\nx = 1\n" + SERVO))
+
+
+def test_what_others_posted_ends_the_polls_that_it_is_for():
+    posted = []
+
+    async def read(_servo, serial):
+        return [each for each in posted if each.serial > serial]
+
+    async def body():
+        outgoing = Outgoing(read, 10, shared=True)
+        early, late = (asyncio.create_task(outgoing.after("a", serial, 60.0)) for serial in (0, 1))
+        while outgoing.polls < 2 or outgoing.waiting != ["a"]:
+            await asyncio.sleep(0.01)
+        outgoing.posted({"a": 0, "b": 7})
+        await asyncio.sleep(0.01)
+        assert not early.done()
+        posted.append(Posted(1, b"x"))
+        outgoing.posted({"a": 1})
+        assert await early == posted
+        assert not late.done()
+        posted.append(Posted(2, b"y"))
+        outgoing.posted({"a": 2})
+        assert await late == posted[1:]
+
+    asyncio.run(body())

@@ -1,0 +1,318 @@
+"""The service as a process: kills, signals, TLS, workers that die; over real sockets."""
+
+import datetime
+import ipaddress
+import json
+import os
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+from service_system import (
+    MSGPACK,
+    OPERATOR,
+    TOKEN,
+    bearer,
+    hello,
+    place,
+    process,
+    trusting,
+    twin_file,
+    unpacked,
+    window,
+)
+
+from servotwin.messages import encode
+from servotwin.store.store import open_store
+from servotwin.twin_service import command as service
+from servotwin.twin_service.pool import Pool
+from servotwin.twin_service.system import System
+from servotwin.twin_service.twin_file import read_twin
+
+PATIENCE = 60.0
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")
+
+
+def until(condition, seconds=PATIENCE):
+    """What a condition gives once it gives something."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := condition():
+            return found
+        time.sleep(0.05)
+    raise AssertionError("it did not happen in time")
+
+
+def self_made(folder: Path) -> tuple[Path, Path]:
+    """A certificate for 127.0.0.1, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "twin")])
+    now = datetime.datetime.now(datetime.UTC)
+    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+    builder = builder.not_valid_before(now - datetime.timedelta(days=1)).not_valid_after(
+        now + datetime.timedelta(days=1)
+    )
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+    names = x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
+    certificate = builder.add_extension(names, critical=False).sign(key, hashes.SHA256())
+    paths = folder / "twin.crt", folder / "twin.key"
+    paths[0].write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    plain = serialization.NoEncryption()
+    paths[1].write_bytes(key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain))
+    return paths
+
+
+def send(client: httpx.Client, sequence: int) -> httpx.Response:
+    sent = window(sequence, start=0.001 * sequence)
+    return client.put(place(sent), content=encode(sent), headers={**bearer(), **MSGPACK})
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "(zombie)" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+def children(pid: int) -> list[int]:
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(each) for each in found.split()]
+
+
+def test_a_window_goes_all_the_way_and_a_signal_ends_it_well(tmp_path):
+    with process(twin_file(tmp_path)) as (running, url):
+        with httpx.Client(base_url=url, timeout=PATIENCE) as client:
+            assert send(client, 0).status_code == 201
+            links = until(
+                lambda: [
+                    link
+                    for link in client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR)).json()
+                    if link["window"]["done"] is not None
+                ]
+            )
+            assert {found["kind"] for found in links[0]["found"]} >= {"estimate"}
+            summary = client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()
+            assert (summary["windows"], summary["waiting"], summary["serial"]) == (1, 0, 1)
+            assert client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json() == []
+            assert client.get("/healthz").json()["ok"] is True
+            metrics = client.get("/metrics").text
+            assert 'servotwin_messages_total{kind="window",put="new"} 1' in metrics
+            assert 'servotwin_outcomes_total{result="committed"} 1' in metrics
+            assert 'servotwin_waiting{kind="messages"} 0\n' in metrics
+            assert "servotwin_waiting_seconds 0\n" in metrics
+            client.post("/v1/servos/ax-1/letters", content=hello(boot="next"), headers=bearer())
+            [greeting] = until(lambda: client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json())
+            assert (greeting["kind"], greeting["status"], greeting["body"]["boot"]) == ("hello", "next", "next")
+            assert client.get("/openapi.json").json()["paths"]["/v1/servos/{servo}/windows/{boot}/{sequence}"]["put"]
+        workers = children(running.pid)
+        assert len(workers) == 1
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(PATIENCE) == 0
+        until(lambda: not any(map(alive, workers)))
+    log = (tmp_path / "log").read_text()
+    told = [json.loads(line) for line in log.splitlines()]
+    [estimate] = [line for line in told if line["message"] == "estimate"]
+    assert (estimate["servo"], estimate["window"], estimate["version"]) == ("ax-1", "b/0", 0)
+    assert estimate["message_id"] == links[0]["window"]["id"]
+    assert "Traceback" not in log
+    for token in (TOKEN, OPERATOR):
+        assert token not in log
+
+
+def test_a_poll_that_waits_does_not_hold_up_the_end(tmp_path):
+    with process(twin_file(tmp_path)) as (running, url):
+        answers = []
+
+        def poll():
+            answers.append(httpx.get(f"{url}/v1/servos/ax-1/outgoing?wait=30", headers=bearer(), timeout=PATIENCE))
+
+        thread = threading.Thread(target=poll)
+        thread.start()
+        until(lambda: "servotwin_polls 1" in httpx.get(f"{url}/metrics").text)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(PATIENCE) == 0
+        thread.join(PATIENCE)
+        assert unpacked(answers[0].content) == []
+
+
+def test_killed_in_midstream_every_acknowledged_window_is_stored_once(tmp_path):
+    path, sequence, acknowledged = twin_file(tmp_path, "rate_burst = 1e6"), 0, []
+    for _ in range(3):
+        with process(path) as (running, url):
+            killer = threading.Timer(0.7, running.kill)
+            killer.start()
+            try:
+                with httpx.Client(base_url=url, timeout=PATIENCE) as client:
+                    while True:
+                        assert send(client, sequence).status_code in (200, 201)
+                        acknowledged.append(sequence)
+                        sequence += 1
+            except httpx.TransportError:
+                running.wait(PATIENCE)
+            killer.join()
+    store = open_store(f"sqlite:///{tmp_path / 'twin.db'}")
+    kept = [held.sequence for held in store.windows("ax-1", limit=100_000)]
+    store.close()
+    assert len(acknowledged) > 30
+    assert len(kept) == len(set(kept))
+    assert set(acknowledged) <= set(kept) <= {*acknowledged, sequence}
+
+
+def test_workers_end_with_a_service_that_is_killed_and_its_work_is_taken_up_again(tmp_path):
+    path = twin_file(tmp_path)
+    with process(path) as (running, url):
+        workers = children(running.pid)
+        with httpx.Client(base_url=url, timeout=PATIENCE) as client:
+            for sequence in range(20):
+                assert send(client, sequence).status_code == 201
+        running.kill()
+        running.wait(PATIENCE)
+        until(lambda: not any(map(alive, workers)))
+    with process(path) as (_running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
+        until(lambda: client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"] == 0)
+        links = client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR)).json()
+    assert [len([f for f in link["found"] if f["kind"] == "estimate"]) for link in links] == [1] * 20
+
+
+def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(tmp_path):
+    with process(twin_file(tmp_path)) as (running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
+        for sequence in range(10):
+            if sequence in (2, 6):
+                [worker] = children(running.pid)
+                os.kill(worker, signal.SIGKILL)
+                until(lambda gone=worker: [pid for pid in children(running.pid) if pid != gone])
+            assert send(client, sequence).status_code == 201
+        until(lambda: client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"] == 0)
+        assert client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["windows"] == 10
+        assert "servotwin_workers_lost_total" in client.get("/metrics").text
+
+
+def test_tls_with_a_self_made_certificate(tmp_path):
+    certificate, _ = self_made(tmp_path)
+    service = 'tls_certificate = "twin.crt"\ntls_key = "twin.key"'
+    with process(twin_file(tmp_path, service)) as (_running, url):
+        assert url.startswith("https://127.0.0.1:")
+        with httpx.Client(base_url=url, verify=trusting(certificate), timeout=PATIENCE) as client:
+            assert send(client, 0).status_code == 201
+        with (
+            pytest.raises(httpx.ConnectError),
+            httpx.Client(base_url=url, verify=ssl.create_default_context()) as client,
+        ):
+            client.get("/healthz")
+
+
+@pytest.mark.parametrize(
+    ("service", "tokens", "said"),
+    [
+        ('bind = "0.0.0.0"', False, "only with tokens"),
+        ('bind = "0.0.0.0"', True, "behind_proxy"),
+        ('bind = "elsewhere"', True, "IP address"),
+        ('store = "postgresql://me:secret@host/twin"', True, "store_password_file"),
+        ('tls_key = "no.key"', True, "no.key"),
+        ("prot = 3", True, "did you mean 'port'"),
+        ("queue = 0", True, "at least 1"),
+    ],
+)
+def test_a_file_that_is_not_allowed_is_one_sentence_and_2(tmp_path, service, tokens, said):
+    path = twin_file(tmp_path, service, tokens)
+    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert found.returncode == 2
+    assert found.stdout == ""
+    assert said in found.stderr
+    assert "secret" not in found.stderr
+    assert found.stderr.count("\n") == 1
+    assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
+
+
+def test_tokens_that_others_may_read_are_refused(tmp_path):
+    path = twin_file(tmp_path)
+    (tmp_path / "tokens.toml").chmod(0o644)
+    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert found.returncode == 2
+    assert "chmod 600" in found.stderr
+
+
+def test_bytes_that_are_no_request_do_no_harm(tmp_path):
+    with process(twin_file(tmp_path)) as (_running, url):
+        address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
+        endless = b"GET /healthz HTTP/1.1\r\n" + b"x: " + b"y" * 200_000
+        for rubbish in (
+            b"\x00" * 1000,
+            b"PUT " + b"/" * 100_000,
+            endless,
+            b"GET /\xff HTTP/1.1\r\n\r\n",
+            b"\r\n" * 50_000,
+        ):
+            with socket.create_connection(address, timeout=10.0) as line:
+                line.settimeout(10.0)
+                try:
+                    line.sendall(rubbish)
+                    line.shutdown(socket.SHUT_WR)
+                    while line.recv(65536):
+                        pass
+                except TimeoutError:
+                    raise
+                except OSError:
+                    pass  # the twin hung up
+        assert httpx.get(f"{url}/healthz").json()["ok"] is True
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        b"GET /healthz HTTP/1.1\r\nX: ",
+        b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer token-of-ax-1\r\n"
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: ",
+    ],
+    ids=["header", "trailer"],
+)
+def test_one_endless_header_is_cut_before_it_fills_the_memory(tmp_path, begun):
+    with process(twin_file(tmp_path)) as (_running, url):
+        address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
+        with socket.create_connection(address, timeout=10.0) as line:
+            line.sendall(begun)
+            with pytest.raises(ConnectionError):
+                line.sendall(b"y" * 64 * 1024 * 1024)
+        assert httpx.get(f"{url}/healthz").json()["ok"] is True
+
+
+def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_path):
+    path = twin_file(tmp_path)
+    with process(path) as (running, url):
+        second = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
+        found = subprocess.run(second, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        assert found.returncode == 2
+        assert "another twin works on it" in found.stderr
+        assert httpx.get(f"{url}/healthz").json()["ok"] is True
+        running.kill()
+        running.wait(timeout=PATIENCE)
+        with process(path) as (_next, again):
+            assert httpx.get(f"{again}/healthz").json()["ok"] is True
+
+
+def test_a_service_that_cannot_begin_does_not_end_well(tmp_path, monkeypatch):
+    twin = read_twin(twin_file(tmp_path))
+    pool = Pool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
+    monkeypatch.setattr(service, "System", lambda twin, store: System(twin, store, pool=pool))
+    with (
+        closing(open_store(twin.service.store)) as store,
+        service.listening(twin.service) as listener,
+        pytest.raises(SystemExit) as ended,
+    ):
+        service.serve(twin, store, listener)
+    assert ended.value.code not in (None, 0)

@@ -1,0 +1,61 @@
+"""What is secret stays where it belongs: in the service, and with whom it was meant for."""
+
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import pytest
+
+from servotwin.cli.audit import Source, audit
+from servotwin.errors import InvalidInput
+from servotwin.link.seal import verifier_of
+from servotwin.twin_service import auth, mqtt_config, pool
+from servotwin.twin_service.auth import TokenFile
+from servotwin.twin_service.config import PASSWORD
+from servotwin.twin_service.secret_file import write_private
+from servotwin.twin_service.tokens import Verifiers, read_tokens, write_tokens
+
+
+def test_workers_do_not_see_what_the_service_keeps_to_itself(monkeypatch):
+    for name in (PASSWORD, mqtt_config.PASSWORD):
+        monkeypatch.setenv(name, "hunter2")
+    assert "hunter2" not in pool._environment().values()
+
+
+def test_tokens_written_while_they_are_read_count_too(tmp_path, monkeypatch):
+    path = tmp_path / "tokens.toml"
+    write_tokens(path, Verifiers({"ax-1": verifier_of("old")}))
+
+    def reading(path):
+        found = read_tokens(path)
+        write_tokens(path, Verifiers({"ax-1": verifier_of("new")}))
+        return found
+
+    monkeypatch.setattr(auth, "read_tokens", reading)
+    file = TokenFile(path)
+    monkeypatch.undo()
+    assert file.refresh()
+    file.authority.admit_servo("ax-1", b"new")
+
+
+def test_an_operator_s_token_follows_no_redirection(tmp_path):
+    class Elsewhere(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append((self.path, self.headers["authorization"]))
+            self.send_response(307)
+            self.send_header("location", "/elsewhere")
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    asked = []
+    write_private(tmp_path / "token", "hunter2")
+    with HTTPServer(("127.0.0.1", 0), Elsewhere) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        source = Source(tmp_path, f"http://127.0.0.1:{server.server_port}", tmp_path / "token")
+        with pytest.raises(InvalidInput, match="307"):
+            audit("ax-1", source, 1, changes=False, json=True)
+        server.shutdown()
+        thread.join()
+    assert asked == [("/v1/servos/ax-1/audit?limit=1", "Bearer hunter2")]

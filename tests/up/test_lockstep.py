@@ -1,0 +1,130 @@
+"""Deployed processes in lock-step do what the co-simulation does, to the last bit."""
+
+import sqlite3
+from pathlib import Path
+
+import msgspec
+import pytest
+from machines import machine
+from services import service
+
+from servotwin.cosim import Loop, cosimulate
+from servotwin.cosim.scenario import Scenario
+from servotwin.drives.simulated.client import SimulatedSupervised
+from servotwin.errors import InvalidInput
+from servotwin.messages import Update, decode, encode
+from servotwin.twin.evidence import plain
+from servotwin.up.lock_step import HttpTwin, LockStep, lock_step
+
+SCENARIO = """
+servo = "paper"
+name = "axis"
+duration_s = {duration}
+seed = 7
+[reference]
+kind = "square"
+amplitude_mm = 1.0
+period_s = {period}
+[gap]
+from_deg = 0.0
+to_deg = 8.0
+over_s = {duration}
+[disturbances]
+input_bias_v = 0.02
+[recording]
+sample_rate_hz = 5000.0
+fine_angle = {fine}
+[controller]
+sample_rate_hz = 5000.0
+[link]
+delay_s = 0.3
+jitter_s = 0.5
+loss = 0.15
+duplicate = 0.15
+reorder = 0.2
+hold_s = 2.0
+[twin]
+{twin}
+"""
+TWIN = """
+[service]
+store = "sqlite:///twin.db"
+lockstep = true
+workers = 1
+[models.paper]
+servo = "paper"
+[models.paper.controller]
+sample_rate_hz = 5000.0
+[models.paper.twin]
+{twin}
+[servos]
+axis = "paper"
+"""
+
+
+def deployed(folder: Path, scenario: Scenario, twin: str) -> LockStep:
+    """The scenario on a machine and a twin in processes of their own."""
+    (folder / "machine.toml").write_text(
+        'scenario = "scenario.toml"\nrole = "supervise"\nlisten = "127.0.0.1:0"\nspeed = 0.0\nendless = false\n'
+    )
+    (folder / "twin.toml").write_text(TWIN.format(twin=twin))
+    with machine(folder / "machine.toml") as (address, _), service(folder / "twin.toml") as url:
+        drive, remote = SimulatedSupervised(address), HttpTwin(url, "axis")
+        try:
+            drive.connect()
+            return lock_step(scenario, remote, drive)
+        finally:
+            remote.close()
+            drive.close()
+
+
+def stored(folder: Path, kind: str) -> dict[tuple[str, int], bytes]:
+    """Evidence of a kind by window."""
+    database = sqlite3.connect(folder / "twin.db")
+    try:
+        rows = database.execute(
+            "select boot, sequence, body from evidence join messages on messages.id = message where evidence.kind = ?",
+            (kind,),
+        ).fetchall()
+    finally:
+        database.close()
+    assert len({row[:2] for row in rows}) == len(rows)
+    return {(boot, sequence): body for boot, sequence, body in rows}
+
+
+def in_memory(loop: Loop) -> dict[tuple[str, int], bytes]:
+    """The co-simulation's estimates by window, as they would be stored."""
+    return {
+        (window.boot, window.sequence): plain(estimate)
+        for window, estimate in zip(loop.windows, loop.estimates, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("twin", "duration", "period", "fine", "updates"),
+    [('policy = "paper"', 40.0, 4.0, "false", 3), ('policy = "certified"', 24.0, 8.0, "true", 1)],
+)
+def test_deployed_is_simulated(
+    tmp_path: Path, twin: str, duration: float, period: float, fine: str, updates: int
+) -> None:
+    """Same scenario: the same windows, estimates, updates and receipts, bit for bit, over a link that loses, repeats
+    and reorders."""
+    text = SCENARIO.format(twin=twin, duration=duration, period=period, fine=fine)
+    (tmp_path / "scenario.toml").write_text(text)
+    scenario = Scenario.load(tmp_path / "scenario.toml")
+    loop, found = cosimulate(scenario), deployed(tmp_path, scenario, twin)
+    sent = {encode(message.message) for message in loop.messages if message.direction == "up"}
+    assert {encode(window) for window in found.windows} <= sent
+    assert [encode(each) for each in found.receipts] == [encode(each) for each in loop.receipts]
+    assert len(loop.updates) >= updates
+    assert dict.fromkeys(encode(each) for each in found.sent if isinstance(each, Update)) == dict.fromkeys(
+        encode(decode(encode(update))) for update in loop.updates
+    )
+    estimates = {key: msgspec.msgpack.decode(body)["estimate"] for key, body in stored(tmp_path, "estimate").items()}
+    assert estimates == {key: msgspec.msgpack.decode(body) for key, body in in_memory(loop).items()}
+    assert len(estimates) == len(loop.windows) > 5
+
+
+def test_a_url_is_one() -> None:
+    with pytest.raises(InvalidInput, match="must be http://HOST:PORT"):
+        HttpTwin("127.0.0.1:80", "axis")

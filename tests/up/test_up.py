@@ -1,0 +1,177 @@
+"""`servotwin up` with real processes: it runs, ends, resumes, and leaves nothing behind, however it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from servotwin.drives.simulated.diary import read_state
+from servotwin.edge_process.config_file import load
+from servotwin.errors import InvalidInput
+from servotwin.store.store import open_store
+from servotwin.up import folder
+from servotwin.up.plan import SERVOS
+
+RUNNING = "x real time"
+PATIENCE_S = 120.0
+
+
+@contextmanager
+def started(path: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """`servotwin up` in a group of its own; whatever is left of it in the end is killed."""
+    command = [sys.executable, "-m", "servotwin", "up", "--folder", str(path), *options]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        process.stdout.close()
+        for pid in left_behind(path):
+            os.kill(pid, signal.SIGKILL)
+
+
+def told(process: subprocess.Popen[str], what: str) -> list[str]:
+    """The lines up to the one that says it."""
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if what in line:
+            return lines
+    raise AssertionError("".join(lines))
+
+
+def left_behind(path: Path) -> list[int]:
+    """Processes that work in a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            command = (entry / "cmdline").read_bytes() if entry.name.isdecimal() else b""
+        except OSError:
+            continue
+        if b"servotwin.up.attended" in command and os.fsencode(path) in command:
+            found.append(int(entry.name))
+    return found
+
+
+def eventually(holds: Callable[[], bool]) -> bool:
+    end = time.monotonic() + PATIENCE_S
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.05)
+    return holds()
+
+
+def times(path: Path) -> list[float]:
+    """Machine time of each servo, s."""
+    states = [read_state(path / servo.name / "state.json") for servo in SERVOS]
+    return [0.0 if state is None else state.time_s for state in states]
+
+
+def stored(path: Path) -> dict[str, set[str]]:
+    """The boots of which the twin has windows, by servo."""
+    store = open_store(f"sqlite:///{path / 'twin.db'}")
+    try:
+        return {servo.name: {link.window.boot for link in store.audit(servo.name, None, 1000)} for servo in SERVOS}
+    finally:
+        store.close()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
+def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path: Path) -> None:
+    path = tmp_path / "up"
+    with started(path, "--for", "5", "--speed", "10") as first:
+        lines = told(first, "all has ended")
+        assert first.wait(PATIENCE_S) == 0
+    assert "made: " in lines[0]
+    assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == len(SERVOS)
+    assert not left_behind(path)
+    before = times(path)
+    assert min(before) > 5.0
+    secrets = [path / "tokens.toml", path / "operator.token", *(path / servo.name / "token" for servo in SERVOS)]
+    assert {file.stat().st_mode & 0o777 for file in secrets} == {0o600}
+
+    with started(path, "--speed", "10") as second:
+        lines = told(second, RUNNING)
+        assert sum(line.startswith("going on with") for line in lines) == len(SERVOS)
+        refused = subprocess.run(
+            [sys.executable, "-m", "servotwin", "up", "--folder", str(path)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert refused.returncode == 2
+        assert f"in use by another servotwin up (process {second.pid})" in refused.stderr
+        second.kill()
+        second.wait()
+        with started(path, "--speed", "10") as third:
+            told(third, RUNNING)
+            third.send_signal(signal.SIGINT)
+            assert "all has ended" in told(third, "all has ended")[-1]
+            assert third.wait(PATIENCE_S) == 0
+    assert eventually(lambda: not left_behind(path))
+    assert all(after > former + 5.0 for former, after in zip(before, times(path), strict=True))
+    for servo, boots in stored(path).items():
+        assert {boot.partition("-")[0] for boot in boots} >= {"b1"}, servo
+        assert len(boots) > 1, servo
+    assert not list(path.glob("*/drive.sock"))
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(InvalidInput, match="was not made by servotwin up"), folder.opened(tmp_path):
+        pass
+    assert [each.name for each in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_path_too_long_for_sockets_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 100)
+    with pytest.raises(InvalidInput, match="too long for the sockets"), folder.opened(path):
+        pass
+    assert not path.exists()
+
+
+def test_what_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInput, match="file"), folder.opened(tmp_path / "file" / "up"):
+        pass
+
+
+def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "up"
+    with folder.opened(path) as made:
+        assert made.new
+        assert made.machine(SERVOS[0]) is None
+        with pytest.raises(InvalidInput, match=f"another servotwin up .process {os.getpid()}"), folder.opened(path):
+            pass
+        made.connect(SERVOS[0], "http://127.0.0.1:4321")
+        assert 'url = "http://127.0.0.1:4321"' in (path / SERVOS[0].name / "edge.toml").read_text()
+    assert [each.name for each in tmp_path.iterdir()] == ["up"]
+    bands = {servo.name: load(path / servo.name / "edge.toml").agent.supervision.fallback for servo in SERVOS}
+    errors = {name: None if fallback is None else fallback.band.error for name, fallback in bands.items()}
+    assert errors["noisy"] == pytest.approx(errors["quick"] + 0.05e-3)  # the edge puts up with its encoder's noise
+    with folder.opened(path) as again:
+        assert not again.new
+    (path / SERVOS[1].name / "token").unlink()
+    with pytest.raises(InvalidInput, match=f"{SERVOS[1].name}/token is missing"), folder.opened(path):
+        pass
+
+
+@pytest.mark.parametrize("options", [("--speed", "0"), ("--speed", "101"), ("--for", "-1")])
+def test_a_speed_or_time_that_is_none_is_refused(tmp_path: Path, options: tuple[str, str]) -> None:
+    command = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert options[0] in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "up").exists()

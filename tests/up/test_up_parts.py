@@ -1,0 +1,267 @@
+"""The parts of `servotwin up`: how fast, how much of the processor, which outages, and what is shown of it."""
+
+import socket
+from dataclasses import replace
+from math import isnan, pi, radians
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+from rich.console import Console
+
+from servotwin.drives.simulated.diary import MachineState, read_speed, read_state, write_speed, write_state
+from servotwin.drives.simulated.pace import Pace
+from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.errors import InvalidInput
+from servotwin.plant.signals import PiecewiseCubic, SCurve
+from servotwin.up import display, pacing, usage
+from servotwin.up.outages import Forwarder, Outages
+from servotwin.up.paced import Mark, Paced
+from servotwin.up.pacing import FASTEST, LIMIT, SLOWEST, Seen, next_speed
+from servotwin.up.plan import SERVOS, machine_toml
+from servotwin.up.reading import Judged, View
+from servotwin.up.twin_watch import Estimated, Twin, counted, newest_estimate
+
+SPEEDS = some.floats(SLOWEST, FASTEST)
+
+
+@given(SPEEDS, some.floats(LIMIT, 2.0, exclude_min=True), some.floats(0.0, 100.0), some.integers(0, 1000))
+def test_more_than_the_limit_is_slowed_down_but_not_below_the_slowest(
+    speed: float, share: float, reached: float, waiting: int
+) -> None:
+    chosen = next_speed(speed, Seen(share, reached, waiting))
+    assert SLOWEST <= chosen <= max(SLOWEST, 0.9 * speed)
+
+
+@given(some.floats(SLOWEST, 90.0), some.floats(1e-3, 1.0))
+def test_a_share_in_proportion_to_speed_settles_below_the_limit(speed: float, share_of_one: float) -> None:
+    for _ in range(60):
+        speed = next_speed(speed, Seen(share_of_one * speed, speed, 0))
+    assert share_of_one * speed <= LIMIT or speed == SLOWEST
+    assert share_of_one * speed >= 0.85 * pacing.WANTED or speed == FASTEST
+
+
+def test_a_machine_that_is_late_or_a_twin_that_is_behind_is_not_driven_faster() -> None:
+    assert next_speed(20.0, Seen(0.2, 10.0, 0)) == 10.0
+    assert next_speed(20.0, Seen(0.2, 20.0, 50)) == 16.0
+    assert next_speed(20.0, Seen(None, 20.0, 0)) == 20.0
+    assert next_speed(20.0, Seen(0.5, 20.0, 0)) == 20.0
+
+
+def test_a_machine_with_one_core_is_measured_by_that_one() -> None:
+    assert pacing.share_of(0.5, 1) == 0.5
+    assert pacing.share_of(0.5, 64) == 0.25
+    assert pacing.share_of(None, 2) is None
+
+
+def process(root: Path, pid: int, group: int, ticks: int, name: str = "python") -> None:
+    (root / str(pid)).mkdir(exist_ok=True)
+    (root / str(pid) / "stat").write_text(f"{pid} ({name}) S 1 {group} 1 0 -1 0 0 0 0 0 {ticks} {ticks} 0 0 20 0\n")
+
+
+def test_processor_time_of_groups_whatever_the_programs_are_called(tmp_path: Path) -> None:
+    process(tmp_path, 10, 10, 300, "a) S 1 99 (b")
+    process(tmp_path, 11, 10, 200)
+    process(tmp_path, 12, 99, 500)
+    process(tmp_path, 13, 98, 500)
+    (tmp_path / "14").mkdir()
+    found = usage.times({10}, {13}, tmp_path)
+    assert found is not None
+    assert set(found) == {10, 11, 13}
+    assert found[10] / found[11] == pytest.approx(1.5)
+    assert usage.times({10}, set(), tmp_path / "nowhere") is None
+
+
+def test_cores_in_use_are_those_since_the_last_look() -> None:
+    use = usage.Usage()
+    assert use.look({1: 5.0}, 100.0) is None
+    assert use.look({1: 6.0, 2: 0.5}, 102.0) == pytest.approx(0.75)
+    assert use.look({2: 1.5}, 104.0) == pytest.approx(0.5)
+    assert use.look(None, 106.0) is None
+
+
+def test_speed_is_that_of_the_slowest_machine() -> None:
+    pace = Paced()
+    pace.look({1: 0.0}, {"a": Mark(0.0, 0.0), "b": Mark(7.0, 0.5)}, 0.0)
+    assert not pace.settled
+    pace.look({1: 1.0}, {"a": Mark(20.0, 2.0), "b": Mark(37.0, 2.5)}, 2.0)
+    pace.look({1: 2.0}, {"a": Mark(50.0, 4.0), "b": Mark(77.0, 4.5)}, 4.0)
+    assert pace.settled
+    assert pace.reached == 15.0
+    assert pace.mean_speed == 12.5
+    assert pace.cores == pytest.approx(0.5)
+
+
+@given(some.floats(0.0, 1e4))
+def test_outages_come_again_and_end(time: float) -> None:
+    plan = Outages(6.0, 8.0, 40.0)
+    left = plan.left(time)
+    assert 0.0 <= left <= plan.lasting
+    assert plan.left(time + left + 1e-6) == pytest.approx(0.0, abs=1e-5)
+    assert (left == 0.0) == (time < 6.0 or (time - 6.0) % 40.0 >= 8.0)
+
+
+@pytest.mark.parametrize(("outages", "answer"), [(Outages(1e9, 1.0, 1e9), b"pong"), (Outages(0.0, 1e9, 2e9), b"")])
+def test_a_link_passes_on_what_comes_but_in_outages(outages: Outages, answer: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as target:
+        forwarder = Forwarder(target.getsockname()[1], outages)
+        forwarder.begin()
+        try:
+            with socket.create_connection(("127.0.0.1", forwarder.port), 10.0) as line:
+                line.settimeout(10.0)
+                if answer:
+                    onward, _ = target.accept()
+                    with onward:
+                        line.sendall(b"ping")
+                        assert onward.recv(16) == b"ping"
+                        onward.sendall(answer)
+                        assert line.recv(16) == answer
+                else:
+                    with pytest.raises(ConnectionError):
+                        _receive_nothing(line)
+        finally:
+            forwarder.end()
+
+
+def _receive_nothing(line: socket.socket) -> None:
+    if line.recv(16) == b"":
+        raise ConnectionResetError
+
+
+def machine(tmp_path: Path) -> MachineSettings:
+    path = tmp_path / "machine.toml"
+    path.write_text(machine_toml(SERVOS[0]))
+    return MachineSettings.load(path)
+
+
+def test_a_machine_goes_on_wearing_from_where_it_was(tmp_path: Path) -> None:
+    new = machine(tmp_path)
+    later = 2345.678
+    write_state(tmp_path / "state.json", MachineState(time_s=later, gap_deg=1.0, speed=5.0, begun_s=0.0, written=0.0))
+    write_speed(tmp_path / "speed", 12.5)
+    on = machine(tmp_path)
+    assert (on.begin, on.speed) == (later, 12.5)
+    for seconds in (0.0, 100.0, 5000.0, 20_000.0):
+        sample = round(seconds * on.rate)
+        assert on.gap_at(sample) == new.gap_when(later + seconds)
+        present = on.present.gap
+        assert isinstance(present, PiecewiseCubic)
+        assert float(present.value(seconds)) == pytest.approx(on.gap_at(sample), rel=1e-12)
+    assert on.present.seed != new.present.seed
+
+
+@given(some.floats(0.0, 50.0), some.floats(0.0, 50.0))
+def test_a_signal_from_a_time_on_is_the_same_later(begin: float, time: float) -> None:
+    pieces = SCurve(0.1, 0.7, 30.0, begin=5.0).pieces(100.0)
+    assert float(pieces.later(begin).value(time)) == pytest.approx(float(pieces.value(begin + time)), rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"schema": "other"}', "\xff", '{"time_s": -1}'])
+def test_a_state_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "state.json").write_text(text, encoding="latin-1")
+    with pytest.raises(InvalidInput, match=r"state\.json: is no state of a machine"):
+        read_state(tmp_path / "state.json")
+
+
+@pytest.mark.parametrize("text", ["", "fast", "0", "-3", "nan", "inf", "1e9", "5 6"])
+def test_a_speed_that_is_none_changes_nothing(tmp_path: Path, text: str) -> None:
+    (tmp_path / "speed").write_text(text)
+    assert read_speed(tmp_path / "speed") is None
+
+
+@given(some.floats(0.1, 100.0), some.floats(0.1, 100.0), some.floats(0.0, 50.0))
+def test_another_speed_neither_repeats_nor_skips_samples(first: float, second: float, change: float) -> None:
+    pace = Pace(1000.0, first, 0.25, 0.0)
+    before = pace.reached(change)
+    pace.change(second, change)
+    assert abs(pace.reached(change) - before) <= 1
+    assert pace.reached(change + 1.0) - before == pytest.approx(1000.0 * second, abs=2.0)
+
+
+def link(boot: str, status: str, gap: float) -> dict[str, Any]:
+    """One of the evidence chain, as the twin tells it."""
+    estimate = {"gap": gap, "interval": [gap - 0.01, gap + 0.01], "time": 42.0}
+    trend = {"mean": [gap, 1e-5, 0.0], "covariance": [0.0, 0.0, 0.0, 0.0, 1e-12, 0.0, 0.0, 0.0, 0.0]}
+    found = [
+        {"kind": "estimate", "status": status, "body": {"estimate": estimate}},
+        {"kind": "trend", "status": "", "body": trend},
+    ]
+    return {"window": {"boot": boot}, "found": found}
+
+
+def test_the_newest_good_estimate_and_the_newest_verdict() -> None:
+    glanced = {"window": {"boot": "b2"}, "found": [{"kind": "glance", "status": "", "body": {}}]}
+    none = {"kind": "estimate", "status": "failed: no", "body": {"failed": "no"}}
+    failed = {"window": {"boot": "b2"}, "found": [none]}
+    links = [glanced, failed, link("b2", "lower bound", 9.0), link("b1", "ok", 0.2), link("b1", "ok", 0.1)]
+    found = newest_estimate(links)
+    assert found == Estimated(
+        "b1", 42.0, 0.2, (0.19, 0.21000000000000002), "failed: no", 1e-5, pytest.approx(1.96e-6, rel=1e-3)
+    )
+    assert newest_estimate([glanced, failed]) is None
+
+
+def test_metrics_are_read_by_name() -> None:
+    text = (
+        "# HELP servotwin_refused_total x\n"
+        'servotwin_messages_total{kind="window",put="new"} 12\nservotwin_messages_total{kind="window",put="known"} 3\n'
+        'servotwin_refused_total{code="future"} 2\nservotwin_refused_total{code="rate"} 3\n'
+    )
+    assert counted(text) == {"windows": 12, "estimates": 0, "updates": 0, "workers lost": 0, "refused": 5}
+
+
+def picture(view: View, twin: Twin | None) -> display.Picture:
+    return display.Picture((view,) * 3, twin, 75.0, 12.0, 11.9, 1.1, 0.55, "http://127.0.0.1:1", "up", "news [x]")
+
+
+def text_of(shown: display.Picture, width: int = 80) -> str:
+    console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console.print(display.rendered(shown))
+    console.file.close()
+    return console.export_text()
+
+
+def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
+    shown = picture(View(SERVOS[0], None, {}, None, 0, 0.0, 0), None)
+    text = text_of(shown)
+    assert "true gap, deg" in text
+    assert "no answer" in text
+    assert "news [x]" in text
+    assert display.line(shown)
+
+
+def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_terminal() -> None:
+    state = MachineState(time_s=3723.0, gap_deg=9.131, speed=12.0, begun_s=0.0, written=0.0)
+    told = Estimated("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
+    edge = {
+        "version": 7, "fallback": True, "tolerance_m": 3.16e-5, "kp_v_per_m": 1377.7, "ki_v_per_m_s": 18907.6,
+        "kd_v_s_per_m": -135.1, "feedforward_v": -0.05, "up": {"windows": 41, "trouble": ""}, "down": {"trouble": ""},
+        "windows": {"waiting": 3, "dropped": {"withheld": 2, "outbox full": 1}},
+    }  # fmt: skip
+    view = View(SERVOS[2], state, edge, Judged(told, 9.0003, 58.0), 47, 4.2, 2)
+    shown = picture(view, Twin(5, 0.1, {"windows": 121, "refused": 0}))
+    text = text_of(shown)
+    for expected in (
+        "1:02:03", "9.131", "9.000 ± 0.040", "-0.0003 58 s ago", "7 fallback set", "0.0316", "1.38 18.9 -0.14", "-50.0",
+        "outage, 4 s left", "11.9 x real time", "1.10 of 2 cores = 55 %", "121 windows", "5 in its queue",
+    ):  # fmt: skip
+        assert expected in text, expected
+    assert "…" not in text
+    assert len(text.splitlines()) <= 24
+    assert "link cut, 3 wait" in display.line(shown)
+    assert "47 cut, 41 acknowledged, 3 waiting, 3 dropped" in next(iter(display.summary(shown)))
+
+
+def test_a_truth_outside_of_the_interval_is_told_apart() -> None:
+    told = Estimated("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
+    assert isnan(told.rate)
+    assert Judged(told, 9.03, 1.0).inside
+    assert Judged(told, 9.05, 1.0).inside is False
+    assert Judged(told, None, None).inside is None
+
+
+def test_files_of_a_machine_belong_to_one_that_runs_on(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="run on"):
+        replace(machine(tmp_path), speed=0.0)
