@@ -11,7 +11,7 @@ from servotwin.reproduction import claims
 from servotwin.reproduction.claims import Verdict
 from servotwin.reproduction.runs import Runs
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+README = (Path(__file__).parents[2] / "README.md").read_text()
 ROWS = re.findall(r"^\|[^|]+\| `([\w-]+)` \| (\w+) \| (\w+) \| (\w+) \|", README, re.MULTILINE)
 WORDS = {Verdict.REPRODUCED: "yes", Verdict.NOT_AS_STATED: "no"}
 LISTED = {claim.id: claim for claim in claims.claims()}
