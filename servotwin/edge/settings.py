@@ -117,7 +117,7 @@ class AgentSettings:
         self._check_longest()
         self._check_novelty()
         fallback = self.supervision.fallback
-        if self.controller is None and fallback is not None and fallback.gains is not None:
+        if self.controller is None and fallback is not None and fallback.setting.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
 
     def _check_longest(self) -> None:

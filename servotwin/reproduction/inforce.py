@@ -32,7 +32,7 @@ class Change:
 def changes(loop: Loop) -> tuple[Change, ...]:
     """Every setting that was in force, in order; gains that an update leaves alone are those before it."""
     start = loop.scenario.start
-    found = [Change(0.0, Origin.START, start.tolerance, gains_of(loop.scenario.start_law))]
+    found = [Change(0.0, Origin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
     for time, origin, tolerance, gains in sorted(_later(loop), key=lambda change: change[0]):
         found.append(Change(time, origin, tolerance, gains or found[-1].gains))
     return tuple(found)
@@ -43,6 +43,6 @@ def _later(loop: Loop) -> Iterator[tuple[float, Origin, float, Gains | None]]:
     sent = {update.version: update for update in loop.updates}
     for receipt in loop.applied:
         update = sent[receipt.version]
-        yield receipt.sample / rate, Origin.UPDATE, update.tolerance, update.controller
+        yield receipt.sample / rate, Origin.UPDATE, update.setting.tolerance, update.setting.gains
     for fallback in loop.fallbacks:
-        yield fallback.sample / rate, Origin.FALLBACK, fallback.tolerance, fallback.controller
+        yield fallback.sample / rate, Origin.FALLBACK, fallback.setting.tolerance, fallback.setting.gains
