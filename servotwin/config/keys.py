@@ -24,8 +24,10 @@ import textwrap
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass
+from enum import StrEnum
 from functools import cache
 from numbers import Integral, Real
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar
 
@@ -170,6 +172,21 @@ def value(
     return Key((), allowed, help, choices=choices, in_file=False)
 
 
+class Form(StrEnum):
+    """What an attribute is in a file."""
+
+    NUMBER = "number"
+    INTEGER = "integer"
+    PAIR = "pair of numbers"
+    NUMBERS = "number or list of numbers"
+    BOOLEAN = "true or false"
+    TEXT = "text"
+    PATH = "path"
+    TABLE = "table"
+    TABLES = "array of tables"
+    OTHER = "value"
+
+
 @dataclass(frozen=True, slots=True)
 class Item:
     """One declared attribute: its name, its type without None, its default and its key."""
@@ -179,6 +196,7 @@ class Item:
     optional: bool
     default: Any
     key: Key
+    form: Form
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -201,26 +219,9 @@ class Item:
         return self.default is MISSING
 
     @property
-    def pair(self) -> bool:
-        """Two numbers."""
-        return self.type == tuple[float, float]
-
-    @property
-    def numbers(self) -> bool:
-        """A list of numbers, or one that stands for all."""
-        return self.type in (tuple[float, ...], float | tuple[float, ...])
-
-    @property
-    def inner(self) -> Maker | None:
-        """What reads an inner table of one kind."""
-        return self.type if dataclasses.is_dataclass(self.type) and isinstance(self.type, type) else None
-
-    @property
-    def listed(self) -> Maker | None:
-        """What reads each table of an array of tables."""
-        arguments = typing.get_args(self.type)
-        inner = len(arguments) == 2 and arguments[1] is ... and dataclasses.is_dataclass(arguments[0])
-        return arguments[0] if inner else None
+    def inner(self) -> Any:
+        """The class of one inner table, or of each of an array of tables."""
+        return typing.get_args(self.type)[0] if self.form is Form.TABLES else self.type
 
 
 def items_of(maker: Any) -> tuple[Item, ...]:
@@ -262,7 +263,7 @@ def check(described: Any) -> None:
         if (given is None and item.optional) or _fits(item, given):
             continue
         shown, words = item.name, allowed(item)
-        if item.numbers and isinstance(given, tuple) and given:
+        if item.form is Form.NUMBERS and isinstance(given, tuple) and given:
             index = next(i for i, each in enumerate(given) if not _number_fits(item, each))
             shown, given, words = f"{item.name}[{index}]", given[index], str(item.key.range)
         unit = f" {item.unit}" if item.unit else ""
@@ -273,12 +274,12 @@ def allowed(item: Item) -> str:
     """What an attribute may be, in words."""
     if item.key.choices is not None:
         return f"one of {', '.join(item.key.choices)}"
-    if item.type is bool:
+    if item.form is Form.BOOLEAN:
         return "True or False"
-    words = item.key.range.whole if item.type is int else str(item.key.range)
-    if item.pair:
+    words = item.key.range.whole if item.form is Form.INTEGER else str(item.key.range)
+    if item.form is Form.PAIR:
         return f"two numbers, each {words}"
-    return f"{words} or a tuple of such" if item.numbers else words
+    return f"{words} or a tuple of such" if item.form is Form.NUMBERS else words
 
 
 def documented(described: type) -> str:
@@ -343,22 +344,43 @@ def _item(name: str, hint: Any, default: Any) -> Item | None:
     rest = [kind for kind in kinds if kind is not NoneType]
     if optional:
         bare = rest[0] if len(rest) == 1 else typing.Union[tuple(rest)]  # noqa: UP007
-    return Item(name, bare, optional, default, declared)
+    return Item(name, bare, optional, default, declared, _form(bare))
+
+
+_FORMS: dict[Any, Form] = {
+    float: Form.NUMBER, int: Form.INTEGER, bool: Form.BOOLEAN, str: Form.TEXT, Path: Form.PATH,
+    tuple[float, float]: Form.PAIR, tuple[float, ...]: Form.NUMBERS, float | tuple[float, ...]: Form.NUMBERS,
+}  # fmt: skip
+
+
+def _form(bare: Any) -> Form:
+    if isinstance(bare, type) and dataclasses.is_dataclass(bare):
+        return Form.TABLE
+    arguments = typing.get_args(bare)
+    if len(arguments) == 2 and arguments[1] is ... and dataclasses.is_dataclass(arguments[0]):
+        return Form.TABLES
+    return _FORMS.get(bare, Form.OTHER)
 
 
 def _fits(item: Item, given: object) -> bool:
     """A value is of its type, a number in its range too."""
+    form = item.form
+    if form is Form.NUMBER or form is Form.INTEGER:
+        return _number_fits(item, given)
     if item.key.choices is not None:
         return isinstance(given, str) and given in item.key.choices
-    if item.type is bool:
+    if form is Form.BOOLEAN:
         return isinstance(given, bool)
-    if item.pair:
+    if form is Form.PAIR:
         return isinstance(given, tuple | list) and len(given) == 2 and all(_number_fits(item, each) for each in given)
-    if item.numbers and isinstance(given, tuple | list):
-        return len(given) > 0 and all(_number_fits(item, each) for each in given)
-    return (item.type not in (float, int) and not item.numbers) or _number_fits(item, given)
+    if form is Form.NUMBERS:
+        each_of = given if isinstance(given, tuple | list) else (given,)
+        return len(each_of) > 0 and all(_number_fits(item, each) for each in each_of)
+    return True
 
 
 def _number_fits(item: Item, given: object) -> bool:
-    kind = Integral if item.type is int else Real
+    if type(given) is float or type(given) is int:  # the others are slow to look up
+        return (item.form is not Form.INTEGER or type(given) is int) and item.key.range.accepts(given)
+    kind = Integral if item.form is Form.INTEGER else Real
     return isinstance(given, kind) and not isinstance(given, bool) and item.key.range.accepts(float(given))

@@ -40,14 +40,11 @@ class Range:
 
     def accepts(self, value: float) -> bool:
         """Whether a number lies in the range; NaN never does, an infinite one only where `infinite`."""
-        if not (math.isfinite(value) or (self.infinite and not math.isnan(value))):
+        if not (isinstance(value, int) or math.isfinite(value) or (self.infinite and not math.isnan(value))):
             return False
-        inside = self.minimum <= value <= self.maximum
-        return (
-            inside
-            and (value > self.above or self.above == -math.inf)
-            and (value < self.below or self.below == math.inf)
-        )
+        if (self.above > -math.inf and value <= self.above) or (self.below < math.inf and value >= self.below):
+            return False
+        return self.minimum <= value <= self.maximum
 
     def scaled(self, scale: Callable[[float], float]) -> Range:
         """The same range in another unit."""
@@ -58,12 +55,8 @@ class Range:
     @property
     def whole(self) -> str:
         """The words for integers."""
-        return (
-            str(self)
-            .replace("a number", "an integer")
-            .replace("a positive number", "a positive integer")
-            .removesuffix(", finite")
-        )
+        words = str(self).removesuffix(", finite")
+        return words.replace("a number", "an integer").replace("a positive number", "a positive integer")
 
     def __str__(self) -> str:
         words = ["a positive number" if self.above == 0.0 else "a number"]
@@ -156,7 +149,7 @@ class Table:
     def integer_in(self, key: str, allowed: Range) -> int:
         """The integer that is there, within a range."""
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not allowed.accepts(_as_float(value)):
+        if isinstance(value, bool) or not isinstance(value, int) or not allowed.accepts(value):
             raise self.invalid(key, allowed.whole)
         return value
 

@@ -9,7 +9,7 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from servotwin.config.keys import Item, Maker, items_of, unit_of
+from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
 from servotwin.config.table import Table, named
 
 Values = dict[str, Any]
@@ -64,7 +64,7 @@ def _read_items(table: Table, items: list[Item], folder: Path, base: Any, comple
         for item in here:
             _read_item(inner, item, folder, getattr(base, item.name, None), values)
             if complete and item.required and item.name not in values:
-                raise inner.missing(item.names[0], table=item.key.makers is not None or item.inner is not None)
+                raise inner.missing(item.names[0], table=item.key.makers is not None or item.form is Form.TABLE)
         if name:
             inner.done()
     return values
@@ -98,7 +98,6 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
 
 def _prefixed(table: Table, item: Item, start: Any) -> Any:
     """Settings whose keys begin with a prefix, in the same table."""
-    assert item.inner is not None
     prefix = item.key.prefix or ""
     table.known(*(prefix + name for each in items_of(item.inner) for name in each.names))
     given: Values = {}
@@ -115,36 +114,36 @@ def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> A
     declared = item.key
     if declared.makers is not None:
         return _of_kind(table.table(name), item, folder)
-    if item.inner is not None:
+    if item.form is Form.TABLE:
         start = base if isinstance(base, type(item.default)) else item.default
         return part(table, name, item.inner, folder, start if dataclasses.is_dataclass(start) else None)
-    if item.listed is not None:
-        return tuple(_whole(each, item.listed, folder) for each in table.tables(name))
+    if item.form is Form.TABLES:
+        return tuple(_whole(each, item.inner, folder) for each in table.tables(name))
     read_value = _plain(table, item, name, folder)
     return read_value if declared.parse is None else declared.parse(table, name, read_value)
 
 
 def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
     """A number, a text, a truth value, a path or a list."""
-    unit, kind = unit_of(name), item.type
-    if kind is bool:
+    unit, form = unit_of(name), item.form
+    if form is Form.BOOLEAN:
         return table.boolean(name)
-    if kind is str:
+    if form is Form.TEXT:
         return table.text(name, choices=item.key.choices)
-    if kind is Path:
+    if form is Form.PATH:
         return folder / table.text(name)
-    if kind is int and unit.exact:
+    if form is Form.INTEGER and unit.exact:
         return table.integer_in(name, item.key.range)
     limits = item.key.range.scaled(unit.from_si)
-    if item.pair or item.numbers:
+    if form in (Form.PAIR, Form.NUMBERS):
         found = table.numbers_in(name, limits)
-        if item.pair and (not isinstance(found, tuple) or len(found) != 2):
+        if form is Form.PAIR and (not isinstance(found, tuple) or len(found) != 2):
             raise table.invalid(name, "two numbers")
         converted = tuple(unit.to_si(each) for each in found) if isinstance(found, tuple) else unit.to_si(found)
         return (converted,) if item.type == tuple[float, ...] and not isinstance(converted, tuple) else converted
-    if kind in (float, int):
+    if form in (Form.NUMBER, Form.INTEGER):
         number = unit.to_si(table.number_in(name, limits))
-        return round(number) if kind is int else number
+        return round(number) if form is Form.INTEGER else number
     return table.values[name]
 
 
@@ -189,9 +188,9 @@ def values_of(described: Any, only: Collection[str] | None = None) -> Values:
 
 
 def _written(item: Item, given: Any) -> Any:
-    if item.inner is not None:
+    if item.form is Form.TABLE:
         return values_of(given)
-    if item.listed is not None:
+    if item.form is Form.TABLES:
         return [values_of(each) for each in given]
     unit = unit_of(item.exact_name)
     if unit.exact or isinstance(given, bool | str):
