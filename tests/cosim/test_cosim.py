@@ -11,13 +11,13 @@ from servotwin.cosim import Loop, cosimulate, quantisation
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.limits import Limits
 from servotwin.estimation.estimate import GapStatus
-from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.reproduction import measures
+from servotwin.runtime.retry import Retry
 from servotwin.simulation import Simulation, simulate
 from servotwin.twin.known import known_gap
 from servotwin.twin.settings import TwinSettings
