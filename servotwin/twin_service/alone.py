@@ -8,7 +8,7 @@ from pathlib import Path
 
 from servotwin.errors import InvalidInput
 from servotwin.runtime.locks import lock_beside, locked
-from servotwin.store.address import address_of, file_of
+from servotwin.store.engine import parse_address, sqlite_file
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def alone(store: str) -> Iterator[None]:
     InvalidInput
         Another process holds it, or the file beside it cannot be made.
     """
-    file = file_of(address_of(store))
+    file = sqlite_file(parse_address(store))
     if file is None:
         yield
         return

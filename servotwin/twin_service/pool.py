@@ -13,7 +13,7 @@ from functools import partial
 from servotwin.runtime.child_process import ChildProcess
 from servotwin.runtime.frames import receive_frame
 from servotwin.runtime.retry import Backoff, Retry
-from servotwin.store.rows import Claim
+from servotwin.store.records import Lease
 from servotwin.twin_service import config, mqtt_config
 from servotwin.twin_service.job import Done, Job, Start, done_of, framed
 
@@ -62,7 +62,7 @@ class Worker:
         self._send(framed(self._start))
         await self._frame(BEGIN_S)
 
-    async def work(self, claims: Sequence[Claim], now: float) -> AsyncIterator[Done]:
+    async def work(self, claims: Sequence[Lease], now: float) -> AsyncIterator[Done]:
         """What becomes of each claim, one after the other; raises WorkerLost."""
         self._send(framed(Job(tuple(claims), now)))
         for _ in claims:
