@@ -11,6 +11,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.messages.legacy import upgrade
+from servotwin.runtime.files import replace_file
 
 
 class ParameterStore(Protocol):
@@ -68,13 +69,8 @@ class FileParameterStore:
         self._path = Path(path)
 
     def save(self, parameters: Parameters) -> None:
-        """Write beside, flush to the disk, put in place."""
-        beside = self._path.with_name(self._path.name + ".new")
-        with beside.open("wb") as file:
-            file.write(msgspec.json.encode(StoredParameters.of(parameters)))
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self._path)
+        """Replace the file; return when the disk has it. Raises OSError."""
+        replace_file(self._path, msgspec.json.encode(StoredParameters.of(parameters)), durable=True)
 
     def load(self) -> Parameters | None:
         """The parameters in the file, in this version's form or the one before.

@@ -17,8 +17,8 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
 from servotwin.edge_process.config_writer import edge_toml
-from servotwin.link.session import Retry
 from servotwin.messages import Gains, Setting
+from servotwin.runtime.retry import Retry
 
 __all__ = ["edge_toml", "load", "read"]
 
