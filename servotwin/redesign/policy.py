@@ -28,15 +28,15 @@ class Redesign:
         Why the controller is left as it is; empty otherwise.
     certificate : Certificate, optional
         What the setting showed in simulation.
-    owed : Region, optional
-        What the setting is still to be proved for; None: nothing is. The certificate is of a wider one then.
+    unverified : Region, optional
+        Region for which the setting is still to be verified, as the certificate is of a wider one; None: none.
     """
 
     setting: Setting | None
     gap: float
     reason: str
     certificate: Certificate | None = None
-    owed: Region | None = None
+    unverified: Region | None = None
 
 
 class Policy(Protocol):

@@ -22,7 +22,7 @@ from servotwin.store.group_commit import CommitLimits, GroupCommit
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin_service import broker_desk
 from servotwin.twin_service.app import make_app, refusal
 from servotwin.twin_service.auth import Authority, TokenFile
@@ -232,7 +232,7 @@ def _told(task: asyncio.Task[None]) -> None:
         log.error("a task of the service ended", exc_info=error)
 
 
-def knowing(fleet: Fleet) -> Callable[[str], bool]:
+def knowing(fleet: ModelRegistry) -> Callable[[str], bool]:
     """Whether a fleet has a servo of that name; what is no name at all, however long, is not remembered."""
 
     @lru_cache(maxsize=REMEMBERED)

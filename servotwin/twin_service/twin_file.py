@@ -7,7 +7,7 @@ from pathlib import Path
 
 from servotwin.config.table import part, read_toml
 from servotwin.errors import InvalidInput
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin_service.config import ServiceConfig, service
 from servotwin.twin_service.job import Start
 
@@ -20,14 +20,14 @@ class TwinFile:
     ----------
     path : Path
     service : ServiceConfig
-    fleet : Fleet
+    fleet : ModelRegistry
     text : str
         Of the file: workers read it once more.
     """
 
     path: Path
     service: ServiceConfig
-    fleet: Fleet
+    fleet: ModelRegistry
     text: str
 
     @property
@@ -47,7 +47,7 @@ def read_twin(path: Path) -> TwinFile:
     table = read_toml(path)
     text, folder = path.read_text(encoding="utf-8"), path.parent
     config = part(table, "service", lambda inner: service(inner, folder))
-    fleet = Fleet.read(table, folder)
+    fleet = ModelRegistry.read(table, folder)
     table.done()
     return TwinFile(path, config, fleet, text)
 

@@ -48,12 +48,12 @@ def attempt(work: Work, claim: Lease, now: float) -> Done:
 
 
 def _work_of(start: bytes) -> Work:
-    from servotwin.twin.fleet import Fleet
+    from servotwin.twin.models import ModelRegistry
     from servotwin.twin.work import work
 
     given = start_of(start)
-    fleet = Fleet.loads(given.text, given.source, Path(given.folder))
-    return lambda claim, now: work(fleet, claim, now)
+    registry = ModelRegistry.loads(given.text, given.source, Path(given.folder))
+    return lambda claim, now: work(registry, claim, now)
 
 
 if __name__ == "__main__":

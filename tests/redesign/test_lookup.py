@@ -34,7 +34,7 @@ from servotwin.redesign.certified.region import Region
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
-from servotwin.twin.policies import policy_of
+from servotwin.redesign.registry import policy_of
 from servotwin.twin.settings import TwinSettings
 
 DEG = math.pi / 180.0
@@ -215,17 +215,17 @@ def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
     exact, looked_up = POLICY.redesign(evidence()), TablePolicy(POLICY, table()).redesign(evidence())
     assert looked_up.setting is not None
     assert looked_up.setting.gains.feedforward == exact.setting.gains.feedforward == -0.05
-    assert exact.owed is None
-    assert looked_up.owed is not None
-    assert looked_up.owed.gap == exact.certificate.gap
-    assert isinstance(POLICY.confirm(looked_up.owed, looked_up.certificate.setting), Certificate)
+    assert exact.unverified is None
+    assert looked_up.unverified is not None
+    assert looked_up.unverified.gap == exact.certificate.gap
+    assert isinstance(POLICY.confirm(looked_up.unverified, looked_up.certificate.setting), Certificate)
 
 
 def test_what_is_not_covered_gets_the_fallback_set_and_owes_nothing() -> None:
     made = TablePolicy(POLICY, table()).redesign(replace(evidence(), disturbance=Disturbance(0, math.inf, 0.0, 0, 0)))
     assert "the fallback set is sent" in made.reason
     assert made.setting.gains == gains_of(table().fallback.setting.controller)
-    assert made.owed is None
+    assert made.unverified is None
 
 
 def test_what_is_in_force_is_not_sent_again() -> None:
@@ -233,7 +233,7 @@ def test_what_is_in_force_is_not_sent_again() -> None:
     made = policy.redesign(evidence())
     again = policy.redesign(evidence(10.1, setting=made.setting))
     assert again.setting is None
-    assert again.owed is None
+    assert again.unverified is None
     assert "in force already" in again.reason
 
 

@@ -94,7 +94,7 @@ class CertifiedPolicy:
         if _in_force(found.setting, evidence):
             return Redesign(None, estimate.gap, "what was proved is in force already", certificate=found)
         sent = _sent(found, region.noise, estimate.gap, "")
-        return replace(sent, owed=region) if prover.owes else sent
+        return replace(sent, unverified=region) if prover.owes else sent
 
     def prove(self, region: Region, _running: Setting | None = None) -> Certificate | Refusal:
         """The cheapest setting that holds in a region, by simulation."""
