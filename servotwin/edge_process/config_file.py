@@ -120,7 +120,7 @@ def _agent(table: Table, rate: float, controller: Controller | None) -> AgentSet
         parameters=part(table, "start", lambda t: _start(t, settable)),
         supervision=part(table, "supervision", lambda t: _supervision(t, gains)),
         probe=probe,
-        novelty=part(table, "novelty", noveltyfile.settings) if "novelty" in table.values else None,
+        window_filter=part(table, "novelty", noveltyfile.settings) if "novelty" in table.values else None,
         **part(table, "window", lambda t: given(t, _WINDOW)),
     )
 

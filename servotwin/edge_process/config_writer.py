@@ -9,6 +9,7 @@ from typing import Any
 
 from servotwin.control.controller_file import written
 from servotwin.edge.novelty import settings_file as noveltyfile
+from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.verdict import FallbackSet
@@ -50,7 +51,7 @@ def edge_toml(config: EdgeConfig) -> str:
 
 def _tables(config: EdgeConfig) -> Values:
     """Those that say something; the order is the reader's."""
-    agent = config.agent
+    agent, novelty = config.agent, config.agent.window_filter
     keep = _all(config.keeping, {"bytes": "megabytes"})
     tables: Values = {
         "drive": dict(config.drive),
@@ -62,7 +63,7 @@ def _tables(config: EdgeConfig) -> Values:
         "limits": _all(agent.limits, _LIMITS),
         "probe": None if agent.probe is None else _all(agent.probe, {"size": "size_m"}),
         "supervision": _supervision(agent.supervision),
-        "novelty": None if agent.novelty is None else noveltyfile.written(agent.novelty),
+        "novelty": noveltyfile.written(novelty) if isinstance(novelty, NoveltySettings) else None,
         "retry": _all(agent.retry),
         "keep": {**keep, "megabytes": config.keeping.bytes / MB},
         "sensor": _all(config.sensor, {"safe_voltage": "safe_voltage_v"}),
