@@ -13,13 +13,13 @@ from servotwin.control import controller_file
 from servotwin.control.controller import Controller
 from servotwin.edge import settings_file as edgefile
 from servotwin.edge.limits import Limits
-from servotwin.edge.novelty import settings_file as noveltyfile
-from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
+from servotwin.novelty import settings_file as noveltyfile
+from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step

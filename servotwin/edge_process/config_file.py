@@ -12,13 +12,13 @@ from servotwin.config.table import Reader, Table, given, named, part, read_toml
 from servotwin.control import controller_file
 from servotwin.control.controller import Controller
 from servotwin.edge import settings_file as edgefile
-from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
 from servotwin.edge_process.config_writer import edge_toml
 from servotwin.link.session import Retry
 from servotwin.messages import Gains
+from servotwin.novelty import settings_file as noveltyfile
 
 __all__ = ["edge_toml", "load", "read"]
 
