@@ -259,7 +259,7 @@ class Scenario:
             retry=r.retry,
             limits=r.limits,
             model_version=self.servo.version,
-            novelty=self._novelty(),
+            window_filter=self._novelty(),
             **r.requests,
         )
 

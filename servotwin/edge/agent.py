@@ -15,10 +15,9 @@ from typing import NamedTuple
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.edge.cut import Cut
+from servotwin.edge.cut import TIMED, Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
-from servotwin.edge.novelty.judge import TIMED
 from servotwin.edge.outlet import Outlet, PackingOutlet
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters

@@ -3,6 +3,9 @@
 from array import array
 from typing import NamedTuple
 
+TIMED = "timed"
+"""Reason of a window that was cut because the filter's longest pause was over."""
+
 
 class Cut(NamedTuple):
     """Samples first .. last - 1 of one boot, and why they were cut.

@@ -4,19 +4,16 @@ The gateway's outlet hands them to a process of its own instead, so that neither
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
 from servotwin.edge.cut import Cut
-from servotwin.edge.novelty.judge import Novelty
 from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.settings import AgentSettings
+from servotwin.edge.window_filter import WindowFilter
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Sender
 from servotwin.messages import Acknowledge, InvalidMessage, Window
-
-Judge = Callable[[Cut], Cut | None]
-"""What is to be sent of a cut window, perhaps with another reason; None: nothing, it tells nothing new."""
 
 NOT_FINITE = "sample not finite"
 WITHHELD = "nothing new"
@@ -55,13 +52,11 @@ class PackingOutlet:
     settings : AgentSettings
     outbox : Outbox, optional
         In memory by default; what it already holds is due at once.
-    judge : callable, optional
-        Looks at each cut window first; None: the one that the settings ask for, if any.
     """
 
-    def __init__(self, settings: AgentSettings, outbox: Outbox | None = None, judge: Judge | None = None) -> None:
+    def __init__(self, settings: AgentSettings, outbox: Outbox | None = None) -> None:
         self._settings = settings
-        self.judge = judge if judge is not None or settings.novelty is None else Novelty(settings.novelty)
+        self._filter: WindowFilter | None = None if settings.window_filter is None else settings.window_filter.start()
         self.outbox = MemoryOutbox() if outbox is None else outbox
         self._sender = Sender(self.outbox, settings.retry)
         self._lost: Counter[str] = Counter()
@@ -83,7 +78,7 @@ class PackingOutlet:
 
     def offer(self, cut: Cut, now: float) -> None:
         """Judge, pack and keep; one that holds a sample which is not finite is counted only."""
-        wanted = cut if self.judge is None or not is_finite(cut) else self.judge(cut)
+        wanted = cut if self._filter is None or not is_finite(cut) else self._filter(cut)
         if wanted is None:
             self._lost[WITHHELD] += 1
             return

@@ -6,11 +6,11 @@ from math import inf, isfinite
 
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
-from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
+from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.session import Retry
 from servotwin.messages import NAME_PATTERN, Gains
@@ -78,8 +78,8 @@ class AgentSettings:
     own : Gains, optional
         The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
     supervision : Supervision
-    novelty : NoveltySettings, optional
-        Which windows are worth sending; None: all.
+    window_filter : WindowFilterSettings, optional
+        Chooses which windows are sent; None: all are.
     """
 
     servo: str
@@ -99,7 +99,7 @@ class AgentSettings:
     longest_window_s: float | None = None
     longest_pre_trigger_s: float | None = None
     probe: ProbeLimits | None = None
-    novelty: NoveltySettings | None = None
+    window_filter: WindowFilterSettings | None = None
 
     def __post_init__(self) -> None:
         for key in ("servo", "boot"):
@@ -115,7 +115,8 @@ class AgentSettings:
             allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
-        self._check_novelty()
+        if self.window_filter is not None:
+            self.window_filter.check_rate(self.sample_rate)
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
@@ -133,12 +134,6 @@ class AgentSettings:
         if not self.longest_pre_trigger_samples < self.longest_samples:
             allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
             raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")
-
-    def _check_novelty(self) -> None:
-        """The model is for these samples."""
-        if self.novelty is not None and self.novelty.model.rate != self.sample_rate:
-            rates = f"{self.novelty.model.rate!r} Hz for samples at {self.sample_rate!r} Hz"
-            raise InvalidInput(f"agent novelty model = {rates}: must be equal")
 
     @property
     def longest_samples(self) -> int:
@@ -160,7 +155,9 @@ class AgentSettings:
     @property
     def look_samples(self) -> float:
         """Samples after a window at which one is cut where nothing else leads to one; inf: never."""
-        return inf if self.novelty is None else max(self.window_samples, self.novelty.rules.look_s * self.sample_rate)
+        if self.window_filter is None:
+            return inf
+        return max(self.window_samples, self.window_filter.longest_pause_s * self.sample_rate)
 
     @property
     def window_samples(self) -> int:

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import msgspec
 
 from servotwin.edge.cut import Cut
-from servotwin.edge.novelty.judge import Novelty, dumps, loads
 from servotwin.edge.outlet import NOT_FINITE, WITHHELD
 from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.store import FileStore, restored
+from servotwin.edge.window_filter import WindowFilter
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.frames import CutFrame, HandledFrame, LetterFrame, SaveFrame, TicksFrame, ToLink
 from servotwin.edge_process.twin_link import CURSOR
@@ -20,7 +20,7 @@ from servotwin.link.outbox import Key
 from servotwin.link.sqlite_outbox import MOST_OWED, SqliteOutbox
 from servotwin.messages import InvalidMessage
 
-_LAST, _NOVELTY = "last cut", "novelty"
+_LAST, _FILTER_STATE = "last cut", "novelty"
 UNJUDGED = "window not judged"
 
 
@@ -44,7 +44,7 @@ class Keeper:
         self._config, self._outbox = config, outbox
         self._store = FileStore(config.path(config.keeping.parameters))
         self._unsaved: SaveFrame | None = None
-        self._novelty: Novelty | None = None
+        self._filter: WindowFilter | None = None
         self._boot = ""
         self._owed: dict[int, Owed] = {}
         self.faults: Counter[str] = Counter()
@@ -93,7 +93,7 @@ class Keeper:
         if boot == frame.boot and frame.sequence <= sequence:
             return
         self._outbox.note(_LAST, here)
-        wanted = self._wanted(frame.cut, self._judge(frame.boot))
+        wanted = self._wanted(frame.cut, self._filter_of(frame.boot))
         if wanted is None:
             self._outbox.lost(WITHHELD)
             return
@@ -104,7 +104,7 @@ class Keeper:
         else:
             self._outbox.put(window)
 
-    def _wanted(self, cut: Cut, judge: Novelty | None) -> Cut | None:
+    def _wanted(self, cut: Cut, judge: WindowFilter | None) -> Cut | None:
         """The window, if it is worth sending; one that cannot be judged is."""
         if judge is None or not is_finite(cut):
             return cut
@@ -113,19 +113,19 @@ class Keeper:
         except Exception:
             self.faults[UNJUDGED] += 1
             return cut
-        self._outbox.note(_NOVELTY, dumps(judge.state))
+        self._outbox.note(_FILTER_STATE, judge.dumps())
         return found
 
-    def _judge(self, boot: str) -> Novelty | None:
-        """Of this boot, with what was known before."""
-        settings = self._config.agent.novelty
-        if settings is not None and (self._novelty is None or boot != self._boot):
-            self._boot, known = boot, self._outbox.noted(_NOVELTY)
+    def _filter_of(self, boot: str) -> WindowFilter | None:
+        """The window filter of a boot, which begins with the state that the last one saved."""
+        settings = self._config.agent.window_filter
+        if settings is not None and (self._filter is None or boot != self._boot):
+            self._boot = boot
             try:
-                self._novelty = Novelty(settings, None if known is None else loads(known))
+                self._filter = settings.start(self._outbox.noted(_FILTER_STATE))
             except InvalidInput:
-                self._novelty = Novelty(settings)
-        return self._novelty
+                self._filter = settings.start()
+        return self._filter
 
     def _save(self) -> list[int]:
         if self._unsaved is None:

@@ -1,8 +1,8 @@
 """Crossovers, margins, sensitivity peak and bandwidth of a loop, from its frequency response.
 
-The response is searched on frequencies that resolve every pole and zero, and every crossing and peak is then refined to
-rounding. So a model, a model with a delay and measured data go the same way. Roots of polynomials are not used: those of
-a chain of many masses, or of a stiff one, are too ill-conditioned to be found.
+The response is searched on frequencies that resolve every pole and zero; every crossing and peak is then refined to
+rounding. A model, a model with a delay and measured data go the same way. Roots of polynomials are not used: those of a
+chain of many masses, or of a stiff one, are too ill-conditioned.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def _peak(value: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
     values = value(omega)
     best = int(np.argmax(values))
     peaks = [(float(omega[best]), float(values[best]))]
-    for i in np.flatnonzero(values >= (1.0 - _NEAR) * values[best]):
+    for i in np.flatnonzero(values >= (1.0 - _NEAR) * values[best]).tolist():
         low, high = max(i - 1, 0), min(i + 1, omega.size - 1)
         if values[i] >= values[low] and values[i] >= values[high] and values[i] > min(values[low], values[high]):
             peaks.append(_extreme(value, 1.0, float(omega[low]), float(omega[high])))

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
-from servotwin.store.address import address_of, file_of
+from servotwin.store.engine import parse_address, sqlite_file
 from servotwin.twin_service.secret_file import PRIVATE
 
 
@@ -24,7 +24,7 @@ def alone(store: str) -> Iterator[None]:
     InvalidInput
         Another process holds it, or the file beside it cannot be made.
     """
-    file = file_of(address_of(store))
+    file = sqlite_file(parse_address(store))
     if file is None:
         yield
         return

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from servotwin.store.rows import Claim, Outcome
+from servotwin.store.records import Lease, WorkResult
 
 LENGTH = Layout("<I")
 
@@ -31,7 +31,7 @@ class Start(NamedTuple):
 class Job(NamedTuple):
     """Servos to be worked on one after the other; `now` in s: since the epoch, or sample time in lock-step."""
 
-    claims: tuple[Claim, ...]
+    claims: tuple[Lease, ...]
     now: float
 
 
@@ -40,14 +40,14 @@ class Done(NamedTuple):
 
     Attributes
     ----------
-    outcome : Outcome or None
+    outcome : WorkResult or None
     error : str
         Why there is none.
     seconds : float
         What it took.
     """
 
-    outcome: Outcome | None
+    outcome: WorkResult | None
     error: str
     seconds: float
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 
-from servotwin.store.rows import Claim
+from servotwin.store.records import Lease
 from servotwin.twin_service import config, mqtt_config
 from servotwin.twin_service.job import LENGTH, Done, Job, Start, done_of, framed
 
@@ -61,7 +61,7 @@ class Worker:
         self._send(framed(self._start))
         await self._frame(BEGIN_S)
 
-    async def work(self, claims: Sequence[Claim], now: float) -> AsyncIterator[Done]:
+    async def work(self, claims: Sequence[Lease], now: float) -> AsyncIterator[Done]:
         """What becomes of each claim, one after the other; raises WorkerLost."""
         self._send(framed(Job(tuple(claims), now)))
         for _ in claims:

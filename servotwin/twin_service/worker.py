@@ -15,10 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from servotwin.store.rows import Claim, Outcome
+from servotwin.store.records import Lease, WorkResult
 from servotwin.twin_service.job import LENGTH, Done, framed, job_of, start_of
 
-Work = Callable[[Claim, float], Outcome]
+Work = Callable[[Lease, float], WorkResult]
 
 
 def main(descriptor: int) -> None:
@@ -37,7 +37,7 @@ def main(descriptor: int) -> None:
                 line.sendall(framed(attempt(work, claim, job.now)))
 
 
-def attempt(work: Work, claim: Claim, now: float) -> Done:
+def attempt(work: Work, claim: Lease, now: float) -> Done:
     """Do it, whatever happens: an error is told, not raised."""
     begun = time.perf_counter()
     try:

@@ -121,7 +121,9 @@ def test_a_double_zero_is_factored():
         assert found.be == pytest.approx(found.phz, abs=1e-6)
 
 
-@pytest.mark.parametrize(("law", "said"), [(Controller(1.0, 1.0, 1.0, 0.1), "complex"), (Controller(1.0, -1.0, 0.0, 0.1), "-10, 1 1/s")])
+@pytest.mark.parametrize(
+    ("law", "said"), [(Controller(1.0, 1.0, 1.0, 0.1), "complex"), (Controller(1.0, -1.0, 0.0, 0.1), "-10, 1 1/s")]
+)
 def test_zeros_that_are_not_real_and_stable_have_no_factors(law, said):
     with pytest.raises(InvalidInput, match=said):
         factorised(law, 1.0)

@@ -15,8 +15,8 @@ from scipy.signal import lsim
 import servotwin
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.commissioning.novelty import model_of
-from servotwin.edge.lost_motion import rests
 from servotwin.edge.novelty.least_squares import burg, fit
+from servotwin.edge.novelty.lost_motion import rests
 from servotwin.edge.novelty.model import Mode, NoveltyModel, fixed
 from servotwin.edge.novelty.motion import Place, play
 from servotwin.edge.novelty.score import Offset, Score, score

@@ -101,8 +101,8 @@ def test_a_scenario_says_it_in_toml(tmp_path: Path) -> None:
     path.write_text(text)
     scenario = Scenario.load(path)
     assert scenario.recording.novelty == NoveltyRules(worth=math.radians(0.2), period_s=300.0, look_s=math.inf)
-    novelty = scenario.agent_settings().novelty
-    assert novelty is not None
+    novelty = scenario.agent_settings().window_filter
+    assert isinstance(novelty, NoveltySettings)
     assert novelty.model == model_of(scenario.servo, 5000.0)
     path.write_text(text.replace("worth_deg", "worthy_deg"))
     with pytest.raises(InvalidInput, match=r"novelty\.worthy_deg.*did you mean 'worth_deg'"):
@@ -111,7 +111,7 @@ def test_a_scenario_says_it_in_toml(tmp_path: Path) -> None:
 
 def agent(rules: NoveltyRules | None, rate: float = 500.0) -> Agent:
     novelty = None if rules is None else NoveltySettings(model_of(Servo.preset("paper"), rate), rules)
-    return Agent(AgentSettings("axis", "b0", rate, novelty=novelty))
+    return Agent(AgentSettings("axis", "b0", rate, window_filter=novelty))
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000, 5000])
@@ -139,7 +139,7 @@ def test_without_novelty_time_cuts_nothing() -> None:
 
 def test_a_model_for_another_rate_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"500\.0 Hz for samples at 1000\.0 Hz"):
-        AgentSettings("axis", "b0", 1000.0, novelty=NoveltySettings(model_of(Servo.preset("paper"), 500.0)))
+        AgentSettings("axis", "b0", 1000.0, window_filter=NoveltySettings(model_of(Servo.preset("paper"), 500.0)))
 
 
 def test_the_bench_measures_what_it_says() -> None:

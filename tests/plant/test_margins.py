@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.plant import linear, loop as loops
+from servotwin.plant import linear
+from servotwin.plant import loop as loops
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, margins, peak
 from servotwin.plant.servo import Servo

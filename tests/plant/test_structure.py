@@ -103,7 +103,9 @@ def test_equilibrium(parts: tuple[Array, Array, Array], d: float) -> None:
     np.testing.assert_allclose(rigid.C @ x + rigid.D * d, d, rtol=1e-9, atol=least)  # every mass is where the screw is
     y = elastic.equilibrium(d)
     ground = parts[1][0]
-    np.testing.assert_allclose(elastic.C @ y, d * 1e6 / (1e6 + ground), rtol=1e-8, atol=least)  # k_d against the ground spring
+    np.testing.assert_allclose(
+        elastic.C @ y, d * 1e6 / (1e6 + ground), rtol=1e-8, atol=least
+    )  # k_d against the ground spring
     force = elastic.reaction @ y + elastic.reaction_position * d
     np.testing.assert_allclose(force, d * 1e6 * ground / (1e6 + ground), rtol=1e-6, atol=1e6 * least)
 

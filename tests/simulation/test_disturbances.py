@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear, loop
+from servotwin.plant import loop
 from servotwin.plant.automaton import Shape, continuous_loop
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave

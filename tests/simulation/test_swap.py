@@ -10,7 +10,6 @@ from scipy.linalg import expm
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave

@@ -71,4 +71,3 @@ def overshoot(servo: Servo, controller: Controller, b: float = 1.0, c: float = 1
     slowest = float(np.min(np.abs(system.poles())))
     response = system.step(np.linspace(0.0, 20.0 * math.pi / slowest, 20_001))
     return float(np.max(response) - 1.0)
-

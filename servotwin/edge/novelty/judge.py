@@ -12,8 +12,8 @@ import msgspec
 from msgspec import Struct, structs
 
 from servotwin.edge.cut import Cut
-from servotwin.edge.lost_motion import rests
 from servotwin.edge.novelty.chart import Chart, begun, look, relearning
+from servotwin.edge.novelty.lost_motion import rests
 from servotwin.edge.novelty.score import Offset, Score, score
 from servotwin.edge.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.errors import InvalidInput
@@ -21,8 +21,6 @@ from servotwin.errors import InvalidInput
 PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
 LOST_MOTION, SCORE, CUSUM = "novelty: lost motion", "novelty: score", "novelty: cusum"
 NEWS = LOST_MOTION, SCORE, CUSUM
-TIMED = "timed"
-"""Why a window was cut that nothing but time led to."""
 
 _KEPT = 8  # windows that an update may stand on
 _WIDEST = 1.0  # rad: a spread beyond says nothing
@@ -270,6 +268,10 @@ class Novelty:
         self.settings = settings
         self.state = start(settings) if state is None else booted(state, settings.rules)
         self.verdict: Verdict | None = None
+
+    def dumps(self) -> bytes:
+        """Encode the state."""
+        return dumps(self.state)
 
     def __call__(self, cut: Cut) -> Cut | None:
         """The window with the reason why it is to be sent; None: it is not."""

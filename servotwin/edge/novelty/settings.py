@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from math import inf, radians
 
 from servotwin.edge.novelty.model import NoveltyModel
+from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 
 
@@ -102,3 +103,20 @@ class NoveltySettings:
     def __post_init__(self) -> None:
         if not 0.0 <= self.gap < inf:
             raise InvalidInput(f"novelty gap = {self.gap!r} rad: must be finite and at least 0")
+
+    @property
+    def longest_pause_s(self) -> float:
+        """Time after a window at which one is cut though the reference rests, s."""
+        return self.rules.look_s
+
+    def check_rate(self, sample_rate: float) -> None:
+        """Raise InvalidInput where the model is for another rate (Hz)."""
+        if self.model.rate != sample_rate:
+            rates = f"{self.model.rate!r} Hz for samples at {sample_rate!r} Hz"
+            raise InvalidInput(f"agent novelty model = {rates}: must be equal")
+
+    def start(self, saved: bytes | None = None) -> WindowFilter:
+        """Start the filter for a new boot; raises InvalidInput where `saved` is not a state of it."""
+        from servotwin.edge.novelty.judge import Novelty, loads
+
+        return Novelty(self, None if saved is None else loads(saved))

@@ -1,0 +1,38 @@
+"""Hook of an optional window filter: it looks at each cut window and chooses which are sent.
+
+The agent's settings carry a `WindowFilterSettings`. The edge's core names no implementation; novelty is one.
+"""
+
+from typing import Protocol
+
+from servotwin.edge.cut import Cut
+
+
+class WindowFilter(Protocol):
+    """A filter at work on the windows of one boot."""
+
+    def __call__(self, cut: Cut) -> Cut | None:
+        """Return the window to send, perhaps with another reason; None: it is not sent."""
+
+    def dumps(self) -> bytes:
+        """Encode the state, which `WindowFilterSettings.start` takes in the next boot."""
+
+
+class WindowFilterSettings(Protocol):
+    """Settings of a filter, which start it."""
+
+    @property
+    def longest_pause_s(self) -> float:
+        """Time after a window at which one is cut though the reference rests, s; inf: never."""
+
+    def check_rate(self, sample_rate: float) -> None:
+        """Raise InvalidInput where the filter is not made for samples at this rate (Hz)."""
+
+    def start(self, saved: bytes | None = None) -> WindowFilter:
+        """Start the filter for a new boot, from the state that an earlier boot saved.
+
+        Raises
+        ------
+        InvalidInput
+            The bytes are not a state of this filter.
+        """
