@@ -98,7 +98,7 @@ def model_of(servo: Servo, sample_rate: float) -> NoveltyModel:
 def response_of(model: NoveltyModel) -> Response:
     """Return the response that a model describes; velocities, which it does not hold, are zero."""
     decay, gain = (np.array([[z.real, z.imag] for z in column]) for column in zip(*model.modes, strict=True))
-    poles = np.log(decay[:, 0] + 1j * decay[:, 1]) * model.rate
+    poles = model.rate * np.log(np.array([mode.decay for mode in model.modes]))
     position, nothing = Readout(gain, model.direct), Readout(np.zeros_like(gain), 0.0)
     return Response(poles, decay, position, nothing, 1.0 / model.rate, model.static_gain, model.unseen)
 

@@ -1,0 +1,52 @@
+"""Designs: controllers with a dead zone, as they are simulated and certified."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.messages import Band, Setting
+
+_GRID = 512
+
+
+@dataclass(frozen=True)
+class Design:
+    """A whole controller and the half-width of its dead zone.
+
+    Attributes
+    ----------
+    controller : Controller
+    tolerance : float
+        m; 0: no dead zone.
+    """
+
+    controller: Controller
+    tolerance: float = 0.0
+
+    def setting(self, band: Band | None = None) -> Setting:
+        """Part of it that an update sets, with the band that is predicted for it."""
+        return Setting(self.tolerance, gains_of(self.controller), band)
+
+    @property
+    def continuous(self) -> Design:
+        """The same law in continuous time, in which candidates are simulated."""
+        return Design(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
+
+    def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
+        """Voltage, V rms, that white measurement noise of `noise` (m rms) within `band` (Hz) causes by itself.
+
+        The loop is left out: it does not answer at frequencies far above its crossover. Gains as in Eq 14, behind the
+        loop filter.
+        """
+        law = self.controller
+        hertz = np.geomspace(*band, _GRID)
+        s = 2j * math.pi * hertz
+        gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
+        if law.loop_filter_hz is not None:
+            gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
+        return noise * float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))
