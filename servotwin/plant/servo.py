@@ -8,24 +8,25 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import resources
 from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, Unpack
 
 import numpy as np
 
 from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
-from servotwin.control.controller import Controller
+from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
 from servotwin.plant import linear, servo_file
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import motor_matrices
 from servotwin.plant.sampled import sampled_poles
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import Array, check_gap
 from servotwin.plant.structure import Chain, chain
+from servotwin.runtime.notebook import html_table
 
 PerMass: TypeAlias = float | tuple[float, ...]
 PRESETS = ("paper", "table1", "paper-gain2")
@@ -44,7 +45,26 @@ class Control(NamedTuple):
     closed_loop: Any
 
 
-@dataclass(frozen=True)
+class ServoChanges(ControllerChanges, total=False):
+    """The keywords of `Servo.replace`: the fields of `Servo` and of its `Controller`, each of them optional."""
+
+    m: PerMass
+    k: PerMass
+    c: PerMass
+    J: float
+    p: float
+    L: float
+    R: float
+    k_T: float
+    k_B: float
+    controller: Controller
+    n: int
+    k_d: float
+    encoder_resolution: float
+    position_resolution: float
+
+
+@dataclass(frozen=True, repr=False)
 class Servo:
     """A position servo: DC motor, lead screw, chain of n masses, sensors and its default controller.
 
@@ -101,6 +121,20 @@ class Servo:
         for name, unit in {"encoder_resolution": "rad", "position_resolution": "m"}.items():
             object.__setattr__(self, name, _checked(name, getattr(self, name), unit, positive=False))
 
+    def __repr__(self) -> str:
+        """Preset or model version, masses, screw and controller in one line."""
+        name = next((repr(name) for name in PRESETS if _preset_version(name) == self.version), "other")
+        screw = "rigid" if self.rigid else f"k_d={self.k_d:g} N/m"
+        return f"<Servo {name}, model {self.version}: {self.n} masses, {screw} screw, {self.controller!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        units = {**_PER_MASS, **_POSITIVE, "k_d": "N/m"}
+        rows = {name: f"{getattr(self, name)} {unit}" for name, unit in units.items()}
+        return html_table(
+            f"Servo, model {self.version}", rows | {"n": str(self.n), "controller": repr(self.controller)}
+        )
+
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
         """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 say how they differ)."""
@@ -147,14 +181,26 @@ class Servo:
         """The servo as TOML that `load` reads back to an equal servo."""
         return servo_file.write(self._plant_values(), dataclasses.asdict(self.controller))
 
-    def replace(self, **changes: Any) -> Servo:
-        """A copy with some values changed; the controller's own names (Kp, Ki, Kd, Tf, voltage_limit, ...) go to it."""
+    def replace(self, **changes: Unpack[ServoChanges]) -> Servo:
+        """A copy with some values changed, validated again.
+
+        Parameters
+        ----------
+        **changes
+            Any fields of the servo or of its controller, by name: ``servo.replace(k=9e3, Ki=500.0)``.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown, or a value is out of its range.
+        """
         _refuse_unknown(changes)
-        for_controller = {key: changes.pop(key) for key in _CONTROLLER_FIELDS if key in changes}
-        changed = dataclasses.replace(self, **changes)
+        for_plant = {key: value for key, value in changes.items() if key not in _CONTROLLER_FIELDS}
+        for_controller = {key: value for key, value in changes.items() if key in _CONTROLLER_FIELDS}
+        changed = dataclasses.replace(self, **for_plant)  # type: ignore[arg-type]
         if not for_controller:
             return changed
-        return dataclasses.replace(changed, controller=changed.controller.replace(**for_controller))
+        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **for_controller))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
@@ -162,11 +208,12 @@ class Servo:
         Raises
         ------
         InvalidInput
-            The gap or k_dz is negative or not finite.
+            The gap or k_dz is negative or not finite, or the gap is above one turn.
         """
         for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
             if not (math.isfinite(value) and value >= 0.0):
                 raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
+        check_gap(gap)
         return k_dz * self.p * gap
 
     @property
@@ -261,6 +308,11 @@ class Servo:
 
     def _plant_values(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "controller"}
+
+
+@cache
+def _preset_version(name: str) -> str:
+    return Servo.preset(name).version
 
 
 def _worst_pole(servo: Servo, controller: Controller) -> complex:

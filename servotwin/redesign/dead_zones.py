@@ -93,4 +93,4 @@ class HysteresisPolicy:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
         law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
-        return Redesign(self.servo.tolerance_for(estimate.gap), estimate.gap, "", law)
+        return Redesign(self.servo.p * estimate.gap, estimate.gap, "", law)
