@@ -17,9 +17,9 @@ from rich.table import Table
 import servotwin as st
 from servotwin.messages import Update
 from servotwin.report import page, style
-from servotwin.reproduction.figures import worn
-from servotwin.reproduction.loops import Estimated, LoopJob, Record, record
-from servotwin.reproduction.measures import SETTLED, TAIL, Step
+from servotwin.reproduction.figures import wear_panels
+from servotwin.reproduction.measures import SETTLED, TAIL, MeasuredStep
+from servotwin.reproduction.twin_runs import EstimateRecord, TwinJob, TwinRun, run_twin
 from servotwin.runtime import files
 
 MM, UM = 1e3, 1e6
@@ -33,9 +33,9 @@ class Comparison:
     """The servo alone, with its twin as published, and with the certified one."""
 
     servo: st.Servo
-    alone: Record
-    published: Record
-    twinned: Record
+    alone: TwinRun
+    published: TwinRun
+    twinned: TwinRun
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Verdict:
     """One step alone, with the published twin and with the certified one; what the twins made of its window."""
 
     number: int
-    alone: Step
-    published: Step
-    twinned: Step
-    published_estimate: Estimated
-    estimate: Estimated
+    alone: MeasuredStep
+    published: MeasuredStep
+    twinned: MeasuredStep
+    published_estimate: EstimateRecord
+    estimate: EstimateRecord
     left: float
 
 
@@ -88,7 +88,7 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
 
 def scenarios(preset: str) -> tuple[st.Scenario, st.Scenario]:
     """The same machine with the twin as published and with the certified one."""
-    published = LoopJob(preset).described().replace(input_bias=BIAS)
+    published = TwinJob(preset).scenario_to_run().replace(input_bias=BIAS)
     certified = st.Scenario.preset("certified").with_servo(published.servo)
     return published, certified.replace(input_bias=BIAS)
 
@@ -110,7 +110,7 @@ def compare(published: st.Scenario, certified: st.Scenario, console: Console) ->
             return lambda share: progress.update(bar, completed=share, note="")
 
         bars = [watched(name) for name in jobs]
-        runs = pool.map(lambda job, bar: record(job, progress=bar), jobs.values(), bars)
+        runs = pool.map(lambda job, bar: run_twin(job, progress=bar), jobs.values(), bars)
         return Comparison(published.servo, *runs)
 
 
@@ -124,12 +124,12 @@ def verdicts(found: Comparison) -> list[Verdict]:
 
 def plot(found: Comparison) -> Figure:
     """Position three times, gap and estimates."""
-    figure, panels = worn.sheet(4)
+    figure, panels = wear_panels.sheet(4)
     names = ("position without a twin", "position, twin as published", "position, certified twin")
     for axes, each, name in zip(panels, (found.alone, found.published, found.twinned), names, strict=False):
-        worn.position(axes, each.trace, name)
-    worn.true_gap(panels[-1], found.twinned.trace)
-    worn.estimates(panels[-1], found.twinned)
+        wear_panels.position(axes, each.trace, name)
+    wear_panels.true_gap(panels[-1], found.twinned.trace)
+    wear_panels.estimates(panels[-1], found.twinned)
     style.legend(panels[-1])
     return figure
 
@@ -164,11 +164,11 @@ def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
     return f"{update.data_time:.0f}", *gains, f"{proof.members} machines", f"{100.0 * proof.settled:.1f} %", *worst
 
 
-def _estimate(one: Estimated) -> str:
+def _estimate(one: EstimateRecord) -> str:
     return f"{math.degrees(one.gap):.2f}" if one.ok else "refused"
 
 
-def word(step: Step) -> str:
+def word(step: MeasuredStep) -> str:
     """Whether a step came to rest."""
     return "rests" if step.settled else "swings"
 
@@ -182,7 +182,7 @@ def summary(rows: Sequence[Verdict]) -> tuple[str, str]:
     return f"Without a twin {alone} of {len(rows)} steps settle, {others}.", _accuracy([row.estimate for row in rows])
 
 
-def _accuracy(estimates: Sequence[Estimated]) -> str:
+def _accuracy(estimates: Sequence[EstimateRecord]) -> str:
     """How many estimates were made, and how far they are off at most."""
     errors = [abs(math.degrees(one.error)) for one in estimates if one.ok]
     worst = f", off by {max(errors):.2g} deg at most" if errors else ""

@@ -27,7 +27,7 @@ def reproduce(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
 ) -> None:
     """Every figure and claim of the paper beside what we measure."""
-    from servotwin.reproduction.everything import reproduce as run
+    from servotwin.reproduction.reproduce import reproduce as run
 
     run(out, only=tuple(only or ()), preset=preset, workers=workers)
 

@@ -28,25 +28,46 @@ class _Required:
 REQUIRED = _Required()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Range:
-    """The numbers that a key accepts; both ends belong to it unless `positive`."""
+    """The numbers that a key accepts: `minimum` and `maximum` belong to it, `above` and `below` do not."""
 
     minimum: float = -math.inf
     maximum: float = math.inf
-    positive: bool = False
+    above: float = -math.inf
+    below: float = math.inf
     infinite: bool = False
 
     def accepts(self, value: float) -> bool:
-        finite = math.isfinite(value) or (self.infinite and not math.isnan(value))
-        return finite and self.minimum <= value <= self.maximum and not (self.positive and value <= 0.0)
+        """Whether a number lies in the range; NaN never does, an infinite one only where `infinite`."""
+        if not (isinstance(value, int) or math.isfinite(value) or (self.infinite and not math.isnan(value))):
+            return False
+        if (self.above > -math.inf and value <= self.above) or (self.below < math.inf and value >= self.below):
+            return False
+        return self.minimum <= value <= self.maximum
+
+    def scaled(self, scale: Callable[[float], float]) -> Range:
+        """The same range in another unit."""
+        ends = (self.minimum, self.maximum, self.above, self.below)
+        minimum, maximum, above, below = (scale(end) if math.isfinite(end) else end for end in ends)
+        return Range(minimum, maximum, above, below, self.infinite)
+
+    @property
+    def whole(self) -> str:
+        """The words for integers."""
+        words = str(self).removesuffix(", finite")
+        return words.replace("a number", "an integer").replace("a positive number", "a positive integer")
 
     def __str__(self) -> str:
-        words = ["a positive number" if self.positive else "a number"]
+        words = ["a positive number" if self.above == 0.0 else "a number"]
         if self.minimum > -math.inf:
             words.append(f"at least {self.minimum:g}")
+        if self.above > -math.inf and self.above != 0.0:
+            words.append(f"above {self.above:g}")
         if self.maximum < math.inf:
             words.append(f"at most {self.maximum:g}")
+        if self.below < math.inf:
+            words.append(f"below {self.below:g}")
         words.append("inf allowed" if self.infinite else "finite")
         return ", ".join(words)
 
@@ -68,7 +89,7 @@ class Table:
     source: str
     values: Mapping[str, object]
     name: str = ""
-    _asked: set[str] = field(default_factory=set)
+    _known: set[str] = field(default_factory=set)
 
     def number(
         self,
@@ -83,7 +104,11 @@ class Table:
         """One number (an integer counts); NaN never, inf only where `infinite`."""
         if self._missing(key, default):
             return cast(_Default, default)
-        return self._number(key, self.values[key], Range(minimum, maximum, positive, infinite))
+        return self.number_in(key, Range(minimum, maximum, 0.0 if positive else -math.inf, infinite=infinite))
+
+    def number_in(self, key: str, allowed: Range) -> float:
+        """The number that is there, within a range."""
+        return self._number(key, self.values[key], allowed)
 
     def numbers(
         self,
@@ -97,7 +122,10 @@ class Table:
         """One number, or a list of at least one."""
         if self._missing(key, default):
             return cast(_Default, default)
-        allowed = Range(minimum, maximum, positive)
+        return self.numbers_in(key, Range(minimum, maximum, 0.0 if positive else -math.inf))
+
+    def numbers_in(self, key: str, allowed: Range) -> float | tuple[float, ...]:
+        """The number or the list of at least one that is there, each within a range."""
         value = self.values[key]
         if not isinstance(value, list):
             return self._number(key, value, allowed, " or a list of such")
@@ -116,10 +144,13 @@ class Table:
         """One integer within the range."""
         if self._missing(key, default):
             return cast(_Default, default)
+        return self.integer_in(key, Range(minimum, maximum))
+
+    def integer_in(self, key: str, allowed: Range) -> int:
+        """The integer that is there, within a range."""
         value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
-            allowed = str(Range(minimum, maximum)).replace("a number", "an integer").removesuffix(", finite")
-            raise self.invalid(key, allowed)
+        if isinstance(value, bool) or not isinstance(value, int) or not allowed.accepts(value):
+            raise self.invalid(key, allowed.whole)
         return value
 
     def text(
@@ -146,17 +177,17 @@ class Table:
 
     def table(self, key: str, *, required: bool = False) -> Table:
         """The table [key]; where it is absent and not required, an empty one."""
-        self._asked.add(key)
+        self._known.add(key)
         value = self.values.get(key, {})
         if not isinstance(value, dict):
             raise self.invalid(key, f"a table [{self.path(key)}]")
         if required and key not in self.values:
-            raise InvalidInput(f"{self.source}: table [{self.path(key)}] is missing{self._misspelt(key)}")
+            raise self.missing(key, table=True)
         return Table(self.source, value, self.path(key))
 
     def tables(self, key: str) -> list[Table]:
         """The array of tables [[key]]; empty where it is absent."""
-        self._asked.add(key)
+        self._known.add(key)
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
@@ -164,20 +195,25 @@ class Table:
 
     def known(self, *keys: str) -> None:
         """These keys are allowed here, whether they are read or not."""
-        self._asked.update(keys)
+        self._known.update(keys)
 
     def done(self) -> None:
         """Refuse whatever was never asked for."""
         for key in self.values:
-            if key not in self._asked:
-                allowed = _listed(sorted(self._asked)) or "no key at all"
-                hint = did_you_mean(key, self._asked)
+            if key not in self._known:
+                allowed = _listed(sorted(self._known)) or "no key at all"
+                hint = did_you_mean(key, self._known)
                 where = f"table [{self.name}]" if self.name else "the top level"
                 raise InvalidInput(f"{self.source}: unknown key '{self.path(key)}'{hint}; {where} allows {allowed}")
 
     def path(self, key: str) -> str:
         """The key's dotted path inside its file."""
         return f"{self.name}.{key}" if self.name else key
+
+    def missing(self, key: str, table: bool = False) -> InvalidInput:
+        """The error for a key or a table that must be there; to be raised by the caller."""
+        what = f"table [{self.path(key)}]" if table else f"key '{self.path(key)}'"
+        return InvalidInput(f"{self.source}: {what} is missing{self._misspelt(key)}")
 
     def invalid(self, key: str, allowed: str) -> InvalidInput:
         """The error for a value of `key` that is not allowed; to be raised by the caller."""
@@ -192,15 +228,15 @@ class Table:
         return number
 
     def _missing(self, key: str, default: object) -> bool:
-        self._asked.add(key)
+        self._known.add(key)
         if key in self.values:
             return False
         if default is REQUIRED:
-            raise InvalidInput(f"{self.source}: key '{self.path(key)}' is missing{self._misspelt(key)}")
+            raise self.missing(key)
         return True
 
     def _misspelt(self, key: str) -> str:
-        close = difflib.get_close_matches(key, [k for k in self.values if k not in self._asked], n=1)
+        close = difflib.get_close_matches(key, [k for k in self.values if k not in self._known], n=1)
         return f" (found '{self.path(close[0])}' instead)" if close else ""
 
 

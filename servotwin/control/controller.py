@@ -2,30 +2,14 @@
 
 from dataclasses import dataclass, fields, replace
 from math import expm1, inf, isfinite, pi, sqrt
-from numbers import Real
-from typing import TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.control.law import LawParameters
 from servotwin.errors import InvalidInput
 from servotwin.runtime.notebook import html_table
 
 _GAINS = ("Kp", "Ki", "Kd", "Tf")
-_UNITS = {
-    "Kp": "V/m",
-    "Ki": "V/(m s)",
-    "Kd": "V s/m",
-    "Tf": "s",
-    "enter": "tolerances",
-    "leave": "tolerances",
-    "loop_filter_hz": "Hz",
-    "voltage_limit": "V",
-    "rate_limit": "V/s",
-    "sample_rate": "Hz",
-    "tracking_time": "s",
-    "feedforward": "V",
-    "release_time": "s",
-}
-_OPTIONAL = ("loop_filter_hz", "voltage_limit", "rate_limit", "sample_rate", "tracking_time")
 
 
 class ControllerChanges(TypedDict, total=False):
@@ -46,31 +30,10 @@ class ControllerChanges(TypedDict, total=False):
     release_time: float
 
 
+@settings("controller")
 @dataclass(frozen=True, slots=True, repr=False)
 class Controller:
     """Filtered PID (Eq 14) with a dead zone on its error (Eq 20), limits and an optional loop filter.
-
-    Parameters
-    ----------
-    Kp, Ki, Kd : float
-        Gains, V/m, V/(m s), V s/m; any sign.
-    Tf : float
-        Time constant of the derivative's filter, s, positive: without it the controller would be improper.
-    enter, leave : float
-        The loop opens when the error is at most `enter` tolerances and closes again above `leave` tolerances;
-        equal values (the paper's) mean no hysteresis.
-    loop_filter_hz : float, optional
-        Cut-off of a first-order low-pass on the measurement, Hz (section 4.3); None: none.
-    voltage_limit, rate_limit : float, optional
-        V and V/s; None: none.
-    sample_rate : float, optional
-        Hz; None: the law runs in continuous time.
-    tracking_time : float, optional
-        Time constant of the back-calculation, s; None: see `tracking`.
-    feedforward : float
-        V, added to the voltage at all times, inside the dead zone too: it cancels a bias of the plant's input.
-    release_time : float
-        s, time constant with which the voltage that a change of parameters left over (`LawState.offset`) is let go.
 
     Raises
     ------
@@ -78,27 +41,65 @@ class Controller:
         When a value is not a finite number in its range.
     """
 
-    Kp: float
-    Ki: float
-    Kd: float
-    Tf: float
-    enter: float = 1.0
-    leave: float = 1.0
-    loop_filter_hz: float | None = None
-    voltage_limit: float | None = None
-    rate_limit: float | None = None
-    sample_rate: float | None = None
-    tracking_time: float | None = None
-    feedforward: float = 0.0
-    release_time: float = 0.5
+    Kp: Annotated[float, key("kp_v_per_m", help="Proportional gain, any sign.")]
+    Ki: Annotated[float, key("ki_v_per_m_s", help="Integral gain, any sign.")]
+    Kd: Annotated[float, key("kd_v_s_per_m", help="Derivative gain, any sign.")]
+    Tf: Annotated[
+        float,
+        key("filter_time_s", above=0.0, help="Time constant of the derivative's filter, which makes the law proper."),
+    ]
+    enter: Annotated[
+        float, key("enter_tolerances", minimum=0.0, help="The loop opens when the error is at most that large.")
+    ] = 1.0
+    leave: Annotated[
+        float,
+        key(
+            "leave_tolerances",
+            minimum=0.0,
+            help="The loop closes again above that error; at least enter_tolerances, equal values (the paper's) mean "
+            "no hysteresis.",
+        ),
+    ] = 1.0
+    loop_filter_hz: Annotated[
+        float | None,
+        key(above=0.0, help="Cut-off of a first-order low-pass on the measurement (section 4.3); none where absent."),
+    ] = None
+    voltage_limit: Annotated[
+        float | None, key("voltage_limit_v", above=0.0, help="Largest voltage, either sign; no limit where absent.")
+    ] = None
+    rate_limit: Annotated[
+        float | None,
+        key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the voltage; no limit where absent."),
+    ] = None
+    sample_rate: Annotated[
+        float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
+    ] = None
+    tracking_time: Annotated[
+        float | None,
+        key(
+            "tracking_time_s",
+            above=0.0,
+            help="Time constant of the integral's back-calculation; sqrt(abs(Kd / Ki)) where absent.",
+        ),
+    ] = None
+    feedforward: Annotated[
+        float,
+        key(
+            "feedforward_v",
+            help="Voltage added at all times, inside the dead zone too; it cancels a bias of the plant's input.",
+        ),
+    ] = 0.0
+    release_time: Annotated[
+        float,
+        key(
+            "release_time_s",
+            above=0.0,
+            help="Time constant with which the voltage offset after a change of parameters (`LawState.offset`) fades.",
+        ),
+    ] = 0.5
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            _check_number(field.name, getattr(self, field.name))
-        for name in ("Tf", "release_time", *_OPTIONAL):
-            _check_positive(name, getattr(self, name))
-        if self.enter < 0.0:
-            raise InvalidInput(f"controller enter = {self.enter!r} tolerances: must be at least 0")
+        check(self)
         if self.leave < self.enter:
             raise InvalidInput(f"controller leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
 
@@ -109,8 +110,8 @@ class Controller:
 
     def _repr_html_(self) -> str:
         """Table for notebooks."""
-        rows = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
-        return html_table("Controller", {name: f"{value:g} {_UNITS[name]}" for name, value in rows.items()})
+        given = [item for item in items_of(type(self)) if getattr(self, item.name) is not None]
+        return html_table("Controller", {one.name: f"{getattr(self, one.name):g} {one.unit}" for one in given})
 
     def replace(self, **changes: Unpack[ControllerChanges]) -> "Controller":
         """A copy with some values changed, validated again.
@@ -180,16 +181,3 @@ class Controller:
             feedforward=float(self.feedforward),
             release_step=-expm1(-step / self.release_time),
         )
-
-
-def _check_number(name: str, value: object) -> None:
-    """Every value is a finite number; optional ones may be None."""
-    if value is None and name in _OPTIONAL:
-        return
-    if isinstance(value, bool) or not isinstance(value, Real) or not isfinite(value):
-        raise InvalidInput(f"controller {name} = {value!r}: must be a finite number")
-
-
-def _check_positive(name: str, value: float | None) -> None:
-    if value is not None and value <= 0.0:
-        raise InvalidInput(f"controller {name} = {value!r}: must be greater than 0")

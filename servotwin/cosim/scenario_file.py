@@ -8,21 +8,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from servotwin.config.table import Table, given, part
-from servotwin.control import controller_file
+from servotwin.config.table import Table, part
+from servotwin.config.toml import changes
 from servotwin.control.controller import Controller
+from servotwin.control.gains import read_gains
 from servotwin.edge import settings_file as edgefile
 from servotwin.edge.limits import Limits
 from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
-from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
+from servotwin.runtime.retry import Retry
 from servotwin.twin import settings_file as twinfile
 
 MM = 1e-3
@@ -162,8 +163,8 @@ def _gap(table: Table) -> SignalLike:
 
 def _controller(table: Table, controller: Controller) -> Controller | None:
     """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
-    changes = given(table, controller_file.KEYS)
-    return controller.replace(**changes) if changes else None
+    changed = changes(table, Controller)
+    return controller.replace(**changed) if changed else None
 
 
 def _noise(table: Table) -> Noise:
@@ -235,7 +236,7 @@ def _supervision(table: Table, controller: Controller) -> Supervision | None:
         return None
 
     def gains(inner: Table) -> Gains:
-        return controller_file.gains(inner, controller)
+        return read_gains(inner, controller)
 
     def whole(inner: Table) -> Supervision:
         inner.table("probe")

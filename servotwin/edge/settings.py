@@ -12,8 +12,8 @@ from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput
-from servotwin.link.session import Retry
 from servotwin.messages import NAME_PATTERN, Gains
+from servotwin.runtime.retry import Retry
 
 
 @dataclass(frozen=True, slots=True)

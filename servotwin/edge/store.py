@@ -10,6 +10,7 @@ from msgspec import Struct
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Gains
+from servotwin.runtime.files import replace_file
 
 
 class Store(Protocol):
@@ -71,13 +72,8 @@ class FileStore:
         self._path = Path(path)
 
     def save(self, parameters: Parameters) -> None:
-        """Write beside, flush to the disk, put in place."""
-        beside = self._path.with_name(self._path.name + ".new")
-        with beside.open("wb") as file:
-            file.write(msgspec.json.encode(kept(parameters)))
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self._path)
+        """Replace the file; return when the disk has it. Raises OSError."""
+        replace_file(self._path, msgspec.json.encode(kept(parameters)), durable=True)
 
     def load(self) -> Parameters | None:
         """What the file holds.

@@ -6,19 +6,19 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from servotwin.config.table import Reader, Table, given, named, part, read_toml
-from servotwin.control import controller_file
+from servotwin.config.toml import read as read_settings
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_given, read_gains
 from servotwin.edge import settings_file as edgefile
 from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
 from servotwin.edge_process.config_writer import edge_toml
-from servotwin.link.session import Retry
 from servotwin.messages import Gains
+from servotwin.runtime.retry import Retry
 
 __all__ = ["edge_toml", "load", "read"]
 
@@ -94,7 +94,7 @@ def read(table: Table) -> EdgeConfig:
 
 def _controller(table: Table, rate: float) -> Controller:
     """Sampled, as the samples are."""
-    controller = controller_file.controller(table)
+    controller: Controller = read_settings(table, Controller)
     return controller if controller.sample_rate is not None else controller.replace(sample_rate=rate)
 
 
@@ -104,7 +104,7 @@ def _agent(table: Table, rate: float, controller: Controller | None) -> AgentSet
 
     def gains(inner: Table) -> Gains | None:
         stay = inner.boolean("gains_stay", settable is None)
-        return None if stay or settable is None else controller_file.gains(inner, settable)
+        return None if stay or settable is None else read_gains(inner, settable)
 
     probe = part(table, "probe", edgefile.probe) if "probe" in table.values else None
     return AgentSettings(
@@ -138,10 +138,10 @@ def _supervision(table: Table, gains: edgefile.GainsReader) -> Supervision:
 
 def _start(table: Table, controller: Controller | None) -> Parameters:
     """In force before the first update."""
-    some: dict[str, Any] = given(table, controller_file.GAINS)
+    some = gains_given(table)
     return Parameters(
         tolerance=edgefile.length(table, "tolerance", 0.0),
-        gains=controller_file.gains(table, controller) if some and controller is not None else None,
+        gains=read_gains(table, controller) if some and controller is not None else None,
         band=part(table, "band", edgefile.band) if "band" in table.values else None,
         fallback=table.boolean("fallback", False),
     )

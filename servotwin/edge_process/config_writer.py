@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from servotwin.control.controller_file import written
+from servotwin.config.toml import dumps, values_of
+from servotwin.control.gains import written_gains
 from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
@@ -46,7 +46,7 @@ def edge_toml(config: EdgeConfig) -> str:
         "update_gains": agent.controller is not None,
         "realtime_priority": config.priority,
     }
-    return "\n".join(_lines("", {**top, **_tables(config)})) + "\n"
+    return dumps({**top, **_tables(config)})
 
 
 def _tables(config: EdgeConfig) -> Values:
@@ -56,8 +56,8 @@ def _tables(config: EdgeConfig) -> Values:
     tables: Values = {
         "drive": dict(config.drive),
         "twin": None if config.twin is None else _all(config.twin),
-        "controller": None if config.controller is None else written(config.controller),
-        "own": None if agent.own is None else written(agent.own),
+        "controller": None if config.controller is None else values_of(config.controller),
+        "own": None if agent.own is None else written_gains(agent.own),
         "start": _start(agent.parameters),
         "window": _window(agent),
         "limits": _all(agent.limits, _LIMITS),
@@ -80,7 +80,7 @@ def _all(described: Any, names: Mapping[str, str] | None = None) -> Values:
 
 def _start(parameters: Parameters) -> Values:
     values: Values = {"tolerance_m": parameters.tolerance, "fallback": parameters.fallback}
-    values |= {} if parameters.gains is None else written(parameters.gains)
+    values |= {} if parameters.gains is None else written_gains(parameters.gains)
     return values | _band(parameters.band)
 
 
@@ -106,26 +106,5 @@ def _fallback(fallback: FallbackSet) -> Values:
     names = ("silence_s", "refuse_s")
     values: Values = {"tolerance_m": fallback.tolerance, **{name: getattr(fallback, name) for name in names}}
     own: Gains | None = fallback.gains
-    values |= {"gains_stay": True} if own is None else written(own)
+    values |= {"gains_stay": True} if own is None else written_gains(own)
     return values | _band(fallback.band)
-
-
-def _lines(path: str, values: Values) -> list[str]:
-    """A table's plain values, then the tables in it."""
-    inner = {key: value for key, value in values.items() if isinstance(value, dict)}
-    lines = ["", f"[{path}]"] if path else []
-    lines += [f"{key} = {_literal(value)}" for key, value in values.items() if key not in inner]
-    for key, value in inner.items():
-        lines += _lines(f"{path}.{key}" if path else key, value)
-    return lines
-
-
-def _literal(value: object) -> str:
-    """A TOML value with every digit that it has."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_literal, value))}]"
-    return repr(value)

@@ -6,20 +6,21 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
-from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, Unpack
+from typing import Annotated, Any, NamedTuple, TypeAlias, Unpack
 
 import numpy as np
 
-from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
+from servotwin.config.keys import check, items_of, key, settings
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.config.toml import dumps, read, values_of
 from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear, servo_file
+from servotwin.plant import linear
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import motor_matrices
@@ -29,9 +30,11 @@ from servotwin.plant.structure import Chain, chain
 from servotwin.runtime.notebook import html_table
 
 PerMass: TypeAlias = float | tuple[float, ...]
+_PLANT = (
+    "J", "L", "R", "k_T", "k_B", "p", "k_d", "n", "m", "k", "c", "encoder_resolution", "position_resolution",
+)  # fmt: skip
+"""The plant's numbers in the order of the file, of which `Servo.version` is the hash."""
 PRESETS = ("paper", "table1", "paper-gain2")
-_POSITIVE = {"J": "kg m^2", "p": "m/rad", "L": "H", "R": "ohm", "k_T": "N m/A", "k_B": "V s/rad"}
-_PER_MASS = {"m": "kg", "k": "N/m", "c": "N s/m"}
 _CONTROLLER_FIELDS = tuple(field.name for field in dataclasses.fields(Controller))
 
 
@@ -64,28 +67,10 @@ class ServoChanges(ControllerChanges, total=False):
     position_resolution: float
 
 
+@settings("servo")
 @dataclass(frozen=True, repr=False)
 class Servo:
     """A position servo: DC motor, lead screw, chain of n masses, sensors and its default controller.
-
-    Parameters
-    ----------
-    m, k, c : float or tuple of n floats
-        kg, N/m, N s/m: mass, stiffness, damping, one for all or one each from the screw outwards (Eq 9). With a rigid
-        screw the first of each is inert (Eq 10).
-    J, L, R, k_T, k_B : float
-        kg m^2, H, ohm, N m/A, V s/rad: the motor (Eqs 1-8).
-    p : float
-        m/rad, pitch of the lead screw.
-    controller : Controller
-        The controller that runs when none is given; it also carries the voltage and rate limits.
-    n : int
-        Number of masses, at least 2.
-    k_d : float
-        N/m between screw and first mass. Infinite (the paper's) means rigid and no reaction on the motor; finite
-        means an elastic screw whose load acts back on the motor.
-    encoder_resolution, position_resolution : float
-        rad and m of one count of the motor's encoder and of the position sensor; 0 is an ideal sensor.
 
     Raises
     ------
@@ -93,33 +78,62 @@ class Servo:
         A value is not a finite number in its range, or m, k or c does not have n values.
     """
 
-    m: PerMass
-    k: PerMass
-    c: PerMass
-    J: float
-    p: float
-    L: float
-    R: float
-    k_T: float
-    k_B: float
-    controller: Controller
-    n: int = 3
-    k_d: float = math.inf
-    encoder_resolution: float = 0.0
-    position_resolution: float = 0.0
+    m: Annotated[
+        PerMass,
+        key(
+            "mass_kg",
+            table="structure",
+            above=0.0,
+            help="Mass, one for all or one each from the screw outwards (Eq 9); with a rigid screw the first of each "
+            "list is inert (Eq 10).",
+        ),
+    ]
+    k: Annotated[PerMass, key("stiffness_n_per_m", table="structure", above=0.0, help="Stiffness, as the mass.")]
+    c: Annotated[PerMass, key("damping_n_s_per_m", table="structure", minimum=0.0, help="Damping, as the mass.")]
+    J: Annotated[float, key("inertia_kg_m2", table="motor", above=0.0, help="Inertia of the rotor (Eqs 1-8).")]
+    p: Annotated[float, key("pitch_m_per_rad", table="screw", above=0.0, help="Pitch of the lead screw.")]
+    L: Annotated[float, key("inductance_h", table="motor", above=0.0, help="Inductance of the winding.")]
+    R: Annotated[float, key("resistance_ohm", table="motor", above=0.0, help="Resistance of the winding.")]
+    k_T: Annotated[float, key("torque_gain_n_m_per_a", table="motor", above=0.0, help="Torque per current.")]
+    k_B: Annotated[float, key("back_emf_v_s_per_rad", table="motor", above=0.0, help="Back-EMF per angular velocity.")]
+    controller: Annotated[
+        Controller, key(help="The controller that runs when none is given; it also carries voltage and rate limits.")
+    ]
+    n: Annotated[int, key("masses", table="structure", minimum=2, help="Number of masses.")] = 3
+    k_d: Annotated[
+        float,
+        key(
+            "stiffness_n_per_m",
+            table="screw",
+            above=0.0,
+            infinite=True,
+            help="Stiffness between screw and first mass; inf (the paper's) means a rigid screw and no reaction on the "
+            "motor, a finite one an elastic screw whose load acts back on the motor.",
+        ),
+    ] = math.inf
+    encoder_resolution: Annotated[
+        float,
+        key("encoder_resolution_rad", table="sensors", minimum=0.0, help="One count of the motor's encoder; 0: ideal."),
+    ] = 0.0
+    position_resolution: Annotated[
+        float,
+        key("position_resolution_m", table="sensors", minimum=0.0, help="One count of the position sensor; 0: ideal."),
+    ] = 0.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 2:
-            raise InvalidInput(f"servo n = {self.n!r}: the number of masses must be an integer of 2 or more")
         if not isinstance(self.controller, Controller):
             raise InvalidInput(f"servo controller = {self.controller!r}: must be a Controller")
-        for name, unit in _PER_MASS.items():
-            object.__setattr__(self, name, _per_mass(name, getattr(self, name), self.n, unit))
-        for name, unit in _POSITIVE.items():
-            object.__setattr__(self, name, _checked(name, getattr(self, name), unit, positive=True))
-        object.__setattr__(self, "k_d", _checked("k_d", self.k_d, "N/m", positive=True, infinite=True))
-        for name, unit in {"encoder_resolution": "rad", "position_resolution": "m"}.items():
-            object.__setattr__(self, name, _checked(name, getattr(self, name), unit, positive=False))
+        for name in ("m", "k", "c"):
+            if isinstance(getattr(self, name), Iterable) and not isinstance(getattr(self, name), str):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+        check(self)
+        for name in _PLANT:
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != self.n:
+                count = f"has {len(value)} values for {self.n} masses; give one or {self.n}"
+                raise InvalidInput(f"servo {name} = {value!r}: {count}")
+            if name != "n":
+                object.__setattr__(self, name, tuple(map(float, value)) if isinstance(value, tuple) else float(value))
 
     def __repr__(self) -> str:
         """Preset or model version, masses, screw and controller in one line."""
@@ -129,11 +143,8 @@ class Servo:
 
     def _repr_html_(self) -> str:
         """Table for notebooks."""
-        units = {**_PER_MASS, **_POSITIVE, "k_d": "N/m"}
-        rows = {name: f"{getattr(self, name)} {unit}" for name, unit in units.items()}
-        return html_table(
-            f"Servo, model {self.version}", rows | {"n": str(self.n), "controller": repr(self.controller)}
-        )
+        rows = {one.name: f"{getattr(self, one.name)} {one.unit}" for one in items_of(type(self))}
+        return html_table(f"Servo, model {self.version}", rows)
 
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
@@ -169,17 +180,15 @@ class Servo:
 
     @classmethod
     def _from_table(cls, table: Table) -> Servo:
-        values, gains = servo_file.read(table)
-        try:
-            servo = cls(controller=Controller(**gains), **values)
+        with named(table):
+            servo: Servo = read(table, cls)
+            table.done()
             servo.check_loop()
             return servo
-        except InvalidInput as error:
-            raise InvalidInput(f"{table.source}: {error}") from None
 
     def dumps(self) -> str:
         """The servo as TOML that `load` reads back to an equal servo."""
-        return servo_file.write(self._plant_values(), dataclasses.asdict(self.controller))
+        return dumps(values_of(self, only=(*_PLANT, "controller")))
 
     def replace(self, **changes: Unpack[ServoChanges]) -> Servo:
         """A copy with some values changed, validated again.
@@ -239,7 +248,7 @@ class Servo:
     @property
     def version(self) -> str:
         """Twelve hexadecimal digits that name this plant's numbers (the controller's do not count)."""
-        return hashlib.sha256(servo_file.write(self._plant_values(), {}).encode()).hexdigest()[:12]
+        return hashlib.sha256(dumps(values_of(self, only=_PLANT)).encode()).hexdigest()[:12]
 
     def chain(self) -> Chain:
         """Matrices of the structure (Eqs 9-13)."""
@@ -306,9 +315,6 @@ class Servo:
         systems = (self.G1(), self.G2(), linear.pidf(self.controller), self.loop(), self.closed_loop())
         return Control(*(system.to_control() for system in systems))
 
-    def _plant_values(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "controller"}
-
 
 @cache
 def _preset_version(name: str) -> str:
@@ -326,29 +332,6 @@ def _worst_pole(servo: Servo, controller: Controller) -> complex:
 
 def _spread(value: PerMass, n: int) -> Array:
     return np.broadcast_to(np.asarray(value, dtype=float), (n,)).copy()
-
-
-def _per_mass(name: str, value: object, n: int, unit: str) -> PerMass:
-    positive = name != "c"
-    if isinstance(value, Real):
-        return _checked(name, value, unit, positive=positive)
-    try:
-        values: tuple[object, ...] = tuple(value)  # type: ignore[arg-type]
-    except TypeError:
-        raise InvalidInput(f"servo {name} = {value!r}: must be a number in {unit} or a tuple of {n}") from None
-    if len(values) != n:
-        count = len(values)
-        raise InvalidInput(f"servo {name} = {value!r}: has {count} values in {unit} for {n} masses; give one or {n}")
-    return tuple(_checked(f"{name}[{i}]", v, unit, positive=positive) for i, v in enumerate(values))
-
-
-def _checked(name: str, value: object, unit: str, *, positive: bool, infinite: bool = False) -> float:
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    finite = math.isfinite(number) or (infinite and number == math.inf)
-    if not finite or number < 0.0 or (positive and number == 0.0):
-        allowed = ("greater than 0" if positive else "0 or more") + (", inf allowed" if infinite else " and finite")
-        raise InvalidInput(f"servo {name} = {value!r} {unit}: must be {allowed}")
-    return number
 
 
 def _refuse_unknown(changes: Mapping[str, object]) -> None:

@@ -1,6 +1,6 @@
-"""What a run is measured by: amplitude, bias, settled, settling time, limit cycle. Plain arrays in, numbers out.
+"""Measures of a run: amplitude, bias, settled, settling time, limit cycle. Plain arrays in, numbers out.
 
-Definitions, used everywhere in the reproduction. The *tail* of a step is its last `TAIL` seconds. The *amplitude* is
+Definitions for the whole reproduction. The *tail* of a step is its last `TAIL` seconds. The *amplitude* is
 half the peak-to-peak of the position over the tail; a step has *settled* when its amplitude is below `SETTLED` times
 the reference amplitude; its *bias* is the reference minus the mean position over the tail.
 """
@@ -19,10 +19,19 @@ Complex = NDArray[np.complex128]
 TAIL = 5.0  # s: several periods of every limit cycle seen (0.9 to 1.5 Hz), a quarter of the paper's half period
 SETTLED = 0.01  # of the reference amplitude
 BAND = 0.02  # of the size of the step, for settling times
+DEFINITIONS = {
+    "gap": "the total lost motion of the backlash",
+    "tolerance": "half-width of the dead zone on the tracking error",
+    "amplitude": f"half the peak-to-peak of the position over the last {TAIL:g} s of a step",
+    "settled": f"an amplitude below {100 * SETTLED:g} % of the reference amplitude of 1 mm",
+    "bias": f"the reference minus the mean position over the last {TAIL:g} s of a step",
+    "settling time": f"from when on the position stays within {100 * BAND:g} % of the step around its end value",
+    "reference": "a square wave of ±1 mm and 40 s; unipolar: 0/1 mm",
+}
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class MeasuredStep:
     """One stretch of constant reference, as measured. Lengths in m, times in s, gap (total) in rad."""
 
     begin: float
@@ -38,7 +47,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class LimitCycle:
+class MeasuredCycle:
     """A periodic oscillation: frequency in Hz (NaN without one), amplitude in the signal's unit."""
 
     frequency: float
@@ -62,7 +71,7 @@ def tail(time: Array, end: float, length: float = TAIL) -> slice:
 
 
 def has_settled(values: Array, scale: float, share: float = SETTLED) -> bool:
-    """Whether the amplitude of `values` is below `share` of `scale`."""
+    """Decide: the amplitude of `values` is below `share` of `scale`."""
     return amplitude(values) < share * scale
 
 
@@ -86,13 +95,13 @@ def upward_crossings(time: Array, values: Array) -> Array:
     return time[first] + share * (time[first + 1] - time[first])
 
 
-def limit_cycle(time: Array, values: Array) -> LimitCycle:
+def limit_cycle(time: Array, values: Array) -> MeasuredCycle:
     """Frequency and amplitude of an oscillation about its mid-range, from the mean distance of upward crossings."""
     middle = (float(values.max()) + float(values.min())) / 2.0
     crossings = upward_crossings(time, values - middle)
     periods = len(crossings) - 1
     frequency = periods / float(crossings[-1] - crossings[0]) if periods > 0 else float("nan")
-    return LimitCycle(frequency, amplitude(values))
+    return MeasuredCycle(frequency, amplitude(values))
 
 
 def peaks(values: Array) -> NDArray[np.intp]:
@@ -102,7 +111,7 @@ def peaks(values: Array) -> NDArray[np.intp]:
 
 
 def is_monotone(values: Sequence[float]) -> bool:
-    """Whether a sequence never rises or never falls."""
+    """Decide: the sequence never rises, or never falls."""
     steps = np.diff(np.asarray(values, dtype=float))
     return bool(np.all(steps >= 0.0) or np.all(steps <= 0.0))
 
@@ -112,7 +121,7 @@ def reference_changes(time: Array, reference: Array) -> Array:
     return time[np.concatenate([[0], np.flatnonzero(np.diff(reference)) + 1])]
 
 
-def steps(time: Array, position: Array, reference: Array, gap: Array, scale: float) -> tuple[Step, ...]:
+def steps(time: Array, position: Array, reference: Array, gap: Array, scale: float) -> tuple[MeasuredStep, ...]:
     """Measure every stretch of constant reference; `scale` is the reference amplitude (m)."""
     begins = reference_changes(time, reference)
     ends = [*begins[1:], time[-1]]
@@ -120,12 +129,14 @@ def steps(time: Array, position: Array, reference: Array, gap: Array, scale: flo
     return tuple(_step(time, position, reference, gap, scale, begin, end) for begin, end in pairs)
 
 
-def _step(time: Array, position: Array, reference: Array, gap: Array, scale: float, begin: float, end: float) -> Step:
+def _step(
+    time: Array, position: Array, reference: Array, gap: Array, scale: float, begin: float, end: float
+) -> MeasuredStep:
     whole, last = between(time, begin, end), tail(time, end)
     values = position[last]
     final, goal = float(values.mean()), float(reference[whole][0])
     size = abs(goal - float(position[whole][0]))
-    return Step(
+    return MeasuredStep(
         begin=begin,
         end=end,
         reference=goal,

@@ -1,4 +1,4 @@
-"""The simulated runs that figures and claims share: each is described by a small frozen job and computed once."""
+"""Simulated runs without a twin, shared by figures and claims: each is a small frozen job and is computed once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.reproduction import measures
-from servotwin.reproduction.measures import Array, Step
+from servotwin.reproduction.measures import Array, MeasuredStep
 from servotwin.simulation import Run, simulate
 
 AMPLITUDE = 1e-3  # m, section 3.2
@@ -40,12 +40,12 @@ class Square:
         return SquareWave(self.amplitude, PERIOD, self.offset)
 
     def scaled(self, factor: float) -> Square:
-        """The same with another amplitude."""
+        """Scale amplitude and offset."""
         return replace(self, amplitude=self.amplitude * factor, offset=self.offset * factor)
 
     @property
     def family(self) -> tuple[Square, ...]:
-        """Nine of them, 0.1 % apart in amplitude: runs that no machine could tell apart beforehand (erratum E17)."""
+        """Nine squares whose amplitudes differ by 0.1 %: no machine could tell them apart beforehand (erratum E17)."""
         return tuple(self.scaled(1.0 + 1e-3 * k) for k in range(-4, 5))
 
 
@@ -74,20 +74,20 @@ class Trace:
         return cls(**{name: np.ascontiguousarray(getattr(run, name)[::every]) for name in names})
 
     @cached_property
-    def steps(self) -> tuple[Step, ...]:
+    def steps(self) -> tuple[MeasuredStep, ...]:
         """Every stretch of constant reference, measured."""
         return measures.steps(self.time, self.position, self.reference, self.gap, AMPLITUDE)
 
 
-class Job(Hashable, Protocol[_R]):
-    """What to run. Equal jobs are run once."""
+class RunJob(Hashable, Protocol[_R]):
+    """A simulation to run. Equal jobs are run once."""
 
     def run(self) -> _R: ...
 
 
 @dataclass(frozen=True, slots=True)
 class StepJob:
-    """A step from rest with a constant gap; `dead_zone_deg` is the gap that the dead zone is made for, None: none."""
+    """A step from rest with a constant gap; `dead_zone_deg` is the gap for which the dead zone is made, None: none."""
 
     preset: str
     gap_deg: float
@@ -97,7 +97,7 @@ class StepJob:
     duration: float = STEP_DURATION
 
     def simulate(self) -> Run:
-        """The run itself."""
+        """Simulate the run."""
         servo = Servo.preset(self.preset)
         return simulate(
             servo,
@@ -110,18 +110,18 @@ class StepJob:
         )
 
     def run(self) -> Trace:
-        """Its signals."""
+        """Simulate; keep the signals."""
         return Trace.of(self.simulate())
 
 
 @dataclass(frozen=True, slots=True)
-class SettleJob:
-    """A step as in `StepJob`, of which only the measures are kept."""
+class StepMeasureJob:
+    """A step as in `StepJob`; only its measures are kept."""
 
     step: StepJob
 
-    def run(self) -> Step:
-        """The step as measured, relative to its own size."""
+    def run(self) -> MeasuredStep:
+        """Simulate; measure the step relative to its own size."""
         run = self.step.simulate()
         still = np.zeros_like(run.time)
         size = abs(self.step.amplitude)
@@ -129,13 +129,13 @@ class SettleJob:
 
 
 @dataclass(frozen=True, slots=True)
-class ReactionJob:
-    """How far the motor turns (rad, at most) in a step run."""
+class MotorTravelJob:
+    """The motor's largest angle (rad) in a step run."""
 
     step: StepJob
 
     def run(self) -> float:
-        """The largest angle."""
+        """Simulate; keep the largest angle."""
         return float(np.abs(self.step.simulate().theta_m).max())
 
 
@@ -149,7 +149,7 @@ class WearJob:
     to_deg: float = END_DEG
 
     def run(self) -> Trace:
-        """Its signals."""
+        """Simulate; keep the signals."""
         servo = Servo.preset(self.preset)
         run = simulate(
             servo,
@@ -169,8 +169,8 @@ class FixedFamilyJob:
     preset: str
     square: Square = BIPOLAR
 
-    def run(self) -> tuple[tuple[Step, ...], ...]:
-        """One row of steps per member."""
+    def run(self) -> tuple[tuple[MeasuredStep, ...], ...]:
+        """Simulate; one row of steps per member."""
         return tuple(WearJob(self.preset, member).run().steps for member in self.square.family)
 
 
@@ -189,33 +189,33 @@ class Runs:
     """One preset and every run made with it so far."""
 
     preset: str
-    done: dict[Any, Any] = field(default_factory=dict, repr=False)
+    results: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def servo(self) -> Servo:
         """The preset's servo."""
         return Servo.preset(self.preset)
 
-    def get(self, job: Job[_R]) -> _R:
-        """The job's result, computed now if it was not before."""
-        if job not in self.done:
-            self.done[job] = job.run()
-        result: _R = self.done[job]
+    def get(self, job: RunJob[_R]) -> _R:
+        """Return the job's result; compute it the first time."""
+        if job not in self.results:
+            self.results[job] = job.run()
+        result: _R = self.results[job]
         return result
 
     def step(self, gap_deg: float, dead_zone_deg: float | None = None) -> Trace:
         """Signals of a 1 mm step (Figs 9 and 11)."""
         return self.get(StepJob(self.preset, gap_deg, dead_zone_deg))
 
-    def settle(self, gap_deg: float, dead_zone_deg: float | None, **more: float) -> Step:
+    def settle(self, gap_deg: float, dead_zone_deg: float | None, **more: float) -> MeasuredStep:
         """Measures of a step."""
-        return self.get(SettleJob(StepJob(self.preset, gap_deg, dead_zone_deg, **more)))
+        return self.get(StepMeasureJob(StepJob(self.preset, gap_deg, dead_zone_deg, **more)))
 
-    def sweep(self, gaps_deg: Iterable[float], dead_zone_deg: float | None = ESTIMATE_DEG) -> tuple[Step, ...]:
+    def sweep(self, gaps_deg: Iterable[float], dead_zone_deg: float | None = ESTIMATE_DEG) -> tuple[MeasuredStep, ...]:
         """Measures of 1 mm steps over gaps."""
         return tuple(self.settle(float(gap), dead_zone_deg) for gap in gaps_deg)
 
-    def ensemble(self, gap_deg: float, dead_zone_deg: float) -> tuple[Step, ...]:
+    def ensemble(self, gap_deg: float, dead_zone_deg: float) -> tuple[MeasuredStep, ...]:
         """81 members over reference amplitudes (0.5 to 2 mm) and initial screw angles (the whole gap), erratum E17."""
         starts = np.linspace(-0.5, 0.5, 9) * gap_deg
         sizes = AMPLITUDE * np.geomspace(0.5, 2.0, 9)
@@ -227,7 +227,7 @@ class Runs:
 
     def reaction(self, gap_deg: float, amplitude: float) -> float:
         """Largest motor angle (rad) in 5 s after a step, with the dead zone made for the gap."""
-        return self.get(ReactionJob(StepJob(self.preset, gap_deg, gap_deg, amplitude, duration=5.0)))
+        return self.get(MotorTravelJob(StepJob(self.preset, gap_deg, gap_deg, amplitude, duration=5.0)))
 
     def wear(self, square: Square = BIPOLAR, to_deg: float = END_DEG) -> Trace:
         """Signals of Fig 12."""

@@ -26,12 +26,12 @@ from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
-from servotwin.config.table import Reader, Table, did_you_mean, given, named, parse_toml, part
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, part
+from servotwin.config.toml import changes
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN
-from servotwin.plant import servo_file
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
 from servotwin.twin import settings_file as settingsfile
@@ -43,7 +43,6 @@ from servotwin.twin.store import Store
 from servotwin.twin.twin import Twin
 
 MOST_MODELS = 256
-_CONTROLLER: dict[str, Reader] = {key.name: (key.symbol, key.read) for key in servo_file.CONTROLLER}
 
 
 @dataclass(frozen=True)
@@ -181,7 +180,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo = _servo(table, folder)
-    law = part(table, "controller", lambda inner: servo.controller.replace(**given(inner, _CONTROLLER)))
+    law = part(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
     settings = part(table, "twin", partial(settingsfile.twin, folder=folder))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)

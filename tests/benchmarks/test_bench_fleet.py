@@ -28,7 +28,7 @@ from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, Sample, Watch
 from servotwin.cli.app import app
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Update, decode, encode
-from servotwin.store.rows import Incoming, Kind
+from servotwin.store.records import Incoming, MessageKind
 from servotwin.store.store import open_store
 
 PLAN = Plan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
@@ -225,7 +225,7 @@ def test_the_store_tells_how_long_windows_waited(tmp_path: Path) -> None:
     store = open_store(f"sqlite:///{tmp_path / 'x.db'}")
     try:
         items = [
-            Incoming("a", Kind.WINDOW, f"b/{k}", b"x", "", bytes([k]) * 16, 100.0 + k, "b", k, float(k))
+            Incoming("a", MessageKind.WINDOW, f"b/{k}", b"x", "", bytes([k]) * 16, 100.0 + k, "b", k, float(k))
             for k in range(4)
         ]
         store.put(items)

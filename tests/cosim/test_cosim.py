@@ -11,13 +11,13 @@ from servotwin.cosim import Loop, cosimulate, quantisation
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.limits import Limits
 from servotwin.estimation.estimate import GapStatus
-from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.reproduction import measures
+from servotwin.runtime.retry import Retry
 from servotwin.simulation import Simulation, simulate
 from servotwin.twin.known import known_gap
 from servotwin.twin.settings import TwinSettings
@@ -222,7 +222,7 @@ def test_fig_15_with_the_papers_own_estimates():
     errors = [math.degrees(e.gap - float(loop.run.gap[round(e.time * 5000)])) for e in loop.estimates]
     assert all(estimate.ok for estimate in loop.estimates)
     assert max(map(abs, errors)) < 0.5
-    assert -0.35 < np.mean(errors[2:]) < -0.25  # facts E8: what the observer has not forgotten at 0.25 s
+    assert -0.35 < np.mean(errors[2:]) < -0.25  # erratum E8: what the observer has not forgotten at 0.25 s
     settled = [step.settled for step in steps_of(loop)]
     assert not settled[1]
     # The others hang on 0.001 deg of an estimate (erratum E17): over 20 amplitudes within 1 %, at most one more moves.

@@ -16,8 +16,8 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.link.session import Retry
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window, checksum, unpack_channel
+from servotwin.runtime.retry import Retry
 
 
 def settings(**changes: Any) -> AgentSettings:

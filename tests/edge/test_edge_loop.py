@@ -11,10 +11,10 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink
 from servotwin.messages import Acknowledge, Message, Reason, Receipt, Update, Window, decode, encode
 from servotwin.runtime.clock import VirtualClock
+from servotwin.runtime.retry import Retry
 
 RATE, STEPS, HOSTILE_S, TAIL_S = 10.0, 10, 20.0, 40.0
 """Tiny windows of four samples, a reference step every two seconds, then a clean link to settle on."""

@@ -14,7 +14,6 @@ from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
-from servotwin.link.session import Retry
 from servotwin.messages import (
     Answer,
     Cause,
@@ -27,6 +26,7 @@ from servotwin.messages import (
     Window,
     unpack_channel,
 )
+from servotwin.runtime.retry import Retry
 
 LIMITS = ProbeLimits(size=1e-3, interval_s=5.0, rest_s=0.5)
 MOVE = Probe(1e-3, 0.4)

@@ -36,7 +36,7 @@ def test_a_crash_while_writing_leaves_the_old_one(tmp_path: Path, monkeypatch: p
     def crash(_: int) -> None:
         raise OSError("power is gone")
 
-    monkeypatch.setattr("servotwin.edge.store.os.fsync", crash)
+    monkeypatch.setattr("servotwin.runtime.files.os.fsync", crash)
     with pytest.raises(OSError, match="power"):
         store.save(GOOD)
     assert store.load() == Parameters(3, 2e-4)

@@ -21,8 +21,8 @@ from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
 from servotwin.edge_process.config_file import edge_toml, load, read
 from servotwin.errors import InvalidInput
-from servotwin.link.session import Retry
 from servotwin.messages import Band
+from servotwin.runtime.retry import Retry
 
 LAW = Controller(1377.7, 18907.6, -135.1, 0.1, voltage_limit=10.0, sample_rate=1000.0)
 PLAIN = """

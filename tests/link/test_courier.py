@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from servotwin.link.courier import Courier
 from servotwin.link.listener import Listener
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
-from servotwin.link.session import Retry
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import Acknowledge, Hello, Refusal, Update, Window, checksum, encode, pack_channel
+from servotwin.runtime.retry import Retry
 
 RETRY = Retry(1.0, 2.0, 8.0)
 KEY = key_of(verifier_of("secret"))

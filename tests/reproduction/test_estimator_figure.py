@@ -12,12 +12,12 @@ from servotwin.reproduction.runs import Runs
 
 
 @pytest.fixture(scope="module")
-def drawn() -> estimator.Data:
-    return estimator.data(Runs("paper"))
+def drawn() -> tuple[estimator.WindowPanel, ...]:
+    return estimator.estimator_data(Runs("paper"))
 
 
 def test_only_two_contacts_show_the_gap(drawn):
-    both, one, none = drawn.panels
+    both, one, none = drawn
     assert set(np.sign(both.pushed)) == {-1.0, 0.0, 1.0}
     assert len(set(np.sign(one.pushed)) - {0.0}) == 1
     assert set(none.pushed) == {0.0}
@@ -30,7 +30,7 @@ def test_only_two_contacts_show_the_gap(drawn):
 
 
 def test_one_contact_answers_but_the_screws_start_can_imitate_it(drawn):
-    one, none = drawn.panels[1:]
+    one, none = drawn[1:]
     assert np.abs(one.raw).max() > 1e-6
     assert np.abs(one.left).max() < 1e-9 * np.abs(one.raw).max()
     assert not np.any(none.raw)
@@ -39,13 +39,13 @@ def test_one_contact_answers_but_the_screws_start_can_imitate_it(drawn):
 def test_the_misfits_valley_is_a_point_a_line_or_a_plain(drawn):
     """How far the gap can be moved, the screw's start at its best, before the misfit doubles."""
     widths = []
-    for panel in drawn.panels:
+    for panel in drawn:
         least = panel.misfit.min(axis=0)
         widths.append(math.degrees(np.ptp(panel.gaps[0][least < 2.0 * least.min()])))
     assert widths[0] <= 1.0 < 15.0 < widths[1]
-    plain = np.mean(drawn.panels[2].misfit < 2.0 * drawn.panels[2].misfit.min())
+    plain = np.mean(drawn[2].misfit < 2.0 * drawn[2].misfit.min())
     assert plain > 0.8
-    line = np.mean(drawn.panels[1].misfit < 2.0 * drawn.panels[1].misfit.min())
+    line = np.mean(drawn[1].misfit < 2.0 * drawn[1].misfit.min())
     assert line < 0.2
 
 
@@ -55,7 +55,7 @@ def test_the_sensitivity_is_the_derivative(drawn):
     from servotwin.estimation.core.response import response
     from servotwin.plant.servo import Servo
 
-    panel, model = drawn.panels[0], response(Servo.preset("paper"), estimator.RATE)
+    panel, model = drawn[0], response(Servo.preset("paper"), estimator.RATE)
     begun, step = float(panel.theta_d[0]), 1e-7
     raw, left = estimator.sensitivity(panel.theta_m, Gap(estimator.GAP, begun), model)
     up, down = (

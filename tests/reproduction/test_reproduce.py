@@ -12,11 +12,10 @@ from rich.console import Console
 
 from servotwin.errors import InvalidInput
 from servotwin.report import page, style
-from servotwin.reproduction import claims, everything, figures, report
-from servotwin.reproduction.claims import Finding, Result, Verdict
-from servotwin.reproduction.figures import fig7, fig10b, figA1
+from servotwin.reproduction import claims, figures, report, reproduce
+from servotwin.reproduction.claims import ClaimResult, Finding, Verdict
+from servotwin.reproduction.figures import DrawnFigure, backlash, observer
 from servotwin.reproduction.runs import Runs
-from servotwin.reproduction.tasks import Drawn
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +28,10 @@ def quiet():
 
 
 def test_every_figure_of_the_paper_is_there_and_ours_come_last():
-    names = [plate.name for plate in figures.PLATES]
+    names = [figure.name for figure in figures.FIGURES]
     ours = ["estimator", "policies", "policies-noise", "policies-bias"]
     assert names == [*("fig4", "fig5", "fig7", "fig9", "fig10b", "fig11", "fig12", "fig15", "fig16", "figA1"), *ours]
-    assert all(plate.title and plate.caption for plate in figures.PLATES)
+    assert all(figure.title and figure.caption for figure in figures.FIGURES)
 
 
 @given(st.integers(1, 30000), st.integers(0, 2**32 - 1), st.integers(2, 400))
@@ -47,14 +46,13 @@ def test_the_envelope_keeps_extremes_and_ends(size, seed, columns):
 
 
 def test_the_same_figure_is_the_same_bytes(runs):
-    vectors = [style.svg(figures.fig7.PLATE.draw(runs), "fig7") for _ in range(2)]
+    vectors = [style.svg(reproduce.figure_spec("fig7").draw(runs), "fig7") for _ in range(2)]
     assert vectors[0] == vectors[1]
 
 
 @pytest.mark.parametrize("name", ["fig4", "fig5", "fig10b", "fig12", "figA1"])
 def test_figures_have_labels_with_units_and_a_legend(runs, name):
-    plate = next(one for one in figures.PLATES if one.name == name)
-    drawn = plate.draw(runs)
+    drawn = reproduce.figure_spec(name).draw(runs)
     labels = [text for axes in drawn.axes for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
     assert labels
     assert all(re.search(r"\((s|mm|deg|V|rad/s|dB.*)\)|dB", label) for label in labels)
@@ -62,13 +60,13 @@ def test_figures_have_labels_with_units_and_a_legend(runs, name):
 
 
 def test_fig_7_is_a_play_of_20_degrees():
-    d = fig7.data()
+    d = backlash.fig7_data()
     assert np.ptp(np.degrees(d.theta_m - d.theta_d)) == pytest.approx(20.0)
 
 
 def test_fig_10b_switches_where_the_error_crosses_the_tolerance(runs):
-    d = fig10b.data(runs)
-    for begin, end in fig10b.open_intervals(d):
+    d = backlash.fig10b_data(runs)
+    for begin, end in d.open_intervals:
         inside = (d.time > begin) & (d.time < end)
         assert np.all(np.abs(d.error[inside]) <= d.tolerance * (1.0 + 1e-9))
         assert np.all(d.dead_zone_error[inside] == 0.0)
@@ -77,10 +75,10 @@ def test_fig_10b_switches_where_the_error_crosses_the_tolerance(runs):
 
 def test_fig_a1_observers_forget_as_their_formula_says(runs):
     """The simulated observers against the matrix exponential of their error."""
-    d = figA1.data(runs)
+    d = observer.figA1_data(runs)
     for alpha, estimate in d.estimates.items():
-        one = figA1.observer(runs.servo, alpha)
-        exact = one.error(one.initial_state(figA1.INITIAL), d.time[250::500])
+        one = observer.observer(runs.servo, alpha)
+        exact = one.error(one.initial_state(observer.INITIAL), d.time[250::500])
         assert (d.position - estimate)[250::500] == pytest.approx(exact, abs=2e-5)
 
 
@@ -88,7 +86,7 @@ def test_fig_a1_observers_forget_as_their_formula_says(runs):
 def small(tmp_path_factory):
     """Two figures in this process."""
     out = tmp_path_factory.mktemp("reproduction") / "new"
-    everything.reproduce(out, only=("fig7,fig4",), console=quiet())
+    reproduce.reproduce(out, only=("fig7,fig4",), console=quiet())
     return out
 
 
@@ -100,7 +98,7 @@ def test_a_small_reproduction_writes_what_it_says(small):
 
 
 def test_a_pool_of_processes_gives_the_same(small, tmp_path):
-    everything.reproduce(tmp_path, only=("fig7", "crossover"), workers=2, console=quiet())
+    reproduce.reproduce(tmp_path, only=("fig7", "crossover"), workers=2, console=quiet())
     assert (tmp_path / "fig7.svg").read_bytes() == (small / "fig7.svg").read_bytes()
     (claim,) = json.loads((tmp_path / "claims.json").read_text())["claims"]
     assert list(claim["results"]) == ["paper", "table1", "paper-gain2"]
@@ -129,8 +127,8 @@ def test_the_report_holds_every_erratum():
 
 def test_the_report_shows_verdicts_first_and_escapes_texts():
     claim = claims.claims()[0]
-    results = [Result(claim, p, Finding(Verdict.NOT_AS_STATED, "a < b & c")) for p in ("paper", "table1")]
-    text = report.report(results, [Drawn("fig4", b"<svg/>")], "paper")
+    results = [ClaimResult(claim, p, Finding(Verdict.NOT_AS_STATED, "a < b & c")) for p in ("paper", "table1")]
+    text = report.report(results, [DrawnFigure("fig4", "Title", "Caption.", b"<svg/>")], "paper")
     assert_self_contained(text)
     assert text.index("Verdicts</h2>") < text.index("Figures</h2>") < text.index("Errata and decisions")
     assert "a &lt; b &amp; c" in text
@@ -138,18 +136,18 @@ def test_the_report_shows_verdicts_first_and_escapes_texts():
 
 
 def test_selection_takes_commas_repeats_and_keeps_the_papers_order():
-    chosen = everything.select(("fig12,crossover", "fig4"))
+    chosen = reproduce.select(("fig12,crossover", "fig4"))
     assert chosen.figures == ("fig4", "fig12")
     assert [claim.id for claim in chosen.claims] == ["crossover"]
-    assert len(everything.select(()).claims) == len(claims.claims())
+    assert len(reproduce.select(()).claims) == len(claims.claims())
 
 
 def test_an_unknown_name_is_refused():
     with pytest.raises(InvalidInput, match="did you mean 'fig12'"):
-        everything.select(("fig112",))
+        reproduce.select(("fig112",))
 
 
 def test_every_claim_is_planned_once_per_preset():
-    tasks = everything.planned(everything.select(()), "paper", None)
+    tasks = reproduce.planned(reproduce.select(()), "paper", None)
     planned = [(task.preset, claim.id) for task in tasks if hasattr(task, "claims") for claim in task.claims]
     assert len(planned) == len(set(planned)) == 3 * len(claims.claims())

@@ -10,13 +10,13 @@ import pytest
 
 import servotwin as st
 from servotwin.plant.servo import PRESETS
-from servotwin.reproduction import claims, document
-from servotwin.reproduction.claims import Finding, Result, Value, Verdict
-from servotwin.reproduction.claims.claim import decided
+from servotwin.reproduction import claims, documents
+from servotwin.reproduction.claims import ClaimResult, Finding, Value, Verdict
 from servotwin.reproduction.claims.linear import best_pd, pd_family
-from servotwin.reproduction.loops import LoopJob
-from servotwin.reproduction.measures import Step
+from servotwin.reproduction.claims.registry import decided
+from servotwin.reproduction.measures import MeasuredStep
 from servotwin.reproduction.runs import Runs
+from servotwin.reproduction.twin_runs import TwinJob
 
 LISTED = {claim.id: claim for claim in claims.claims()}
 
@@ -127,12 +127,12 @@ def test_fig_12_is_lost_where_it_is_known_to_be(runs):
 
 
 def test_the_bias_with_a_known_gap_is_the_known_one(runs):
-    found = runs["paper"].get(LoopJob("paper", exact=True)).trace.steps
+    found = runs["paper"].get(TwinJob("paper", exact=True)).trace.steps
     assert max(abs(step.bias) for step in found) == pytest.approx(0.072e-3, abs=0.001e-3)
     assert [round(step.amplitude * 1e3, 3) for step in found] == [0.009, 0.041] + [0.0] * 8
 
 
-def test_observer_claims_find_the_misprints(runs):
+def test_observer_claims_find_errata_e5_and_e6(runs):
     assert number(finding(runs, "observer-gains"), "fastest pole") == pytest.approx(-2.56e5, rel=1e-3)
     assert number(finding(runs, "observer-gains"), "slowest pole") == pytest.approx(-0.0125, rel=1e-3)
     assert finding(runs, "observer-matrix").verdict is Verdict.NOT_AS_STATED
@@ -148,7 +148,7 @@ def test_claims_that_need_the_reference_are_measured_for_both_readings(runs):
 def test_a_changed_run_changes_the_verdict(runs):
     """No verdict is a constant: the same function on a run that never rests says so."""
     fake = Runs("paper")
-    moving = Step(0.0, 60.0, 1e-3, 1e-3, 1e-3, 0.0, False, math.inf, 0.0, 0.0)
+    moving = MeasuredStep(0.0, 60.0, 1e-3, 1e-3, 1e-3, 0.0, False, math.inf, 0.0, 0.0)
     fake.settle = lambda *_, **__: moving
     assert claims.measure(LISTED["settle-0-5-10-15"], fake).finding.verdict is Verdict.NOT_AS_STATED
     assert claims.measure(LISTED["dead-zone-too-small"], fake).finding.verdict is Verdict.REPRODUCED
@@ -163,14 +163,14 @@ def test_noise_is_as_described(runs):
 def fake_results():
     claim = LISTED["crossover"]
     values = (Value("there", 1.5, "rad/s"), Value("missing", math.nan, "mm"), Value("never", math.inf, "s"))
-    one = Result(claim, "paper", Finding(Verdict.REPRODUCED, "a < b & c", values))
+    one = ClaimResult(claim, "paper", Finding(Verdict.REPRODUCED, "a < b & c", values))
     other = dataclasses.replace(one, preset="table1", unipolar=Finding(Verdict.NOT_AS_STATED, "because", ()))
     return [one, other]
 
 
 def test_claims_json_follows_its_schema():
-    found = json.loads(document.dumps(fake_results()))
-    assert found["schema"] == document.SCHEMA
+    found = json.loads(documents.claims_json(fake_results()))
+    assert found["schema"] == documents.CLAIMS_SCHEMA
     assert set(found) == {"schema", "paper", "version", "definitions", "presets", "claims"}
     assert found["presets"]["table1"]["model"] == st.Servo.preset("table1").version
     (claim,) = found["claims"]

@@ -20,7 +20,7 @@ from servotwin.estimation import whitened
 from servotwin.messages import Acknowledge, checksum, encode
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.store.rows import Claim, Kind, Stored
+from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.evidence import plain
@@ -40,8 +40,8 @@ def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], Model]:
     model = Model("m", scenario.model, scenario.twin, InForce(scenario.start_law, scenario.start_tolerance))
     fleet, state, found = Fleet((model,), (("*", "m"),)), b"", []
     for each in (m for m in cosimulate(scenario).messages if m.direction == "up"):
-        stored = Stored(1, Kind.WINDOW, each.data, "", each.arrival)
-        outcome = work(fleet, Claim(scenario.name, state, 0, (stored,)), each.arrival)
+        stored = StoredMessage(1, MessageKind.WINDOW, each.data, "", each.arrival)
+        outcome = work(fleet, Lease(scenario.name, state, 0, (stored,)), each.arrival)
         rows = [row for row in outcome.evidence if row.kind == "estimate"]
         found += [(each.data, row.body, dict(outcome.contexts)[row.context]) for row in rows]
         state = outcome.state
@@ -131,7 +131,9 @@ def test_a_window_that_no_estimator_took_is_the_same_again():
     blind = msgspec.structs.replace(window, channels=channels, crc=checksum(channels))
     model = estimated("fig15")[1]
     fleet = Fleet((model,), (("*", "m"),))
-    outcome = work(fleet, Claim(window.servo, b"", 0, (Stored(1, Kind.WINDOW, encode(blind), "", 0.0),)), 0.0)
+    outcome = work(
+        fleet, Lease(window.servo, b"", 0, (StoredMessage(1, MessageKind.WINDOW, encode(blind), "", 0.0),)), 0.0
+    )
     row = next(row for row in outcome.evidence if row.kind == "estimate")
     again = replay(encode(blind), row.body, dict(outcome.contexts)[row.context])
     assert (again.same, again.differs) == (True, ())

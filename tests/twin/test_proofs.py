@@ -18,7 +18,7 @@ from servotwin.redesign.certified.certificate import Certificate, Demands, Refus
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Stored
+from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.fleet import Fleet, Model
 from servotwin.twin.in_force import InForce
 from servotwin.twin.lookups import Question, decode_question
@@ -59,33 +59,35 @@ class Queue:
     def __init__(self, fleet: Fleet) -> None:
         self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
 
-    def give(self, message: Window | Receipt | Fallback | Incoming) -> Outcome:
-        body, kind = (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), Kind.WINDOW)
+    def give(self, message: Window | Receipt | Fallback | Incoming) -> WorkResult:
+        body, kind = (
+            (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), MessageKind.WINDOW)
+        )
         self.serial += 1
-        stored = Stored(self.serial, kind, body, "", float(self.serial))
-        outcome = work(self.fleet, Claim("axis", self.state, self.serial - 1, (stored,)), float(self.serial))
+        stored = StoredMessage(self.serial, kind, body, "", float(self.serial))
+        outcome = work(self.fleet, Lease("axis", self.state, self.serial - 1, (stored,)), float(self.serial))
         self.state = outcome.state
         self.outcomes.append(outcome)
         return outcome
 
-    def window(self, number: int, version: int = 0, **changes) -> Outcome:
+    def window(self, number: int, version: int = 0, **changes) -> WorkResult:
         return self.give(msgspec.structs.replace(windows()[number], parameter_version=version, **changes))
 
-    def applied(self, update: Update) -> Outcome:
+    def applied(self, update: Update) -> WorkResult:
         sample = round(update.data_time * 5000.0) + 20000
         return self.give(
             Receipt("axis", update.version, True, sample, Reason.APPLIED, update.version, update.window[0])
         )
 
 
-def sent(outcome: Outcome) -> Update:
+def sent(outcome: WorkResult) -> Update:
     (body,) = outcome.outgoing
     update = decode(body)
     assert isinstance(update, Update)
     return update
 
 
-def kinds(outcome: Outcome) -> list[str]:
+def kinds(outcome: WorkResult) -> list[str]:
     return [row.kind for row in outcome.evidence]
 
 
@@ -109,7 +111,7 @@ def begun(fleet: Fleet) -> tuple[Queue, Update, Incoming]:
 def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: Fleet) -> None:
     _, update, asked = begun(fleet)
     question = decode_question(asked.body)
-    assert (asked.servo, asked.kind, asked.encoding) == ("axis", Kind.PROOF, "")
+    assert (asked.servo, asked.kind, asked.encoding) == ("axis", MessageKind.VERIFICATION, "")
     assert (question.version, question.window) == (update.version, update.window)
     assert gains_of(question.setting.controller) == update.controller
     assert question.region.gap[0] < 12.0 * DEG < question.region.gap[1]

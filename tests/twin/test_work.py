@@ -20,7 +20,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window, decode, encode
 from servotwin.messages.compression import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.store.rows import Claim, Kind, Outcome, Stored
+from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import twin as twinmodule
 from servotwin.twin.evidence import LONGEST_STATUS, plain, tail_of
 from servotwin.twin.fleet import Fleet, Model
@@ -47,20 +47,20 @@ def windows() -> tuple[Window, ...]:
     return loop().windows
 
 
-def claim(*sent, state=b"", received=None, serial=0, attempts=1) -> Claim:
+def claim(*sent, state=b"", received=None, serial=0, attempts=1) -> Lease:
     """Messages, or bytes, or (bytes, encoding), as the store would lend them; ids from 1 on."""
     bodies = [each if isinstance(each, tuple) else (each, "") for each in sent]
     bodies = [(body if isinstance(body, bytes) else encode(body), encoding) for body, encoding in bodies]
     times = received or [float(k) for k in range(len(bodies))]
-    stored = [Stored(k + 1, Kind.WINDOW, *each, times[k]) for k, each in enumerate(bodies)]
-    return Claim("axis", state, serial, tuple(stored), attempts)
+    stored = [StoredMessage(k + 1, MessageKind.WINDOW, *each, times[k]) for k, each in enumerate(bodies)]
+    return Lease("axis", state, serial, tuple(stored), attempts)
 
 
-def kinds(outcome: Outcome, message: int) -> list[str]:
+def kinds(outcome: WorkResult, message: int) -> list[str]:
     return [row.kind for row in outcome.evidence if row.message == message]
 
 
-def statuses(outcome: Outcome, kind: str = "estimate") -> list[str]:
+def statuses(outcome: WorkResult, kind: str = "estimate") -> list[str]:
     return [row.status for row in outcome.evidence if row.kind == kind]
 
 
@@ -336,8 +336,8 @@ def test_it_says_what_the_twin_of_the_simulation_says(name):
     mine = Fleet((Model("m", scenario.model, scenario.twin, start),), (("*", "m"),))
     state, sent = b"", []
     for each in (m for m in lived.messages if m.direction == "up"):
-        stored = Stored(1, Kind.LETTER, each.data, "", each.arrival)
-        outcome = work(mine, Claim(scenario.name, state, 0, (stored,)), each.arrival)
+        stored = StoredMessage(1, MessageKind.LETTER, each.data, "", each.arrival)
+        outcome = work(mine, Lease(scenario.name, state, 0, (stored,)), each.arrival)
         state, sent = outcome.state, sent + list(outcome.outgoing)
     assert sent == [m.data for m in lived.messages if m.direction == "down" and not isinstance(m.message, Acknowledge)]
     assert len(sent) >= 1

@@ -26,8 +26,8 @@ from service_system import (
 from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
 from servotwin.messages import Acknowledge, Update, decode, encode
 from servotwin.messages.compression import compress
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.rows import Outcome
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import WorkResult
 from servotwin.twin_service.system import System
 from servotwin.twin_service.tokens import read_tokens, write_tokens
 
@@ -268,9 +268,9 @@ def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
         waiting = asyncio.create_task(asked)
         await asyncio.sleep(0.1)
         assert not waiting.done()
-        [claim] = system.store.claim("me", 1, 10.0, system.clocks.wall())
+        [claim] = system.store.lease("me", 1, 10.0, system.clocks.wall())
         done = tuple(message.id for message in claim.messages)
-        made = Outcome("ax-1", claim.serial, b"state", None, done, outgoing=(encode(update),))
+        made = WorkResult("ax-1", claim.serial, b"state", None, done, outgoing=(encode(update),))
         assert await system.dispatcher._committed(made)
         again = await client.get("/v1/servos/ax-1/outgoing", headers=bearer())
         for answer in (await waiting, again):

@@ -60,7 +60,7 @@ def left_behind(path: Path) -> list[int]:
             command = (entry / "cmdline").read_bytes() if entry.name.isdecimal() else b""
         except OSError:
             continue
-        if b"servotwin.up.attended" in command and os.fsencode(path) in command:
+        if b"servotwin.runtime.child_process" in command and os.fsencode(path) in command:
             found.append(int(entry.name))
     return found
 

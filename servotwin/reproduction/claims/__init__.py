@@ -1,10 +1,10 @@
 """The paper's claims: a list fixed in claims.toml before measuring, and a measuring function for each."""
 
 from servotwin.reproduction.claims import backlash, linear, loop, noise, observer  # they register their functions
-from servotwin.reproduction.claims.claim import (
+from servotwin.reproduction.claims.registry import (
     Claim,
+    ClaimResult,
     Finding,
-    Result,
     Value,
     Verdict,
     claims,
@@ -15,8 +15,8 @@ from servotwin.reproduction.claims.claim import (
 
 __all__ = [
     "Claim",
+    "ClaimResult",
     "Finding",
-    "Result",
     "Value",
     "Verdict",
     "backlash",

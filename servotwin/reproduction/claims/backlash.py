@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from servotwin.reproduction import measures as measure
-from servotwin.reproduction.claims.claim import Finding, decided, measures, measures_both
-from servotwin.reproduction.figures import fig7, fig10b
-from servotwin.reproduction.measures import LimitCycle, Step
+from servotwin.reproduction.claims.registry import Finding, decided, measures, measures_both
+from servotwin.reproduction.figures.backlash import PLAY_DEG, fig7_data, fig10b_data
+from servotwin.reproduction.measures import MeasuredCycle, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, ESTIMATE_DEG, STRESS_DEG, FixedFamilyJob, Runs, Square, Trace
 
 GAPS_DEG = (5.0, 10.0, 15.0)  # Fig 9's, as far as the text tells
@@ -22,15 +22,15 @@ MM = 1e3
 @measures("lost-motion")
 def lost_motion(_runs: Runs) -> Finding:
     """Range of theta_m - theta_d, and the screw at rest in between."""
-    d = fig7.data()
+    d = fig7_data()
     lag = np.degrees(d.theta_m - d.theta_d)
-    inside = np.abs(lag) < 0.5 * fig7.GAP_DEG - 1e-9
+    inside = np.abs(lag) < 0.5 * PLAY_DEG - 1e-9
     moved = float(np.degrees(np.abs(np.diff(d.theta_d))[inside[:-1] & inside[1:]].max()))
     span = float(np.ptp(lag))
     why = (
         f"the motor leads and trails by {span:.4g} deg in all, and the screw moves by {moved:.2g} deg while it crosses"
     )
-    reproduced = abs(span - fig7.GAP_DEG) < 0.01 and moved == 0.0
+    reproduced = abs(span - PLAY_DEG) < 0.01 and moved == 0.0
     return decided(reproduced, why, ("range of θm - θd", span, "deg"), ("screw's motion inside", moved, "deg"))
 
 
@@ -116,7 +116,7 @@ def bias_not_transparent(runs: Runs) -> Finding:
 
 @measures("under-estimate-limit")
 def under_estimate(runs: Runs) -> Finding:
-    """Where settling ends, and whether it ends for good."""
+    """Largest gap up to which all settle, and largest gap that settles."""
     found = runs.sweep(UNDER_DEG)
     settled = [step.settled for step in found]
     first = settled.index(False) if False in settled else len(settled)
@@ -149,7 +149,7 @@ def other_cycle(runs: Runs) -> Finding:
 @measures("undriven-inside")
 def undriven(runs: Runs) -> Finding:
     """Voltage inside and outside the tolerance."""
-    d = fig10b.data(runs)
+    d = fig10b_data(runs)
     inside = np.abs(d.error) < d.tolerance * (1.0 - 1e-9)
     outside = np.abs(d.error) > d.tolerance * (1.0 + 1e-9)
     largest = float(np.abs(d.voltage[inside]).max())
@@ -207,25 +207,25 @@ def lost_near_17(runs: Runs, square: Square) -> Finding:
     steps, stress = runs.wear(square).steps, runs.wear(square, STRESS_DEG).steps
     members = runs.get(FixedFamilyJob(runs.preset, square))
     share = 100.0 * float(np.mean([_lost_near_17(member) for member in members]))
-    why = f"{_told(steps)}; with the gap growing to {STRESS_DEG:g} deg: {_told(stress)}"
+    why = f"{_lost_steps(steps)}; with the gap growing to {STRESS_DEG:g} deg: {_lost_steps(stress)}"
     alike = (f"the same in {len(members)} runs with amplitudes 0.1 % apart", share, "%")
     return decided(_lost_near_17(steps), why, *_loss("", steps), *_loss("to 30 deg: ", stress), alike)
 
 
-def _lost_near_17(steps: Sequence[Step]) -> bool:
-    """Whether all settle up to a step that meets 16 to 18 deg, and none from there on."""
+def _lost_near_17(steps: Sequence[MeasuredStep]) -> bool:
+    """Decide: all settle up to a step that meets 16 to 18 deg, and none from there on."""
     settled = [step.settled for step in steps]
     first = settled.index(False) if False in settled else len(steps)
     return 0 < first < len(steps) and not any(settled[first:]) and _around_17(steps[first])
 
 
-def _around_17(step: Step) -> bool:
-    """Whether 16 to 18 deg is met by the gap at the begin or the end of a step."""
+def _around_17(step: MeasuredStep) -> bool:
+    """Decide: the gap at the begin or the end of a step is 16 to 18 deg."""
     return any(16.0 <= math.degrees(gap) <= 18.0 for gap in (step.gap_begin, step.gap_end))
 
 
-def _told(steps: Sequence[Step]) -> str:
-    """Which steps did not settle, and the gap where that begins."""
+def _lost_steps(steps: Sequence[MeasuredStep]) -> str:
+    """Word the steps that did not settle, and the gap where the first of them begins."""
     lost = [i for i, step in enumerate(steps) if not step.settled]
     if not lost:
         return "every step settles"
@@ -234,23 +234,23 @@ def _told(steps: Sequence[Step]) -> str:
     return f"not settled are the steps {names}, the first of which begins at {first:.3g} deg"
 
 
-def _loss(prefix: str, steps: Sequence[Step]) -> list[tuple[str, float, str]]:
+def _loss(prefix: str, steps: Sequence[MeasuredStep]) -> list[tuple[str, float, str]]:
     lost = [step for step in steps if not step.settled]
     gap = math.degrees(lost[0].gap_begin) if lost else math.nan
     return [(f"{prefix}steps not settled", len(lost), ""), (f"{prefix}gap where the first begins", gap, "deg")]
 
 
-def _cycle(trace: Trace) -> LimitCycle:
+def _cycle(trace: Trace) -> MeasuredCycle:
     """The oscillation over the last half of the run."""
     last = measure.tail(trace.time, float(trace.time[-1]), 30.0)
     return measure.limit_cycle(trace.time[last], trace.position[last])
 
 
-def _cycles(runs: Runs) -> dict[float, LimitCycle]:
+def _cycles(runs: Runs) -> dict[float, MeasuredCycle]:
     return {gap: _cycle(runs.step(gap)) for gap in GAPS_DEG}
 
 
-def _amplitudes(cycles: dict[float, LimitCycle]) -> list[tuple[str, float, str]]:
+def _amplitudes(cycles: dict[float, MeasuredCycle]) -> list[tuple[str, float, str]]:
     return [(f"amplitude, gap {gap:g} deg", cycle.amplitude * MM, "mm") for gap, cycle in cycles.items()]
 
 
@@ -264,18 +264,18 @@ def _list(gaps: Sequence[float]) -> str:
     return ", ".join(f"{gap:g}" for gap in gaps)
 
 
-def _settled(gaps: Sequence[float], found: Sequence[Step]) -> str:
+def _settled(gaps: Sequence[float], found: Sequence[MeasuredStep]) -> str:
     return _list([gap for gap, step in zip(gaps, found, strict=True) if step.settled]) or "none"
 
 
-def _share(members: Sequence[Step]) -> float:
+def _share(members: Sequence[MeasuredStep]) -> float:
     return float(np.mean([step.settled for step in members]))
 
 
-def _worst_bias(members: Sequence[Step]) -> float:
+def _worst_bias(members: Sequence[MeasuredStep]) -> float:
     """Largest bias of the settled members, m."""
     return max((abs(step.bias) for step in members if step.settled), default=math.nan)
 
 
-def _worst(found: Sequence[Step]) -> list[tuple[str, float, str]]:
+def _worst(found: Sequence[MeasuredStep]) -> list[tuple[str, float, str]]:
     return [("largest amplitude at the end", max(step.amplitude for step in found) * MM, "mm")]

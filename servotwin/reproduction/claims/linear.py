@@ -11,10 +11,10 @@ from servotwin.plant.linear import LinearSystem, pidf
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 from servotwin.reproduction import measures as measure
-from servotwin.reproduction.claims.claim import Finding, Verdict, decided, listed, measures
+from servotwin.reproduction.claims.registry import Finding, Verdict, decided, listed, measures
 from servotwin.reproduction.runs import PERIOD, Runs
 
-WANTED, MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
+CROSSOVER, MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
 LOOP_FILTER_HZ = 20.0  # section 4.3
 
 
@@ -29,7 +29,9 @@ def crossover(runs: Runs) -> Finding:
         f' {margins.bandwidth:.4g} rad/s, so that "bandwidth" means the crossover'
     )
     values = [(f"gain crossover {i + 1}", omega, "rad/s") for i, omega in enumerate(crossovers)]
-    return decided(abs(first - WANTED) < 0.01 * WANTED, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s"))
+    return decided(
+        abs(first - CROSSOVER) < 0.01 * CROSSOVER, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s")
+    )
 
 
 @measures("phase-margin")
@@ -65,7 +67,7 @@ def loop_filter(runs: Runs) -> Finding:
 
 @measures("pidtune")
 def pidtune(runs: Runs) -> Finding:
-    """MATLAB is not at hand; what can be said is how the printed gains factor."""
+    """Without MATLAB only the zeros of the printed gains can be shown."""
     law = runs.servo.controller
     zeros = np.roots([law.Kp * law.Tf + law.Kd, law.Kp + law.Ki * law.Tf, law.Ki])
     margins = runs.servo.margins()
@@ -98,7 +100,7 @@ def _static(closed: LinearSystem, name: str) -> Finding:
 
 @measures("pd-bandwidth")
 def pd_bandwidth(runs: Runs) -> Finding:
-    """Whether any filtered PD crosses over at 10 rad/s with 10 deg of margin."""
+    """Search the filtered PDs that cross over at 10 rad/s for one with 10 deg of margin."""
     first = runs.servo.margins(without_integral(runs.servo)).gain_crossovers[0].omega
     laws = pd_family(runs.servo)
     stable = [law for law in laws if runs.servo.closed_loop(law).is_stable()]
@@ -114,20 +116,20 @@ def pd_bandwidth(runs: Runs) -> Finding:
 
 
 def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller]:
-    """The largest margin (deg) among stabilising controllers, and whose it is."""
+    """Largest margin (deg) among stabilising controllers, and its controller."""
     return max(((pd_margin_deg(servo, law), law) for law in laws), key=lambda pair: pair[0])
 
 
 def pd_family(servo: Servo) -> list[Controller]:
     """Kp (1 + ratio s / (s/pole + 1)) with a gain of 1 at 10 rad/s: leads, lags and right-half-plane zeros."""
-    plant = complex(servo.plant().response(WANTED))
+    plant = complex(servo.plant().response(CROSSOVER))
     steps = np.geomspace(1e-3, 10.0, 17)
     pairs = [(float(ratio), float(pole)) for ratio in (0.0, *steps, *-steps) for pole in np.geomspace(1.0, 1e3, 25)]
     return [_pd(servo, plant, ratio, pole) for ratio, pole in pairs]
 
 
 def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
-    shape = 1.0 + ratio * 1j * WANTED / (1j * WANTED / pole + 1.0)
+    shape = 1.0 + ratio * 1j * CROSSOVER / (1j * CROSSOVER / pole + 1.0)
     gain = 1.0 / abs(shape * plant)
     return servo.controller.replace(Kp=gain, Ki=0.0, Kd=gain * ratio, Tf=1.0 / pole)
 
@@ -135,7 +137,7 @@ def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
 def pd_margin_deg(servo: Servo, law: Controller) -> float:
     """Smallest phase margin, deg; 0 when it crosses over below 10 rad/s too."""
     margins = servo.margins(law)
-    early = margins.gain_crossovers[0].omega < 0.99 * WANTED
+    early = margins.gain_crossovers[0].omega < 0.99 * CROSSOVER
     return 0.0 if early else smallest_margin_deg(margins)
 
 

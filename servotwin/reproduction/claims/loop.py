@@ -8,27 +8,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servotwin.reproduction.claims.claim import Finding, Verdict, decided, listed, measures, measures_both
 from servotwin.reproduction.claims.linear import linear_settling_time
-from servotwin.reproduction.loops import CONTINUOUS, SAMPLED, FamilyJob, LoopJob, Record
-from servotwin.reproduction.measures import Array, Step
+from servotwin.reproduction.claims.registry import Finding, Verdict, decided, listed, measures, measures_both
+from servotwin.reproduction.measures import Array, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, BIPOLAR, FixedFamilyJob, Runs, Square
-from servotwin.reproduction.windows import WindowJob
+from servotwin.reproduction.twin_runs import CONTINUOUS, SAMPLED, TwinFamilyJob, TwinJob, TwinRun, WindowJob
 
 RATE_BITS = 100e6  # bit/s, section 4
 UNBIASED_DEG = 0.05
 MM = 1e3
-Family = Sequence[Sequence[Step]]
+Family = Sequence[Sequence[MeasuredStep]]
 
 
-def fig15(runs: Runs, square: Square = BIPOLAR, scenario: str = CONTINUOUS, exact: bool = False) -> Record:
+def fig15(runs: Runs, square: Square = BIPOLAR, scenario: str = CONTINUOUS, exact: bool = False) -> TwinRun:
     """Fig 15's run."""
-    return runs.get(LoopJob(runs.preset, scenario, square, exact=exact))
+    return runs.get(TwinJob(runs.preset, scenario, square, exact=exact))
 
 
 def family(runs: Runs, square: Square, exact: bool = False) -> Family:
     """The steps of nine runs like Fig 15's, whose reference amplitudes differ by 0.1 % each."""
-    return runs.get(FamilyJob(runs.preset, square, exact))
+    return runs.get(TwinFamilyJob(runs.preset, square, exact))
 
 
 @measures_both("always-restabilised")
@@ -185,12 +184,12 @@ def unbiased(runs: Runs) -> Finding:
 
 
 def _settled_counts(found: Family) -> list[int]:
-    """How many steps settle, for each run."""
+    """Number of settled steps, for each run."""
     return [sum(step.settled for step in steps) for steps in found]
 
 
 def _unsettled_counts(found: Family) -> dict[int, int]:
-    """In how many runs a step does not settle, by the step's number, for those that ever do not."""
+    """Number of runs in which a step does not settle, by the step's number; steps that always settle left out."""
     counts = Counter(i for steps in found for i, step in enumerate(steps, start=1) if not step.settled)
     return dict(sorted(counts.items()))
 

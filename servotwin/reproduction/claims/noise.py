@@ -9,26 +9,26 @@ import numpy as np
 from scipy import signal
 
 import servotwin as st
-from servotwin.reproduction.claims.claim import Finding, decided, measures, measures_both
-from servotwin.reproduction.loops import NOISY, SAMPLED, SEEDS, LoopJob, Record
+from servotwin.reproduction.claims.registry import Finding, decided, measures, measures_both
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import AMPLITUDE, BIPOLAR, PERIOD, RATE, Runs, Square
+from servotwin.reproduction.twin_runs import NOISY, SAMPLED, SEEDS, TwinJob, TwinRun
 
 MM = 1e3
 NOISE = st.Noise(std=0.22e-3, band=(10.0, 50.0))  # section 4.3
 
 
-def noisy(runs: Runs, square: Square = BIPOLAR, k_dz: float = 1.0) -> list[Record]:
+def noisy(runs: Runs, square: Square = BIPOLAR, k_dz: float = 1.0) -> list[TwinRun]:
     """Fig 16's run for every seed."""
-    return [runs.get(LoopJob(runs.preset, NOISY, square, seed, k_dz)) for seed in SEEDS]
+    return [runs.get(TwinJob(runs.preset, NOISY, square, seed, k_dz)) for seed in SEEDS]
 
 
-def quiet(runs: Runs, square: Square = BIPOLAR) -> Record:
+def quiet(runs: Runs, square: Square = BIPOLAR) -> TwinRun:
     """Fig 16's loop without its noise: Fig 15 sampled."""
-    return runs.get(LoopJob(runs.preset, SAMPLED, square))
+    return runs.get(TwinJob(runs.preset, SAMPLED, square))
 
 
-def deviations(records: Sequence[Record]) -> Array:
+def deviations(records: Sequence[TwinRun]) -> Array:
     """(10,) m: standard deviation of the position over the last 5 s of each step, median over the seeds."""
     return np.median([[step.deviation for step in record.trace.steps] for record in records], axis=0)
 
@@ -138,7 +138,7 @@ def copes(runs: Runs, square: Square) -> Finding:
     return decided(loud == 0, why, ("largest amplitude", worst * MM, "mm"), ("steps over 10 %", loud))
 
 
-def _bias(records: Sequence[Record]) -> tuple[float, float]:
+def _bias(records: Sequence[TwinRun]) -> tuple[float, float]:
     """Mean and standard error of the estimates' errors from step 3 on, deg."""
     errors = np.degrees([one.error for record in records for one in record.estimates[2:]])
     return float(errors.mean()), float(errors.std(ddof=1) / math.sqrt(errors.size))

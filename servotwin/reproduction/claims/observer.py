@@ -8,8 +8,8 @@ import numpy as np
 
 from servotwin.estimation.paper.observer import Observer, observer
 from servotwin.reproduction import measures as measure
-from servotwin.reproduction.claims.claim import Finding, decided, measures
-from servotwin.reproduction.figures.figA1 import ALPHAS, INITIAL
+from servotwin.reproduction.claims.registry import Finding, decided, measures
+from servotwin.reproduction.figures.observer import ALPHAS, INITIAL
 from servotwin.reproduction.measures import Array, Complex
 from servotwin.reproduction.runs import Runs
 
@@ -19,7 +19,7 @@ BAND = 0.02 * 1.5e-3  # m: 2 % of the initial error
 
 @measures("observer-quarter-second")
 def quarter_second(runs: Runs) -> Finding:
-    """When the error comes to stay below 2 % of its start, from the matrix exponential."""
+    """Time after which the error stays below 2 % of its start, from the matrix exponential."""
     times = {alpha: forgetting_time(observer(runs.servo, alpha)) for alpha in ALPHAS}
     why = f"with α = 40 the error stays below 2 % of the initial 1.5 mm after {times[ALPHA]:.3g} s"
     values = [(f"time for α = {alpha:g} 1/s", time, "s") for alpha, time in times.items()]

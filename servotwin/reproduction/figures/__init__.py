@@ -1,27 +1,12 @@
-"""The paper's figures in its order, then ours; `PLATES` lists them."""
+"""Figures of the paper in its order (`PAPER`), then those beyond it (`BEYOND`)."""
 
 from typing import Any
 
-from servotwin.reproduction.figures import (
-    estimator,
-    fig4,
-    fig5,
-    fig7,
-    fig9,
-    fig10b,
-    fig11,
-    fig12,
-    fig15,
-    fig16,
-    figA1,
-    policies,
-)
-from servotwin.reproduction.figures.plate import Plate
+from servotwin.reproduction.figures import backlash, estimator, linear, observer, policies, twin
+from servotwin.reproduction.figures.spec import DrawnFigure, FigureSpec
 
-OURS: tuple[Plate[Any], ...] = (estimator.PLATE, *policies.PLATES)
-PLATES: tuple[Plate[Any], ...] = (
-    *(module.PLATE for module in (fig4, fig5, fig7, fig9, fig10b, fig11, fig12, fig15, fig16, figA1)),
-    *OURS,
-)
+PAPER: tuple[FigureSpec[Any], ...] = (*linear.FIGURES, *backlash.FIGURES, *twin.FIGURES, observer.FIGURE)
+BEYOND: tuple[FigureSpec[Any], ...] = (estimator.FIGURE, *policies.FIGURES)
+FIGURES = (*PAPER, *BEYOND)
 
-__all__ = ["OURS", "PLATES", "Plate"]
+__all__ = ["BEYOND", "FIGURES", "PAPER", "DrawnFigure", "FigureSpec"]

@@ -1,8 +1,9 @@
-"""The estimator explained: what a window with two contacts, one contact or none says about the gap."""
+"""Figure beyond the paper: information on the gap in a window with two contacts, with one, and with none."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.report import style
-from servotwin.reproduction.figures.plate import Plate
+from servotwin.reproduction.figures.spec import FigureSpec
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import AMPLITUDE, RATE, Runs
 from servotwin.simulation import Run, simulate
@@ -37,7 +38,7 @@ CALM, BEFORE_STEP = 0.0, 0.75  # integral gain over its own, and how long before
 
 
 @dataclass(frozen=True, eq=False)
-class Panel:
+class WindowPanel:
     """One window.
 
     Attributes
@@ -50,7 +51,7 @@ class Panel:
     pushed : (n,) array
         +1 while the motor pushes the screw forwards, -1 backwards, 0 while the gap is open.
     raw, left : (n,) arrays
-        Derivative of the position by the gap (m/rad); the part of it that nothing else can imitate.
+        Derivative of the position by the gap (m/rad); its part that no other unknown can imitate.
     spread : float
         rad: Cramer-Rao bound of the standard deviation in white noise of `FLOOR`; inf: no information.
     gaps, starts, misfit : (PLACES, GAPS) arrays
@@ -75,23 +76,14 @@ class Panel:
     start: float
 
 
-@dataclass(frozen=True, eq=False)
-class Data:
-    """Three windows."""
-
-    panels: tuple[Panel, ...]
-
-
-def data(runs: Runs) -> Data:
-    """The paper's loop after a step; a calm loop around a step; the same loop at rest."""
+def estimator_data(runs: Runs) -> tuple[WindowPanel, ...]:
+    """Simulate three windows: the paper's loop after a step; a calm loop around a step; the same loop at rest."""
     servo = runs.servo
     lively, calm = _run(servo, 1.0), _run(servo, CALM)
-    return Data(
-        (
-            _panel("two contacts", servo, lively, HALF_PERIOD),
-            _panel("one contact", servo, calm, HALF_PERIOD - BEFORE_STEP),
-            _panel("at rest", servo, calm, HALF_PERIOD - SPAN - 0.5),
-        )
+    return (
+        _panel("two contacts", servo, lively, HALF_PERIOD),
+        _panel("one contact", servo, calm, HALF_PERIOD - BEFORE_STEP),
+        _panel("at rest", servo, calm, HALF_PERIOD - SPAN - 0.5),
     )
 
 
@@ -103,7 +95,7 @@ def _run(servo: Servo, integral: float) -> Run:
     )
 
 
-def _panel(title: str, servo: Servo, run: Run, start: float) -> Panel:
+def _panel(title: str, servo: Servo, run: Run, start: float) -> WindowPanel:
     clean = Window.from_run(run, start, SPAN)
     noise = FLOOR * np.random.default_rng(0).standard_normal(clean.position.size)
     window = clean.replace(position=clean.position + noise)
@@ -118,23 +110,38 @@ def _panel(title: str, servo: Servo, run: Run, start: float) -> Panel:
     begun = float(theta_d[0] - window.theta_m[0])
     pushed = np.sign(window.theta_m - theta_d) * (np.abs(window.theta_m - theta_d) >= 0.5 * GAP * (1.0 - 1e-6))
     time = np.arange(theta_d.size) / RATE
-    return Panel(title, time, window.theta_m, theta_d, pushed, raw, left, spread, *cost(window, model), estimate, begun)
+    gaps, starts, misfit = cost(window, model)
+    return WindowPanel(
+        title=title,
+        time=time,
+        theta_m=window.theta_m,
+        theta_d=theta_d,
+        pushed=pushed,
+        raw=raw,
+        left=left,
+        spread=spread,
+        gaps=gaps,
+        starts=starts,
+        misfit=misfit,
+        estimate=estimate,
+        start=begun,
+    )
 
 
 def sensitivity(theta_m: Array, at: Gap, model: Response) -> tuple[Array, Array]:
-    """(n,) derivative of the position by the gap, whole and without what the other unknowns can imitate.
+    """Derivative of the position by the gap, (n,): whole, and its part that no other unknown can imitate.
 
-    They are the screw's start, the structure's motion from before, the encoder's offset and a delay.
+    The other unknowns are the screw's start, the structure's initial state, the encoder's offset and a delay.
     """
-    seen = contacts(theta_m, at)
-    by_gap, by_start = model.respond(seen[[BY_GAP, BY_START]])
-    late = model.velocities(seen[[SCREW]])
+    signals = contacts(theta_m, at)
+    by_gap, by_start = model.respond(signals[[BY_GAP, BY_START]])
+    late = model.velocities(signals[[SCREW]])
     others = np.vstack([by_start, np.ones(theta_m.size), model.free(theta_m.size), late])
     return by_gap, project_out(orthonormal(others), by_gap[None])[0]
 
 
 def cost(window: Window, model: Response) -> tuple[Array, Array, Array]:
-    """Gap, screw's start and root mean square residual (PLACES, GAPS), the linear unknowns at their best everywhere."""
+    """Gap, screw's start and rms residual, (PLACES, GAPS) each; the linear unknowns are at their best everywhere."""
     assert window.theta_m is not None
     misfit = Reduction.of(window.theta_m, window.position, model).coarse()
     gaps, places = np.meshgrid(np.linspace(0.0, WIDEST, GAPS), np.linspace(-1.0, 1.0, PLACES))
@@ -143,14 +150,14 @@ def cost(window: Window, model: Response) -> tuple[Array, Array, Array]:
     return gaps, 0.5 * gaps * places, np.sqrt(squares / misfit.position.size)
 
 
-def plot(d: Data) -> Figure:
-    """Angles, what the contacts contribute, and the misfit over gap and start; one column for each window."""
+def plot(windows: Sequence[WindowPanel]) -> Figure:
+    """Draw angles, sensitivity and misfit; one column per window."""
     figure, axes = style.panels(3, 3, height=2.3, heights=(1.0, 0.9, 1.35), share=False)
-    reach = 1.1 * max(float(np.abs(panel.raw).max()) for panel in d.panels)
-    for column, panel in zip(axes.T, d.panels, strict=True):
+    reach = 1.1 * max(float(np.abs(panel.raw).max()) for panel in windows)
+    for column, panel in zip(axes.T, windows, strict=True):
         _angles(column[0], panel)
         _contribution(column[1], panel, reach)
-    meshes = [_misfit(one, panel) for one, panel in zip(axes[2], d.panels, strict=True)]
+    meshes = [_misfit(one, panel) for one, panel in zip(axes[2], windows, strict=True)]
     for row, label in zip(axes[:, 0], ("Angle (deg)", "Position by gap (µm/deg)", "Screw's start (deg)"), strict=True):
         row.set_ylabel(label)
     figure.align_ylabels(axes[:, 0])
@@ -161,7 +168,7 @@ def plot(d: Data) -> Figure:
     return figure
 
 
-def _angles(axes: Axes, panel: Panel) -> None:
+def _angles(axes: Axes, panel: WindowPanel) -> None:
     _shade(axes, panel)
     origin = float(panel.theta_m[0])
     style.trace(axes, panel.time, (panel.theta_m - origin) * style.DEG, style.BLUE, r"motor $\theta_m$")
@@ -170,8 +177,8 @@ def _angles(axes: Axes, panel: Panel) -> None:
     axes.tick_params(labelbottom=False)
 
 
-def _shade(axes: Axes, panel: Panel) -> None:
-    """Forwards contact orange, backwards contact green."""
+def _shade(axes: Axes, panel: WindowPanel) -> None:
+    """Shade contact forwards orange, contact backwards green."""
     for side, color in ((1.0, style.ORANGE), (-1.0, style.GREEN)):
         axes.fill_between(
             panel.time,
@@ -185,7 +192,7 @@ def _shade(axes: Axes, panel: Panel) -> None:
         )
 
 
-def _contribution(axes: Axes, panel: Panel, reach: float) -> None:
+def _contribution(axes: Axes, panel: WindowPanel, reach: float) -> None:
     per_degree = 1e6 / style.DEG
     _shade(axes, panel)
     axes.plot(panel.time, panel.raw * per_degree, color=style.GREY, label="whole")
@@ -197,7 +204,7 @@ def _contribution(axes: Axes, panel: Panel, reach: float) -> None:
     axes.set_title(known, loc="right", fontsize=8.0)
 
 
-def _misfit(axes: Axes, panel: Panel) -> QuadMesh:
+def _misfit(axes: Axes, panel: WindowPanel) -> QuadMesh:
     norm = LogNorm(0.1, 100.0)
     values = np.maximum(panel.misfit * 1e6, 0.1)
     gaps, starts = panel.gaps * style.DEG, panel.starts * style.DEG
@@ -206,12 +213,12 @@ def _misfit(axes: Axes, panel: Panel) -> QuadMesh:
     axes.plot(GAP * style.DEG, panel.start * style.DEG, "o", color="white", markeredgecolor=style.BLACK, markersize=6)
     axes.set(xlabel="Gap (deg)", xlim=(0.0, WIDEST * style.DEG), facecolor="#EEEEEE")
     axes.grid(False)
-    axes.set_title(said(panel.estimate), loc="right", fontsize=8.0)
+    axes.set_title(answer(panel.estimate), loc="right", fontsize=8.0)
     return mesh
 
 
-def said(estimate: GapEstimate) -> str:
-    """What the estimator answers, in a few words."""
+def answer(estimate: GapEstimate) -> str:
+    """Word the estimator's result in one line."""
     if estimate.ok:
         return f"OK: {estimate.gap * style.DEG:.3f} ± {estimate.std * style.DEG:.3f} deg"
     if estimate.status is GapStatus.LOWER_BOUND:
@@ -219,14 +226,14 @@ def said(estimate: GapEstimate) -> str:
     return estimate.status.value
 
 
-PLATE = Plate(
+FIGURE = FigureSpec(
     "estimator",
     "When a window shows the gap.",
-    "Three windows of a loop with a gap of 10 deg and 1 µm of white noise: (a) pushed both ways, (b) one way, (c) not"
-    " at all. Above: motor and screw, the contacts shaded (forwards orange, backwards green). Middle: how the position"
-    " answers to a wider gap, and the part of that answer that no other unknown can imitate; above it the Cramer-Rao"
-    " bound. Below: the misfit over the gap and the screw's first angle (from the motor's), all linear unknowns at"
-    " their best; the dot is the truth, and above it what the estimator answers.",
-    data,
+    "Three windows of a loop with a gap of 10 deg and 1 µm of white noise. The motor pushes the screw (a) both ways,"
+    " (b) one way, (c) not at all. Above: motor and screw, the contacts shaded (forwards orange, backwards green)."
+    " Middle: the change of the position for a wider gap, and the part of it that no other unknown can imitate;"
+    " above the panel the Cramer-Rao bound. Below: the misfit over the gap and the screw's first angle (from the"
+    " motor's), all linear unknowns at their best; the dot is the truth; above the panel the estimator's result.",
+    estimator_data,
     plot,
 )

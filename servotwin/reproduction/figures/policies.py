@@ -1,4 +1,4 @@
-"""Beyond the paper: the policies on one wear, each in the same loop; what they leave, and what they sent."""
+"""Figures beyond the paper: the policies on the same wear, each in the same loop; errors left and updates sent."""
 
 from __future__ import annotations
 
@@ -15,16 +15,25 @@ from matplotlib.ticker import MultipleLocator
 
 from servotwin.messages import Gains
 from servotwin.report import style
-from servotwin.reproduction.beyond import ALONE, BIASED, CLEAN, CONTESTANTS, NOISE, Condition, Outcome, PolicyJob, worst
-from servotwin.reproduction.figures import worn
-from servotwin.reproduction.figures.plate import Plate
-from servotwin.reproduction.inforce import Change
-from servotwin.reproduction.loops import Record
+from servotwin.reproduction.figures import wear_panels
+from servotwin.reproduction.figures.spec import FigureSpec
 from servotwin.reproduction.measures import Array
+from servotwin.reproduction.policy_runs import (
+    ALONE,
+    BIASED,
+    CLEAN,
+    CONTESTANTS,
+    NOISE,
+    LoopCondition,
+    PolicyJob,
+    PolicyOutcome,
+    worst,
+)
 from servotwin.reproduction.runs import AMPLITUDE, DURATION, Runs
+from servotwin.reproduction.twin_runs import SettingChange, TwinRun
 
 
-class Look(NamedTuple):
+class LineStyle(NamedTuple):
     """Colour, line width and marker; widths differ so that equal lines show through."""
 
     color: str
@@ -32,45 +41,45 @@ class Look(NamedTuple):
     marker: str
 
 
-LOOKS = {
-    "paper": Look(style.ORANGE, 3.4, "s"),
-    "margin": Look(style.GREEN, 2.6, "^"),
-    "hysteresis": Look(style.PINK, 1.8, "D"),
-    "certified": Look(style.BLUE, 1.0, "o"),
-    ALONE: Look(style.SKY, 4.2, "v"),
+LINE_STYLES = {
+    "paper": LineStyle(style.ORANGE, 3.4, "s"),
+    "margin": LineStyle(style.GREEN, 2.6, "^"),
+    "hysteresis": LineStyle(style.PINK, 1.8, "D"),
+    "certified": LineStyle(style.BLUE, 1.0, "o"),
+    ALONE: LineStyle(style.SKY, 4.2, "v"),
 }
 APART = 1.5  # s, between markers that would hide one another
 LEAST = 2e-5  # m: the errors' axis never shows less
 
-Policied = list[tuple[str, Record]]
+RunsByPolicy = list[tuple[str, TwinRun]]
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
-    """What came of each policy, the servo's own gains, and the reference."""
+class PolicyComparison:
+    """PolicyOutcome of each policy, the servo's own gains, and time (s), reference (m) and gap (rad) of all of them."""
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[PolicyOutcome, ...]
     own: Gains
     time: Array
     reference: Array
     gap: Array
 
 
-def data_of(condition: Condition, duration: float = DURATION) -> Callable[[Runs], Data]:
-    """The data of the figure for a condition."""
+def data_of(condition: LoopCondition, duration: float = DURATION) -> Callable[[Runs], PolicyComparison]:
+    """Make the function that simulates every policy in a condition."""
 
-    def data(runs: Runs) -> Data:
+    def data(runs: Runs) -> PolicyComparison:
         outcomes = tuple(runs.get(PolicyJob(runs.preset, policy, condition, duration)) for policy in CONTESTANTS)
-        trace = next(one.record.trace for one in outcomes if one.record is not None)
+        trace = next(one.run.trace for one in outcomes if one.run is not None)
         law = runs.servo.controller
         own = Gains(law.Kp, law.Ki, law.Kd, law.Tf)
-        return Data(outcomes, own, trace.time, trace.reference, trace.gap)
+        return PolicyComparison(outcomes, own, trace.time, trace.reference, trace.gap)
 
     return data
 
 
-def plot(d: Data) -> Figure:
-    """Reference, one error per policy, gap and estimates, and what was in force: dead zone, gains, feedforward."""
+def plot(d: PolicyComparison) -> Figure:
+    """Draw reference, one error per policy, gap and estimates, and in force: dead zone, gains, feedforward."""
     heights = (0.6, *(0.8 for _ in d.outcomes), 1.3, 1.0, 1.0, 1.0)
     figure, grid = style.panels(len(heights), 1, height=1.2, heights=heights)
     panels = list(grid[:, 0])
@@ -79,7 +88,7 @@ def plot(d: Data) -> Figure:
     reach = _reach(d.outcomes)
     for axes, outcome in zip(errors, d.outcomes, strict=True):
         _error(axes, outcome, reach)
-    ran = [(one.policy, one.record) for one in d.outcomes if one.record is not None]
+    ran = [(one.policy, one.run) for one in d.outcomes if one.run is not None]
     _gap(gap, ran, d)
     _in_force(tolerance, ran, lambda change: change.tolerance * style.MM, "Dead zone\n(mm)")
     style.legend(tolerance, columns=5)
@@ -93,51 +102,51 @@ def plot(d: Data) -> Figure:
     return figure
 
 
-def _reference(axes: Axes, d: Data) -> None:
-    axes.plot(*worn.held(d.time[:-1], d.reference[:-1] * style.MM), color=style.BLACK)
+def _reference(axes: Axes, d: PolicyComparison) -> None:
+    axes.plot(*wear_panels.corners(d.time[:-1], d.reference[:-1] * style.MM), color=style.BLACK)
     axes.set(ylabel="Reference\n(mm)", ylim=(-1.4 * AMPLITUDE * style.MM, 1.4 * AMPLITUDE * style.MM))
 
 
-def _reach(outcomes: Sequence[Outcome]) -> float:
-    """Half the errors' axis, m: what any policy leaves, with some room."""
+def _reach(outcomes: Sequence[PolicyOutcome]) -> float:
+    """Half the range of the errors' axis, m: the largest error left by any policy, with some room."""
     left = [step.error for one in outcomes for step in one.steps]
     return 1.3 * max([LEAST, *left])
 
 
-def _error(axes: Axes, outcome: Outcome, reach: float) -> None:
-    """Reference minus position; steps that did not settle are shaded."""
+def _error(axes: Axes, outcome: PolicyOutcome, reach: float) -> None:
+    """Draw reference minus position; shade the steps that did not settle."""
     axes.set(ylabel="Error\n(mm)", ylim=(-reach * style.MM, reach * style.MM))
-    axes.set_title(_told(outcome), loc="right", fontsize=8.0)
-    if outcome.record is None:
+    axes.set_title(_title(outcome), loc="right", fontsize=8.0)
+    if outcome.run is None:
         axes.grid(False)
         text = "\n".join(textwrap.wrap(outcome.refused, 110))
         axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=7.5, color=style.BLACK)
         return
-    trace = outcome.record.trace
+    trace = outcome.run.trace
     for step in trace.steps:
         if not step.settled:
             axes.axvspan(step.begin, step.end, color=style.GREY, alpha=0.22, linewidth=0.0)
     error = (trace.reference - trace.position)[:-1] * style.MM
-    style.trace(axes, trace.time[:-1], error, LOOKS[outcome.policy].color, linewidth=0.9)
+    style.trace(axes, trace.time[:-1], error, LINE_STYLES[outcome.policy].color, linewidth=0.9)
 
 
-def _told(outcome: Outcome) -> str:
-    """The policy and what came of it, in a line."""
-    if outcome.record is None:
+def _title(outcome: PolicyOutcome) -> str:
+    """Word the policy's outcome in one line."""
+    if outcome.run is None:
         return f"{outcome.policy}: designs nothing here"
     settled, left = sum(step.settled for step in outcome.steps), worst(outcome.steps, "error") * style.MM
-    return f"{outcome.policy}: {settled} of {len(outcome.steps)} steps settle, at most {left:.2g} mm are left"
+    return f"{outcome.policy}: {settled} of {len(outcome.steps)} steps settle, largest error left {left:.2g} mm"
 
 
-def _gap(axes: Axes, ran: Policied, d: Data) -> None:
-    """The truth, and every policy's estimates, side by side at one time."""
+def _gap(axes: Axes, ran: RunsByPolicy, d: PolicyComparison) -> None:
+    """Draw the true gap and every policy's estimates; equal times are moved apart."""
     style.trace(axes, d.time, d.gap * style.DEG, style.BLACK, "actual gap")
-    answered = [(policy, record) for policy, record in ran if record.estimates]
-    for later, (policy, record) in enumerate(answered):
-        known = [one for one in record.estimates if one.ok]
+    answered = [(policy, run) for policy, run in ran if run.estimates]
+    for later, (policy, run) in enumerate(answered):
+        known = [one for one in run.estimates if one.ok]
         times = [one.time + APART * later for one in known]
         values, half = ([getattr(one, name) * style.DEG for one in known] for name in ("gap", "std"))
-        look = LOOKS[policy]
+        look = LINE_STYLES[policy]
         spread = np.multiply(2.0, half)
         axes.errorbar(
             times, values, spread, fmt=look.marker, color=look.color, markersize=3.5, capsize=1.5, label=policy
@@ -146,16 +155,18 @@ def _gap(axes: Axes, ran: Policied, d: Data) -> None:
     style.legend(axes, columns=5)
 
 
-def _in_force(axes: Axes, ran: Policied, value: Callable[[Change], float], label: str, line: str = "-") -> None:
-    """What was in force, a staircase per policy."""
-    for policy, record in sorted(ran, key=lambda one: -LOOKS[one[0]].width):
-        look = LOOKS[policy]
-        axes.step(*_stairs(record, value), line, where="post", color=look.color, linewidth=look.width, label=policy)
+def _in_force(
+    axes: Axes, ran: RunsByPolicy, value: Callable[[SettingChange], float], label: str, line: str = "-"
+) -> None:
+    """Draw a value of the setting in force, one staircase per policy."""
+    for policy, run in sorted(ran, key=lambda one: -LINE_STYLES[one[0]].width):
+        look = LINE_STYLES[policy]
+        axes.step(*_stairs(run, value), line, where="post", color=look.color, linewidth=look.width, label=policy)
     axes.set_ylabel(label)
 
 
-def _gains(axes: Axes, ran: Policied, own: Gains) -> None:
-    """Kp and Ki in the servo's own."""
+def _gains(axes: Axes, ran: RunsByPolicy, own: Gains) -> None:
+    """Draw Kp and Ki relative to the servo's own."""
     _in_force(axes, ran, lambda change: change.gains.Ki / own.Ki, "", "--")
     _in_force(axes, ran, lambda change: change.gains.Kp / own.Kp, "Gain over\nown")
     kinds = [Line2D([], [], color=style.BLACK, linestyle=line) for line in ("-", "--")]
@@ -163,38 +174,38 @@ def _gains(axes: Axes, ran: Policied, own: Gains) -> None:
     _widen(axes, 0.0)
 
 
-def _stairs(record: Record, value: Callable[[Change], float]) -> tuple[list[float], list[float]]:
-    """Times and values, the last value up to the run's end."""
-    values = [value(change) for change in record.changes]
-    return [*(change.time for change in record.changes), float(record.trace.time[-1])], [*values, values[-1]]
+def _stairs(run: TwinRun, value: Callable[[SettingChange], float]) -> tuple[list[float], list[float]]:
+    """Times and values; the last value lasts to the run's end."""
+    values = [value(change) for change in run.changes]
+    return [*(change.time for change in run.changes), float(run.trace.time[-1])], [*values, values[-1]]
 
 
 def _widen(axes: Axes, least: float) -> None:
-    """Room around lines at the edges, and `least` either side of 0 at the least."""
+    """Widen the axis: room around lines at the edges, and at least `least` on either side of 0."""
     low, high = axes.dataLim.intervaly
     low, high = min(float(low), -least), max(float(high), least)
     room = 0.12 * (high - low)
     axes.set_ylim(low - room, high + room)
 
 
-def _plate(name: str, title: str, what: str, condition: Condition) -> Plate[Data]:
+def _figure(name: str, title: str, circumstances: str, condition: LoopCondition) -> FigureSpec[PolicyComparison]:
     caption = (
-        f"{what} Every policy runs in the same co-simulation, sampled at 5 kHz, with the same machine, seed, link and"
-        " estimator (ours; windows of 1 s, those of certified 2 s). What differs is the policy, and what comes with it:"
-        " certified begins on a fallback set that is proved for every gap of the stated range, and hysteresis falls"
-        " back to the same one. The fallback set alone is certified with its twin off. (a) Reference; (b) to (f) its"
-        " distance from the true position, cut where the steps begin, and shaded where the step does not settle; (g)"
-        " the gap and the estimates that were accepted, with two standard deviations, moved"
-        f" {APART:g} s apart; in force at the edge: (h) half-width of the dead zone, (i) gains in the servo's own,"
-        " (j) feedforward."
+        f"{circumstances} Every policy runs in the same co-simulation, sampled at 5 kHz, with the same machine, seed,"
+        " link and estimator (ours; windows of 1 s, 2 s under certified). Only the policy differs, and its fallback"
+        " set: certified begins on a fallback set that is verified in simulation for every gap of the stated range, and"
+        " hysteresis falls back to the same set. The fallback set alone is certified with its twin off. (a) Reference;"
+        " (b) to (f) reference minus true position, cut where the steps begin, and shaded where the step does not"
+        " settle; (g) the gap and the accepted estimates with two standard deviations, moved"
+        f" {APART:g} s apart; in force at the edge: (h) half-width of the dead zone, (i) gains relative to the servo's"
+        " own, (j) feedforward."
     )
-    return Plate(name, title, caption, data_of(condition), plot, lambda d: d.outcomes)
+    return FigureSpec(name, title, caption, data_of(condition), plot, lambda d: d.outcomes)
 
 
-PLATES = (
-    _plate("policies", "The policies on Fig 15's wear.", "No noise, no bias.", CLEAN),
-    _plate("policies-noise", "The policies in Fig 16's noise.", "Noise and low-pass in the loop as in Fig 16.", NOISE),
-    _plate(
+FIGURES = (
+    _figure("policies", "The policies on Fig 15's wear.", "No noise, no bias.", CLEAN),
+    _figure("policies-noise", "The policies in Fig 16's noise.", "Noise and low-pass in the loop as in Fig 16.", NOISE),
+    _figure(
         "policies-bias",
         "The policies with a bias on the motor's input.",
         f"No noise; {BIASED.input_bias * 1e3:g} mV are added to the voltage behind the controller.",

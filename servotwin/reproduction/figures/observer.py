@@ -13,7 +13,7 @@ from scipy import signal
 from servotwin.estimation.paper.observer import observer
 from servotwin.plant.backlash import play
 from servotwin.report import style
-from servotwin.reproduction.figures.plate import Plate
+from servotwin.reproduction.figures.spec import FigureSpec
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import RATE, Runs
 
@@ -24,7 +24,7 @@ SPAN = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class ObserverOutputs:
     """Time (s), motor and screw angle (rad), the output (m) and its estimates by alpha (rad/s)."""
 
     time: Array
@@ -34,8 +34,8 @@ class Data:
     estimates: Mapping[float, Array]
 
 
-def data(runs: Runs) -> Data:
-    """Eq 19's motion through a gap of 30 deg into G2 from the paper's initial state; the observers start from zero."""
+def figA1_data(runs: Runs) -> ObserverOutputs:
+    """Simulate Eq 19 through a gap of 30 deg into G2 from the paper's initial state; the observers start at zero."""
     time = np.arange(round(SPAN * RATE) + 1) / RATE
     theta_m = (1.0 + time / 10.0) * np.sin(2.0 * np.pi * time)
     theta_d = play(theta_m, math.radians(GAP_DEG), 0.0)
@@ -44,11 +44,11 @@ def data(runs: Runs) -> Data:
     system = (plant.A_o, plant.B[:, None], plant.C[None, :], 0.0)
     _, position, _ = signal.lsim(system, theta_d, time, plant.initial_state(INITIAL))
     estimates = {alpha: one.estimate(theta_d, position, RATE) for alpha, one in observers.items()}
-    return Data(time, theta_m, theta_d, position, estimates)
+    return ObserverOutputs(time, theta_m, theta_d, position, estimates)
 
 
-def plot(d: Data) -> Figure:
-    """Angles above, outputs below."""
+def _plot(d: ObserverOutputs) -> Figure:
+    """Draw angles above, outputs below."""
     figure, axes = style.panels(2, 1, height=2.1, heights=(1.0, 1.4))
     upper, lower = axes[:, 0]
     upper.plot(d.time, d.theta_m * style.DEG, color=style.ORANGE, label="motor $θ_m$")
@@ -65,11 +65,11 @@ def plot(d: Data) -> Figure:
     return figure
 
 
-PLATE = Plate(
+FIGURE = FigureSpec(
     "figA1",
-    "Fig A.1. Observers that forget what they did not know.",
+    "Fig A.1. Observers that start from a wrong state.",
     "(a) Our input, Eq 19, and the screw behind a gap of 30 deg; (b) the structure's output from the paper's initial"
     " state and three observers that start from zero. The dotted line marks 0.25 s.",
-    data,
-    plot,
+    figA1_data,
+    _plot,
 )

@@ -1,4 +1,4 @@
-"""What a claim, its measurement and its verdict are; the fixed list; the registry of measuring functions."""
+"""Claims, findings and verdicts; the fixed list of claims; the registry of measuring functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from servotwin.reproduction.runs import BIPOLAR, UNIPOLAR, Runs, Square
 
 
 class Verdict(StrEnum):
-    """What the measurement says of the sentence."""
+    """Verdict of a measurement on a sentence of the paper."""
 
     REPRODUCED = "reproduced"
     NOT_AS_STATED = "not as stated"
@@ -21,9 +21,9 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A sentence of the paper, where it stands, and what must be measured to call it reproduced.
+    """A sentence of the paper, its section, and the criterion that a measurement must meet to reproduce it.
 
-    `amended` says why the criterion is not the one fixed before measuring, where that is so.
+    `amended`: reason for a criterion that was changed after a measurement; empty where it was not.
     """
 
     id: str
@@ -44,7 +44,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A verdict, why, and the numbers it rests on."""
+    """A verdict, its reason, and the numbers behind it."""
 
     verdict: Verdict
     why: str
@@ -52,7 +52,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class ClaimResult:
     """One claim in one preset; `unipolar` is the same with a reference of 0/1 mm, where that matters (erratum E20)."""
 
     claim: Claim
@@ -66,7 +66,7 @@ Measure = Callable[[Runs, Square], Finding]
 
 @dataclass(frozen=True, slots=True)
 class _Measurement:
-    """How a claim is measured, where that is written, and whether it is measured for both readings of the reference."""
+    """A claim's measuring function, its module, and `both`: measure both readings of the reference."""
 
     module: str
     function: Measure
@@ -77,7 +77,7 @@ _MEASURES: dict[str, _Measurement] = {}
 
 
 def claims() -> tuple[Claim, ...]:
-    """The list, as fixed in claims.toml before any measurement."""
+    """Read the list that was fixed in claims.toml before any measurement."""
     text = resources.files("servotwin.reproduction.claims").joinpath("claims.toml").read_text(encoding="utf-8")
     return tuple(Claim(**entry) for entry in tomllib.loads(text)["claim"])
 
@@ -109,20 +109,20 @@ def _register(claim_id: str, module: str, function: Measure, *, both: bool) -> N
 
 
 def group(claim: Claim) -> str:
-    """Claims of one group share runs; the groups are measured apart."""
+    """Group of a claim; claims of one group share runs, and groups are measured separately."""
     return _MEASURES[claim.id].module
 
 
 def measured_ids() -> frozenset[str]:
-    """The claims that have a measuring function."""
+    """Ids of the claims that have a measuring function."""
     return frozenset(_MEASURES)
 
 
-def measure(claim: Claim, runs: Runs) -> Result:
-    """Run the code and decide."""
+def measure(claim: Claim, runs: Runs) -> ClaimResult:
+    """Measure a claim and decide its verdict."""
     how = _MEASURES[claim.id]
     other = how.function(runs, UNIPOLAR) if how.both else None
-    return Result(claim, runs.preset, how.function(runs, BIPOLAR), other)
+    return ClaimResult(claim, runs.preset, how.function(runs, BIPOLAR), other)
 
 
 def decided(reproduced: bool, why: str, *values: tuple[str, float] | tuple[str, float, str]) -> Finding:

@@ -1,4 +1,4 @@
-"""Beyond the paper: the policies side by side on Fig 15's wear, clean, in Fig 16's noise, and with an input bias."""
+"""Runs beyond the paper: every policy on Fig 15's wear, clean, in Fig 16's noise, and with an input bias."""
 
 from __future__ import annotations
 
@@ -10,46 +10,46 @@ import numpy as np
 
 import servotwin as st
 from servotwin.errors import InvalidInput
-from servotwin.reproduction.inforce import Origin
-from servotwin.reproduction.loops import NOISY, SAMPLED, Record, record
+from servotwin.reproduction.measures import DEFINITIONS as MEASURES
 from servotwin.reproduction.measures import TAIL, Array, between, tail
 from servotwin.reproduction.runs import Trace
+from servotwin.reproduction.twin_runs import NOISY, SAMPLED, SettingOrigin, TwinRun, run_twin
 from servotwin.twin.policies import policy_of
 from servotwin.twin.settings import TwinSettings
 
 POLICIES = ("paper", "margin", "hysteresis", "certified")
-ALONE = "fallback set alone"  # where the certified loop begins, and nobody who updates it
+ALONE = "fallback set alone"  # the certified loop's first setting, never updated
 CONTESTANTS = (*POLICIES, ALONE)
 TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class LoopCondition:
     """A packaged scenario, and a bias (V) on the motor's input."""
 
     scenario: str
     input_bias: float = 0.0
 
 
-CLEAN, NOISE, BIASED = Condition(SAMPLED), Condition(NOISY), Condition(SAMPLED, 0.05)
+CLEAN, NOISE, BIASED = LoopCondition(SAMPLED), LoopCondition(NOISY), LoopCondition(SAMPLED, 0.05)
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyJob:
-    """One policy in one condition, for `duration` s of it; the wear is that of the whole scenario.
+    """One policy in one condition, for its first `duration` s.
 
-    The machine, its noise, the link and the estimator (ours, with its defaults) are the same for all; windows are as
-    the scenario says, and those of "certified" as that policy's own scenario has them, because its loop is calmer.
-    `ALONE` is "certified" with its twin switched off: against it one sees what the updates are worth.
+    All policies share the machine, its noise, the link and the estimator (ours, with its defaults). Windows are those
+    of the scenario; under "certified" they are those of that policy's own scenario, because its loop is calmer.
+    `ALONE` is "certified" with its twin switched off; the difference between the two is the worth of the updates.
     """
 
     preset: str
     policy: str
-    condition: Condition
+    condition: LoopCondition
     duration: float = 200.0
 
-    def described(self) -> st.Scenario:
-        """The scenario."""
+    def scenario_to_run(self) -> st.Scenario:
+        """Vary the packaged scenario."""
         packaged = st.Scenario.preset(self.condition.scenario).with_servo(st.Servo.preset(self.preset))
         alone = self.policy == ALONE
         policy = "certified" if alone else self.policy
@@ -61,18 +61,18 @@ class PolicyJob:
             input_bias=self.condition.input_bias,
         )
 
-    def run(self) -> Outcome:
-        """Co-simulate and measure; a policy that cannot design for this machine says so instead."""
-        scenario = self.described()
-        why = refusal(scenario)
-        if why:
-            return Outcome(self.policy, why)
-        kept = record(scenario)
-        return Outcome(self.policy, "", kept, measured(kept), summed(kept))
+    def run(self) -> PolicyOutcome:
+        """Co-simulate and measure; the outcome of a policy that cannot design for this machine is its reason."""
+        scenario = self.scenario_to_run()
+        reason = design_refusal(scenario)
+        if reason:
+            return PolicyOutcome(self.policy, reason)
+        run = run_twin(scenario)
+        return PolicyOutcome(self.policy, "", run, measured_steps(run), measured_total(run))
 
 
 @dataclass(frozen=True, slots=True)
-class StepRow:
+class PolicyStep:
     """One step under one policy.
 
     Attributes
@@ -82,13 +82,13 @@ class StepRow:
     gap : float
         rad, total, at the step's end.
     settled : bool
-        As everywhere in the reproduction.
+        As in `measures`.
     error : float
-        m, the largest of the last `TAIL` seconds.
+        m, largest absolute error of the last `TAIL` seconds.
     overshoot : float
-        How far the position goes beyond the reference, in sizes of the step; 0: not at all.
+        Largest distance of the position beyond the reference, in sizes of the step; 0: none.
     settling : float
-        s, as everywhere in the reproduction; inf where it leaves the band to the end.
+        s, as in `measures`; inf where the position is outside the band at the end.
     """
 
     begin: float
@@ -100,7 +100,7 @@ class StepRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Total:
+class PolicyTotal:
     """The whole run.
 
     Attributes
@@ -108,11 +108,11 @@ class Total:
     voltage, voltage_at_rest : float
         V rms: of the whole run, and of the last `TAIL` seconds of every step.
     travel : float
-        Turns that the motor makes, to and fro.
+        Turns of the motor in both directions, added up.
     estimates, windows : int
         Windows whose estimate was accepted, and all.
     updates, fallbacks : int
-        Updates put in force, and how often the edge left them for its fallback set.
+        Updates put in force, and changes to the fallback set.
     """
 
     voltage: float
@@ -125,18 +125,18 @@ class Total:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came of one policy; `refused` says why nothing did, and then the rest is empty."""
+class PolicyOutcome:
+    """Outcome of one policy. `refused`: reason for which it designs nothing; then the rest is empty."""
 
     policy: str
     refused: str = ""
-    record: Record | None = None
-    steps: tuple[StepRow, ...] = ()
-    total: Total | None = None
+    run: TwinRun | None = None
+    steps: tuple[PolicyStep, ...] = ()
+    total: PolicyTotal | None = None
 
 
-def refusal(scenario: st.Scenario) -> str:
-    """Why the scenario's policy cannot design for its machine; empty where it can."""
+def design_refusal(scenario: st.Scenario) -> str:
+    """Reason for which the scenario's policy cannot design for its machine; empty where it can."""
     try:
         policy_of(scenario.model, scenario.twin)
         scenario.agent_settings()
@@ -145,12 +145,12 @@ def refusal(scenario: st.Scenario) -> str:
     return ""
 
 
-def measured(kept: Record) -> tuple[StepRow, ...]:
-    """Every step."""
-    trace = kept.trace
+def measured_steps(run: TwinRun) -> tuple[PolicyStep, ...]:
+    """Measure every step."""
+    trace = run.trace
     error = trace.reference - trace.position
     return tuple(
-        StepRow(
+        PolicyStep(
             step.begin,
             step.gap_end,
             step.settled,
@@ -163,31 +163,31 @@ def measured(kept: Record) -> tuple[StepRow, ...]:
 
 
 def overshoot(trace: Trace, begin: float, end: float) -> float:
-    """How far the position goes beyond a stretch's reference, in sizes of its step from the position at its begin."""
+    """Largest distance of the position beyond a stretch's reference, in sizes of its step."""
     part = between(trace.time, begin, end)
     goal, position = float(trace.reference[part][0]), trace.position[part]
     size = goal - float(position[0])
     return max(0.0, float(((position - goal) / size).max())) if size else 0.0
 
 
-def summed(kept: Record) -> Total:
-    """The whole run's measures."""
-    trace = kept.trace
+def measured_total(run: TwinRun) -> PolicyTotal:
+    """Measure the whole run."""
+    trace = run.trace
     rests = [trace.voltage[tail(trace.time, step.end)] for step in trace.steps]
-    origins = [change.origin for change in kept.changes]
-    return Total(
+    origins = [change.origin for change in run.changes]
+    return PolicyTotal(
         voltage=_rms(trace.voltage),
         voltage_at_rest=_rms(np.concatenate(rests)) if rests else math.nan,
         travel=float(np.abs(np.diff(trace.theta_m)).sum()) / TURN,
-        estimates=sum(one.ok for one in kept.estimates),
-        windows=len(kept.estimates),
-        updates=origins.count(Origin.UPDATE),
-        fallbacks=origins.count(Origin.FALLBACK),
+        estimates=sum(one.ok for one in run.estimates),
+        windows=len(run.estimates),
+        updates=origins.count(SettingOrigin.UPDATE),
+        fallbacks=origins.count(SettingOrigin.FALLBACK),
     )
 
 
-def worst(steps: Sequence[StepRow], name: str) -> float:
-    """The largest `name` of all steps; NaN without any."""
+def worst(steps: Sequence[PolicyStep], name: str) -> float:
+    """Largest `name` of all steps; NaN without any."""
     return max((float(getattr(step, name)) for step in steps), default=math.nan)
 
 
@@ -196,8 +196,9 @@ def _rms(values: Array) -> float:
 
 
 DEFINITIONS = {
+    **{word: MEASURES[word] for word in ("settled", "settling time")},
     "error left": f"the largest distance of the true position from the reference over the last {TAIL:g} s of a step",
-    "overshoot": "how far the position goes beyond the reference, in sizes of the step",
+    "overshoot": "the largest distance of the position beyond the reference, in sizes of the step",
     "voltage at rest": f"root mean square over the last {TAIL:g} s of all steps",
-    "motor travel": "turns of the motor to and fro, all added up",
+    "motor travel": "turns of the motor in both directions, added up",
 }

@@ -1,0 +1,386 @@
+"""Settings declared once: TOML key, unit, range and help stand in the annotation of the attribute that they set.
+
+    @settings("retry")
+    @dataclass(frozen=True)
+    class Retry:
+        \"\"\"When to repeat a message.\"\"\"
+
+        first_s: Annotated[float, key(above=0.0, help="First pause.")] = 5.0
+        size: Annotated[float, key("size_mm", "size_m", minimum=0.0, help="Largest move.")] = 0.0
+
+        def __post_init__(self) -> None:
+            check(self)
+
+The reader and the writer (`config.toml`), the check in the constructor, the class's docstring, the reference in docs/
+and the JSON Schemas are all made of this. A plain function with annotated parameters declares a table as well.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import textwrap
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass
+from enum import StrEnum
+from functools import cache
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar
+
+from servotwin.config.table import Range, Table, did_you_mean
+from servotwin.errors import InvalidInput
+
+_Class = TypeVar("_Class", bound=type)
+Maker = Callable[..., Any]
+"""A class, or a function, whose parameters a table declares."""
+_ITEMS: dict[Any, tuple[Item, ...]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """The unit of a key, and the one that its attribute has: attribute = key * factor / divisor."""
+
+    name: str
+    si: str
+    factor: float = 1.0
+    divisor: float = 1.0
+
+    @property
+    def exact(self) -> bool:
+        """The key has the attribute's unit, so that no digit is lost on the way."""
+        return self.factor == self.divisor == 1.0
+
+    def to_si(self, value: float) -> float:
+        """The attribute's value."""
+        return value * self.factor / self.divisor
+
+    def from_si(self, value: float) -> float:
+        """A key's value that `to_si` turns into this one, to the last bit where a float does that."""
+        near = value * self.divisor / self.factor
+        close = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
+        return next((number for number in close if self.to_si(number) == value), near)
+
+
+_DEGREE = math.pi / 180.0
+_SCALED = {
+    "mm_per_s": Unit("mm/s", "m/s", 1e-3),
+    "mm": Unit("mm", "m", 1e-3),
+    "um": Unit("µm", "m", 1e-6),
+    "deg_per_s": Unit("deg/s", "rad/s", _DEGREE),
+    "deg": Unit("deg", "rad", _DEGREE),
+    "mv": Unit("mV", "V", 1e-3),
+    "percent": Unit("%", "", divisor=100.0),
+    "megabytes": Unit("MB", "bytes", 1e6),
+}
+_PLAIN = {
+    "s": "s", "hz": "Hz", "v": "V", "m": "m", "rad": "rad", "kg": "kg", "h": "H", "ohm": "ohm", "n_m": "N m",
+    "m_per_s": "m/s", "rad_per_s": "rad/s", "v_per_s": "V/s", "v_per_m": "V/m", "v_per_m_s": "V/(m s)",
+    "v_s_per_m": "V s/m", "kg_m2": "kg m^2", "n_m_per_a": "N m/A", "v_s_per_rad": "V s/rad", "m_per_rad": "m/rad",
+    "n_per_m": "N/m", "n_s_per_m": "N s/m", "per_s": "1/s", "per_minute": "1/min", "days": "days", "bytes": "bytes",
+    "tolerances": "tolerances",
+}  # fmt: skip
+_SUFFIXES = {**_SCALED, **{suffix: Unit(name, name) for suffix, name in _PLAIN.items()}}
+
+
+@cache
+def unit_of(name: str) -> Unit:
+    """The unit that the end of a key's name says; none for a key without."""
+    fitting = (suffix for suffix in _SUFFIXES if name == suffix == "megabytes" or name.endswith(f"_{suffix}"))
+    return _SUFFIXES.get(max(fitting, key=len, default=""), Unit("", ""))
+
+
+ANY = Range()
+
+
+@dataclass(frozen=True)
+class Key:
+    """The metadata of one attribute; `key` and `value` make it."""
+
+    names: tuple[str, ...] = ()
+    range: Range = ANY
+    help: str = ""
+    table: str = ""
+    choices: tuple[str, ...] | None = None
+    prefix: str | None = None
+    switch: str = ""
+    makers: Mapping[str, Maker] | None = None
+    select: Callable[[Table], Maker] | None = None
+    parse: Callable[[Table, str, Any], Any] | None = None
+    in_file: bool = True
+
+
+def key(
+    *names: str,
+    minimum: float = -math.inf,
+    above: float = -math.inf,
+    maximum: float = math.inf,
+    below: float = math.inf,
+    infinite: bool = False,
+    help: str = "",  # noqa: A002
+    table: str = "",
+    choices: tuple[str, ...] | None = None,
+    prefix: str | None = None,
+    switch: str = "",
+    makers: Mapping[str, Maker] | None = None,
+    select: Callable[[Table], Maker] | None = None,
+    parse: Callable[[Table, str, Any], Any] | None = None,
+) -> Key:
+    """Declare the TOML key of an attribute.
+
+    Parameters
+    ----------
+    names : str
+        Keys that set it, each in the unit that its end says; the attribute's own name by default. Where a file has
+        several of them, the last one counts.
+    minimum, above, maximum, below, infinite
+        Range, in the attribute's unit.
+    help : str
+        One sentence.
+    table : str
+        Inner table that holds the key; that of the class by default.
+    choices : tuple of str
+        Words that are allowed.
+    prefix : str
+        For an attribute that is a declared class: its keys lie in the same table and begin with this.
+    switch : str
+        For an attribute that is a declared class or None: a key that is true or false; false: None.
+    makers : mapping
+        For an inner table of several kinds: what makes each; the key `kind` says which, or `select`.
+    parse : callable
+        Takes the table, the key and its value, and gives the attribute; raises `table.invalid`.
+    """
+    allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
+    return Key(names, allowed, help, table, choices, prefix, switch, makers, select, parse)
+
+
+def value(
+    *,
+    minimum: float = -math.inf,
+    above: float = -math.inf,
+    maximum: float = math.inf,
+    below: float = math.inf,
+    infinite: bool = False,
+    choices: tuple[str, ...] | None = None,
+    help: str = "",  # noqa: A002
+) -> Key:
+    """Declare range and help of an attribute that no file sets."""
+    allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
+    return Key((), allowed, help, choices=choices, in_file=False)
+
+
+class Form(StrEnum):
+    """What an attribute is in a file."""
+
+    NUMBER = "number"
+    INTEGER = "integer"
+    PAIR = "pair of numbers"
+    NUMBERS = "number or list of numbers"
+    BOOLEAN = "true or false"
+    TEXT = "text"
+    PATH = "path"
+    TABLE = "table"
+    TABLES = "array of tables"
+    OTHER = "value"
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One declared attribute: its name, its type without None, its default and its key."""
+
+    name: str
+    type: Any
+    optional: bool
+    default: Any
+    key: Key
+    form: Form
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The keys that set it."""
+        return self.key.names or (self.name,)
+
+    @property
+    def exact_name(self) -> str:
+        """The key that holds it to the last bit, as far as there is one."""
+        return next((name for name in self.names if unit_of(name).exact), self.names[0])
+
+    @property
+    def unit(self) -> str:
+        """The attribute's unit."""
+        return unit_of(self.names[0]).si
+
+    @property
+    def required(self) -> bool:
+        """A file has to give it."""
+        return self.default is MISSING
+
+    @property
+    def inner(self) -> Any:
+        """The class of one inner table, or of each of an array of tables."""
+        return typing.get_args(self.type)[0] if self.form is Form.TABLES else self.type
+
+
+def items_of(maker: Any) -> tuple[Item, ...]:
+    """The declared attributes of a class, or parameters of a function, in order."""
+    known = _ITEMS.get(maker)
+    if known is None:
+        hints = typing.get_type_hints(maker, include_extras=True)
+        items = (_item(name, hints[name], default) for name, default in _defaults(maker).items() if name in hints)
+        known = _ITEMS[maker] = tuple(item for item in items if item is not None)
+    return known
+
+
+def name_of(described: Any) -> str:
+    """What messages call a declared class or its object."""
+    return str(getattr(described, "settings_name", ""))
+
+
+def settings(name: str) -> Callable[[_Class], _Class]:
+    """Name a declared class for its messages, and complete its docstring from the declaration."""
+
+    def decorate(described: _Class) -> _Class:
+        described.settings_name = name  # type: ignore[attr-defined]
+        described.__doc__ = documented(described)
+        return described
+
+    return decorate
+
+
+def check(described: Any) -> None:
+    """Refuse a value out of its declared range; for `__post_init__`.
+
+    Raises
+    ------
+    InvalidInput
+        Naming the attribute, its value and unit, and what is allowed.
+    """
+    for item in items_of(type(described)):
+        given = getattr(described, item.name)
+        if (given is None and item.optional) or _fits(item, given):
+            continue
+        shown, words = item.name, allowed(item)
+        if item.form is Form.NUMBERS and isinstance(given, tuple) and given:
+            index = next(i for i, each in enumerate(given) if not _number_fits(item, each))
+            shown, given, words = f"{item.name}[{index}]", given[index], str(item.key.range)
+        unit = f" {item.unit}" if item.unit else ""
+        raise InvalidInput(f"{name_of(described)} {shown} = {given!r}{unit}: must be {words}".lstrip())
+
+
+def allowed(item: Item) -> str:
+    """What an attribute may be, in words."""
+    if item.key.choices is not None:
+        return f"one of {', '.join(item.key.choices)}"
+    if item.form is Form.BOOLEAN:
+        return "True or False"
+    words = item.key.range.whole if item.form is Form.INTEGER else str(item.key.range)
+    if item.form is Form.PAIR:
+        return f"two numbers, each {words}"
+    return f"{words} or a tuple of such" if item.form is Form.NUMBERS else words
+
+
+def documented(described: type) -> str:
+    """The docstring of a class with a section on its declared attributes."""
+    text = inspect.cleandoc(described.__doc__ or "")
+    lines = [line for item in items_of(described) if item.key.help for line in _parameter(item)]
+    if not lines:
+        return text
+    section = "\n".join(["Parameters", "----------", *lines])
+    head, separator, tail = text.partition("\nParameters\n----------\n")
+    if separator:  # what is declared stands first, what the class says by hand after it
+        return f"{head}\n{section}\n{tail}"
+    head, separator, tail = text.partition("\nRaises\n------")
+    return f"{head.rstrip()}\n\n{section}\n" + (f"\nRaises\n------{tail}" if separator else "")
+
+
+def choice(what: str, word: object, choices: typing.Iterable[str]) -> str:
+    """A word that is one of those allowed.
+
+    Raises
+    ------
+    InvalidInput
+        With the closest of them.
+    """
+    words = tuple(choices)
+    if isinstance(word, str) and word in words:
+        return word
+    raise InvalidInput(
+        f"{what} = {word!r} does not exist{did_you_mean(str(word), words)}; give one of {', '.join(words)}"
+    )
+
+
+def _parameter(item: Item) -> list[str]:
+    kind = getattr(item.type, "__name__", str(item.type)) if isinstance(item.type, type) else str(item.type)
+    optional = ", optional" if item.optional else ""
+    unit = f" In {item.unit}." if item.unit else ""
+    help_lines = textwrap.wrap(f"{item.key.help}{unit}", 110, initial_indent="    ", subsequent_indent="    ")
+    return [f"{item.name} : {kind}{optional}", *help_lines]
+
+
+def _defaults(maker: Maker) -> dict[str, Any]:
+    """The parameters' defaults; MISSING where one has to be given."""
+    if dataclasses.is_dataclass(maker):
+        return {field.name: _default(field) for field in dataclasses.fields(maker) if field.init}
+    parameters = inspect.signature(maker).parameters.values()
+    return {each.name: MISSING if each.default is each.empty else each.default for each in parameters}
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    return field.default_factory() if field.default_factory is not MISSING else field.default
+
+
+def _item(name: str, hint: Any, default: Any) -> Item | None:
+    if typing.get_origin(hint) is not Annotated:
+        return None
+    bare, *metadata = typing.get_args(hint)
+    declared = next((each for each in metadata if isinstance(each, Key)), None)
+    if declared is None:
+        return None
+    kinds = typing.get_args(bare) if isinstance(bare, UnionType) or typing.get_origin(bare) is typing.Union else ()
+    optional = NoneType in kinds
+    rest = [kind for kind in kinds if kind is not NoneType]
+    if optional:
+        bare = rest[0] if len(rest) == 1 else typing.Union[tuple(rest)]  # noqa: UP007
+    return Item(name, bare, optional, default, declared, _form(bare))
+
+
+_FORMS: dict[Any, Form] = {
+    float: Form.NUMBER, int: Form.INTEGER, bool: Form.BOOLEAN, str: Form.TEXT, Path: Form.PATH,
+    tuple[float, float]: Form.PAIR, tuple[float, ...]: Form.NUMBERS, float | tuple[float, ...]: Form.NUMBERS,
+}  # fmt: skip
+
+
+def _form(bare: Any) -> Form:
+    if isinstance(bare, type) and dataclasses.is_dataclass(bare):
+        return Form.TABLE
+    arguments = typing.get_args(bare)
+    if len(arguments) == 2 and arguments[1] is ... and dataclasses.is_dataclass(arguments[0]):
+        return Form.TABLES
+    return _FORMS.get(bare, Form.OTHER)
+
+
+def _fits(item: Item, given: object) -> bool:
+    """A value is of its type, a number in its range too."""
+    form = item.form
+    if form is Form.NUMBER or form is Form.INTEGER:
+        return _number_fits(item, given)
+    if item.key.choices is not None:
+        return isinstance(given, str) and given in item.key.choices
+    if form is Form.BOOLEAN:
+        return isinstance(given, bool)
+    if form is Form.PAIR:
+        return isinstance(given, tuple | list) and len(given) == 2 and all(_number_fits(item, each) for each in given)
+    if form is Form.NUMBERS:
+        each_of = given if isinstance(given, tuple | list) else (given,)
+        return len(each_of) > 0 and all(_number_fits(item, each) for each in each_of)
+    return True
+
+
+def _number_fits(item: Item, given: object) -> bool:
+    if type(given) is float or type(given) is int:  # the others are slow to look up
+        return (item.form is not Form.INTEGER or type(given) is int) and item.key.range.accepts(given)
+    kind = Integral if item.form is Form.INTEGER else Real
+    return isinstance(given, kind) and not isinstance(given, bool) and item.key.range.accepts(float(given))

@@ -1,0 +1,225 @@
+"""Tables of a TOML file as declared settings, and back; see `config.keys` for the declaration."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING
+from pathlib import Path
+from typing import Any
+
+from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
+from servotwin.config.table import Table, named
+
+Values = dict[str, Any]
+
+
+def read(table: Table, maker: Any, folder: Path = Path(), base: Any = None, **given: Any) -> Any:
+    """Make settings of a table; the caller ends with `table.done()`, unless the table is an inner one.
+
+    Parameters
+    ----------
+    table : Table
+    maker : class or function
+        Declares the keys.
+    folder : Path
+        Folder that paths in the file are relative to.
+    base : object, optional
+        Settings of that class, whose values hold where the table gives none. None: the declared defaults.
+    given
+        Values of further parameters; what is given is not read.
+
+    Raises
+    ------
+    InvalidInput
+        A key is missing or unknown, or a value is not allowed.
+    """
+    items = [item for item in items_of(maker) if item.key.in_file and item.name not in given]
+    values = {**_read_items(table, items, folder, base, complete=base is None), **given}
+    with named(table):
+        return maker(**values) if base is None else dataclasses.replace(base, **values)
+
+
+def changes(table: Table, maker: Any, only: Collection[str] | None = None, folder: Path = Path()) -> Values:
+    """Read the attributes that a table gives, by name; absent ones are left out.
+
+    Parameters
+    ----------
+    only : collection of str, optional
+        Attributes to read; None: all.
+    """
+    items = [item for item in items_of(maker) if item.key.in_file and (only is None or item.name in only)]
+    return _read_items(table, items, folder, None, complete=False)
+
+
+def _read_items(table: Table, items: list[Item], folder: Path, base: Any, complete: bool) -> Values:
+    """Values by attribute; `complete`: an attribute without default has to be there."""
+    values: Values = {}
+    for name in dict.fromkeys(item.key.table for item in items):
+        here = [item for item in items if item.key.table == name]
+        required = complete and any(item.required for item in here)
+        inner = table.table(name, required=required) if name else table
+        inner.known(*(key for item in here if item.key.prefix is None for key in (*item.names, *_switch(item))))
+        for item in here:
+            _read_item(inner, item, folder, getattr(base, item.name, None), values)
+            if complete and item.required and item.name not in values:
+                raise inner.missing(item.names[0], table=item.key.makers is not None or item.form is Form.TABLE)
+        if name:
+            inner.done()
+    return values
+
+
+def part(table: Table, name: str, maker: Any, folder: Path = Path(), base: object = None, **given: Any) -> Any:
+    """Make settings of an inner table, which is read to its last key; an absent one gives the defaults."""
+    inner = table.table(name)
+    made = read(inner, maker, folder, base, **given)
+    inner.done()
+    return made
+
+
+def _switch(item: Item) -> tuple[str, ...]:
+    return (item.key.switch,) if item.key.switch else ()
+
+
+def _read_item(table: Table, item: Item, folder: Path, base: object, values: Values) -> None:
+    """One attribute, where the table gives it."""
+    if item.key.prefix is not None:
+        start = base if base is not None else item.default
+        values[item.name] = _prefixed(table, item, start)
+        return
+    if item.key.switch and not table.boolean(item.key.switch, True):
+        values[item.name] = None
+        return
+    for name in item.names:
+        if name in table.values:
+            values[item.name] = _value(table, item, name, folder, base)
+
+
+def _prefixed(table: Table, item: Item, start: Any) -> Any:
+    """Settings whose keys begin with a prefix, in the same table."""
+    prefix = item.key.prefix or ""
+    table.known(*(prefix + name for each in items_of(item.inner) for name in each.names))
+    given: Values = {}
+    for each in items_of(item.inner):
+        for name in each.names:
+            if prefix + name in table.values:
+                given[each.name] = _value(table, each, prefix + name, Path(), None)
+    with named(table):
+        return item.inner(**given) if start is MISSING else dataclasses.replace(start, **given)
+
+
+def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> Any:
+    """The value of a key that is there, in the attribute's unit."""
+    declared = item.key
+    if declared.makers is not None:
+        return _of_kind(table.table(name), item, folder)
+    if item.form is Form.TABLE:
+        start = base if isinstance(base, type(item.default)) else item.default
+        return part(table, name, item.inner, folder, start if dataclasses.is_dataclass(start) else None)
+    if item.form is Form.TABLES:
+        return tuple(_whole(each, item.inner, folder) for each in table.tables(name))
+    read_value = _plain(table, item, name, folder)
+    return read_value if declared.parse is None else declared.parse(table, name, read_value)
+
+
+def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
+    """A number, a text, a truth value, a path or a list."""
+    unit, form = unit_of(name), item.form
+    if form is Form.BOOLEAN:
+        return table.boolean(name)
+    if form is Form.TEXT:
+        return table.text(name, choices=item.key.choices)
+    if form is Form.PATH:
+        return folder / table.text(name)
+    if form is Form.INTEGER and unit.exact:
+        return table.integer_in(name, item.key.range)
+    limits = item.key.range.scaled(unit.from_si)
+    if form in (Form.PAIR, Form.NUMBERS):
+        found = table.numbers_in(name, limits)
+        if form is Form.PAIR and (not isinstance(found, tuple) or len(found) != 2):
+            raise table.invalid(name, "two numbers")
+        converted = tuple(unit.to_si(each) for each in found) if isinstance(found, tuple) else unit.to_si(found)
+        return (converted,) if item.type == tuple[float, ...] and not isinstance(converted, tuple) else converted
+    if form in (Form.NUMBER, Form.INTEGER):
+        number = unit.to_si(table.number_in(name, limits))
+        return round(number) if form is Form.INTEGER else number
+    return table.values[name]
+
+
+def _of_kind(table: Table, item: Item, folder: Path) -> Any:
+    """A table of several kinds."""
+    makers = item.key.makers or {}
+    if item.key.select is not None:
+        return _whole(table, item.key.select(table), folder)
+    return _whole(table, makers[table.text("kind", choices=tuple(makers))], folder)
+
+
+def _whole(table: Table, maker: Maker, folder: Path) -> Any:
+    made = read(table, maker, folder)
+    table.done()
+    return made
+
+
+def values_of(described: Any, only: Collection[str] | None = None) -> Values:
+    """The keys and values of a table that reads as these settings; what is None is left out.
+
+    Parameters
+    ----------
+    described : object
+        Of a declared class.
+    only : collection of str, optional
+        The attributes to write, in that order.
+    """
+    values: Values = {}
+    items = {item.name: item for item in items_of(type(described)) if item.key.in_file}
+    for item in items.values() if only is None else (items[name] for name in only):
+        here = values.setdefault(item.key.table, {}) if item.key.table else values
+        given = getattr(described, item.name)
+        if item.key.switch:
+            here[item.key.switch] = given is not None
+        if given is None:
+            continue
+        if item.key.prefix is not None:
+            here.update({item.key.prefix + name: each for name, each in values_of(given).items()})
+        else:
+            here[item.exact_name] = _written(item, given)
+    return values
+
+
+def _written(item: Item, given: Any) -> Any:
+    if item.form is Form.TABLE:
+        return values_of(given)
+    if item.form is Form.TABLES:
+        return [values_of(each) for each in given]
+    unit = unit_of(item.exact_name)
+    if unit.exact or isinstance(given, bool | str):
+        return str(given) if isinstance(given, Path) else given
+    return tuple(unit.from_si(each) for each in given) if isinstance(given, tuple) else unit.from_si(given)
+
+
+def dumps(values: Mapping[str, Any]) -> str:
+    """The text of a TOML file: plain values first, then the tables, each number with every digit that it has."""
+    return "\n".join(_lines("", values)).lstrip("\n") + "\n"
+
+
+def _lines(path: str, values: Mapping[str, Any]) -> list[str]:
+    inner = {key: value for key, value in values.items() if isinstance(value, Mapping)}
+    lines = ["", f"[{path}]"] if path else []
+    lines += [f"{key} = {_literal(value)}" for key, value in values.items() if key not in inner]
+    for key, value in inner.items():
+        lines += _lines(f"{path}.{key}" if path else key, value)
+    return lines
+
+
+def _literal(value: object) -> str:
+    """A TOML value."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_literal, value))}]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_literal(each)}" for key, each in value.items()) + "}"
+    return repr(value)
