@@ -15,7 +15,8 @@ from servotwin.analysis.tuning.tune import Specification, Tuning
 from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.linear import LinearSystem, loop_filter, series
+from servotwin.plant.linear import LinearSystem, series
+from servotwin.plant.loop import loop_filter
 from servotwin.plant.servo import Servo
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from servotwin.edge.cut import Cut
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import kept
+from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import BackFrame, DoneFrame, HeardFrame, StandingFrame
 from servotwin.messages import Acknowledge, InvalidMessage, Message, Window, decode, encode
@@ -121,7 +121,7 @@ class PipeOutlet:
 
     def save(self, parameters: Parameters) -> None:
         """Let these parameters be kept on disk."""
-        self._keep(frames.SaveFrame(self._next(), kept(parameters)))
+        self._keep(frames.SaveFrame(self._next(), StoredParameters.of(parameters)))
 
     def tell(self, frame: frames.TicksFrame) -> None:
         """Something that may be lost; left out when the link process is behind."""

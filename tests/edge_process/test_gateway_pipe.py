@@ -12,6 +12,7 @@ from servotwin.messages import (
     Acknowledge,
     Hello,
     InvalidMessage,
+    Setting,
     encode,
 )
 
@@ -39,8 +40,8 @@ def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Fa
     box.offer(cut(0), 0.0)
     assert box.waiting
     box.connect(far.near)
-    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, 0.0, ""))
-    box.save(Parameters(3, 1e-4))
+    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
+    box.save(Parameters(3, Setting(1e-4)))
     pumped(box)
     assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
     far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
