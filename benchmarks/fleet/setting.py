@@ -14,10 +14,10 @@ import msgspec
 
 from benchmarks.fleet.stock import BOOT, COMMISSIONED, RATE, Known, Place, commissioned
 from servotwin.config.table import parse_toml
-from servotwin.messages import Hello, encode
+from servotwin.messages import Hello, Setting, encode
 from servotwin.redesign.certified.lookup import Grid
 from servotwin.redesign.certified.lookup_file import build
-from servotwin.store.rows import Incoming, Kind, Outcome
+from servotwin.store.records import Incoming, MessageKind, WorkResult
 from servotwin.store.store import Store, open_store
 from servotwin.twin.fleet import Fleet, models_of
 from servotwin.twin.policies import certified
@@ -137,9 +137,9 @@ def _introduce(store: Store, numbers: range, scale: Scale, known: Sequence[Known
     states = {f"ax-{n:05d}": known[n % len(known)].state for n in numbers}
     ages = _ages(scale, numbers)
     store.put([_hello(servo, now) for servo in states])
-    claims = store.claim("bench", len(states), 60.0, now)
+    claims = store.lease("bench", len(states), 60.0, now)
     made = [
-        Outcome(
+        WorkResult(
             claim.servo,
             claim.serial,
             _named(states[claim.servo], claim.servo, ages[claim.servo]),
@@ -167,9 +167,9 @@ def _named(state: TwinState, servo: str, glances: int) -> bytes:
 
 
 def _hello(servo: str, now: float) -> Incoming:
-    body = encode(Hello(servo, BOOT, COMMISSIONED, RATE, 0, 0.0, "axis"))
+    body = encode(Hello(servo, BOOT, COMMISSIONED, RATE, 0, Setting(0.0), "axis"))
     digest = blake2b(body, digest_size=16).digest()
-    return Incoming(servo, Kind.LETTER, digest.hex(), body, "", digest, now)
+    return Incoming(servo, MessageKind.LETTER, digest.hex(), body, "", digest, now)
 
 
 def _text(scale: Scale, enabled: bool) -> str:

@@ -12,7 +12,7 @@ from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Update, Window, decode, encode
 from servotwin.plant.noise import Noise
-from servotwin.store.rows import Claim, Kind, Stored
+from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin.fleet import Fleet
 from servotwin.twin.settings import TriageSettings
 from servotwin.twin.state import TwinState
@@ -99,15 +99,15 @@ def commissioned(fleet: Fleet, servo: str, place: Place) -> Known:
     for number, recorded in enumerate(learnt):
         start = COMMISSIONED + (number - len(learnt)) * PERIOD
         window = readdressed(recorded, servo, number, start, version)
-        outcome = work(fleet, _claim(servo, state, number, Kind.WINDOW, encode(window)), start)
+        outcome = work(fleet, _claim(servo, state, number, MessageKind.WINDOW, encode(window)), start)
         state = outcome.state
         sent = [decode(body) for body in outcome.outgoing]
         # That the next window is cut under an update tells the twin as much as its receipt.
         version = max([version, *(update.version for update in sent if isinstance(update, Update))])
         for asked in outcome.enqueue:
-            state = work(fleet, _claim(servo, state, number, Kind.PROOF, asked.body), start).state
+            state = work(fleet, _claim(servo, state, number, MessageKind.VERIFICATION, asked.body), start).state
     return Known(msgspec.msgpack.decode(state, type=TwinState), version)
 
 
-def _claim(servo: str, state: bytes, serial: int, kind: Kind, body: bytes) -> Claim:
-    return Claim(servo, state, serial, (Stored(serial + 1, kind, body, "", 0.0),))
+def _claim(servo: str, state: bytes, serial: int, kind: MessageKind, body: bytes) -> Lease:
+    return Lease(servo, state, serial, (StoredMessage(serial + 1, kind, body, "", 0.0),))

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from servotwin.store.backup import Counts, backup, restore
 from servotwin.store.backup import Progress as Report
+from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.twin_service.twin_file import service_of
 
 
@@ -39,5 +39,5 @@ def _shown(what: str) -> Iterator[Report]:
         yield report
 
 
-def _say(where: Path | str, counts: Counts) -> None:
+def _say(where: Path | str, counts: RowCounts) -> None:
     print(f"written: {where}: {counts.twins} servos, {counts.messages} messages, {counts.evidence} pieces of evidence")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
 from servotwin.messages.compression import decompress
-from servotwin.store.links import Found, Link
+from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.fleet import Model
 from servotwin.twin.replay import Replayed, replay
@@ -104,7 +104,7 @@ def summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
     return "\n".join(lines)
 
 
-def _again(store: Store, link: Link, contexts: dict[str, str], model: Model | None) -> Again:
+def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: Model | None) -> Again:
     held = link.window
     name = f"{held.boot}/{held.sequence}"
     found = next((one for one in reversed(link.found) if one.kind == "estimate"), None)
@@ -122,7 +122,7 @@ def _again(store: Store, link: Link, contexts: dict[str, str], model: Model | No
         return Again(name, UNREADABLE, str(error))
 
 
-def _compared(name: str, found: Found, again: Replayed) -> Again:
+def _compared(name: str, found: StoredEvidence, again: Replayed) -> Again:
     if again.same:
         return Again(name, SAME, "", again.differs)
     gaps = f"gap {_degrees(found.gap)} deg then, {_degrees(again.estimate.gap)} deg now"

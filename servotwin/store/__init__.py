@@ -1,1 +1,1 @@
-"""The twin's evidence on disk: messages, estimates, versions, receipts; SQLite by default, PostgreSQL by URL."""
+"""Database of messages, estimates, versions and receipts; SQLite by default, PostgreSQL by URL."""

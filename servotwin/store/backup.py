@@ -1,4 +1,4 @@
-"""An SQLite store copied to a file while it is written to, and put back; PostgreSQL has tools of its own for that."""
+"""Backup of an SQLite store while it is in use, and restore; PostgreSQL has its own tools for that."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.runtime.files import written
-from servotwin.store.address import POSTGRESQL, address_of, file_of, shown
+from servotwin.runtime.files import atomic_output
+from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.schema import REVISION, metadata
 
 PAGES = 2048
-"""Pages that are copied between two reports."""
+"""Pages copied between two progress reports."""
 PRIVATE = 0o600
-SINCE = 1_000_000
-"""Messages to one edge that may have been posted since a backup."""
+SERIAL_MARGIN = 1_000_000
+"""Upper bound of the messages to one edge that may have been posted since a backup."""
 
 Progress = Callable[[int, int], None]
 """(pages that remain, pages in all)."""
 
 
-class Counts(NamedTuple):
-    """Rows of a store."""
+class RowCounts(NamedTuple):
+    """Numbers of rows in a store's tables."""
 
     twins: int
     messages: int
@@ -36,79 +36,79 @@ class Counts(NamedTuple):
     outgoing: int
 
 
-def backup(url: str, to: Path, progress: Progress | None = None) -> Counts:
-    """Copy a store as it is at one moment into a new file; whoever writes to it goes on.
+def backup(url: str, to: Path, progress: Progress | None = None) -> RowCounts:
+    """Copy a store as of one moment into a new file; writers continue meanwhile.
 
-    The file is checked before it gets its name: it is whole or not there. Only its owner may read it.
+    The copy is verified before it gets its name: it is complete or absent. Only its owner may read it.
 
     Parameters
     ----------
     url : str
-        Of an SQLite store; of PostgreSQL's the error says what to call.
+        Of an SQLite store; for PostgreSQL the error names the command to use.
     to : Path
-        Replaced if it exists.
+        Overwritten if it exists.
 
     Returns
     -------
-    Counts
-        What the file holds.
+    RowCounts
+        Rows in the file.
 
     Raises
     ------
     InvalidInput
-        No store there, one of PostgreSQL, or the file cannot be written.
+        There is no store, it is in PostgreSQL, or the file cannot be written.
     """
-    source = _sqlite_file(url, "pg_dump --format=custom --file={} DATABASE", to)
+    source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
     if not source.is_file():
         raise InvalidInput(f"store {source}: there is no such file; give that of a store")
     if to.exists() and to.samefile(source):
         raise InvalidInput(f"backup {to}: is the store itself; give another file")
-    with written(to, PRIVATE) as temporary:
+    with atomic_output(to, PRIVATE) as temporary:
         return _copied(source, temporary, progress)
 
 
-def restore(backed_up: Path, url: str, progress: Progress | None = None) -> Counts:
-    """Put a backup in the place of a store that does not exist or holds nothing.
+def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowCounts:
+    """Restore a backup to a store that does not exist or is empty.
 
-    What was posted since the backup is lost, but edges have it: they ignore serials up to the last that they got. So
-    numbers go on far beyond those in the backup.
+    Messages posted since the backup are lost here but known to the edges, which ignore serials up to the last one that
+    they received. So the serials continue far above those in the backup.
 
     Raises
     ------
     InvalidInput
-        The backup is damaged or of a newer servotwin; the store holds something, is in use, or is one of PostgreSQL.
+        The backup is damaged or of a newer servotwin; the store holds data, is in use, or is in PostgreSQL.
     """
-    place = _sqlite_file(url, "pg_restore --dbname=DATABASE {}", backed_up)
+    place = _source_file(url, "pg_restore --dbname=DATABASE {}", backed_up)
     if not backed_up.is_file():
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)
-    with written(place, PRIVATE) as temporary:
+    with atomic_output(place, PRIVATE) as temporary:
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
-            store.execute("UPDATE twins SET posted = posted + ?", (SINCE,))
+            store.execute("UPDATE twins SET posted = posted + ?", (SERIAL_MARGIN,))
         return counts
 
 
-def _sqlite_file(url: str, instead: str, file: Path) -> Path:
-    address = address_of(url)
-    path = file_of(address)
+def _source_file(url: str, instead: str, file: Path) -> Path:
+    address = parse_address(url)
+    path = sqlite_file(address)
     if path is not None:
         return path
     if address.get_backend_name() == POSTGRESQL:
-        raise InvalidInput(f"store {shown(address)}: is PostgreSQL's; call {instead.format(file)}")
-    raise InvalidInput(f"store {shown(address)}: is in memory; give that of a file")
+        raise InvalidInput(f"store {public_address(address)}: is in PostgreSQL; call {instead.format(file)}")
+    raise InvalidInput(f"store {public_address(address)}: is in memory; give that of a file")
 
 
-def _copied(source: Path, target: Path, progress: Progress | None) -> Counts:
-    """One moment of the source in the target, compared and checked."""
+def _copied(source: Path, target: Path, progress: Progress | None) -> RowCounts:
+    """Copy the source as of one moment into the target, compare and check it."""
     with _opened(source, "mode=ro") as there, _opened(target, "mode=rw") as here:
-        # The first read fixes the moment: later writes go to the log behind it.
+        # The first read fixes the snapshot: later writes go to the log.
         there.execute("BEGIN")
         _check_revision(there, source)
         expected = _counts(there)
         there.backup(here, pages=PAGES, progress=None if progress is None else lambda _, left, of: progress(left, of))
         there.execute("ROLLBACK")
-        # The copy is one file then, without a log beside it.
+        # Without a log the copy is a single file.
         here.execute("PRAGMA journal_mode = DELETE")
         found = [row[0] for row in here.execute("PRAGMA integrity_check(1)")]
         if found != ["ok"]:
@@ -120,7 +120,7 @@ def _copied(source: Path, target: Path, progress: Progress | None) -> Counts:
 
 @contextmanager
 def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
-    """A connection; what SQLite has to complain of becomes InvalidInput."""
+    """Open a connection; an error of SQLite becomes InvalidInput."""
     try:
         uri = f"{path.absolute().as_uri()}?{mode}"
         with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
@@ -131,25 +131,25 @@ def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
 
 def _check_revision(connection: sqlite3.Connection, path: Path) -> None:
     if not _tables(connection) >= {VERSIONS, *metadata.tables}:
-        raise InvalidInput(f"store {path}: is not one of servotwin's")
+        raise InvalidInput(f"store {path}: is not a store of servotwin")
     (revision,) = connection.execute(f"SELECT version_num FROM {VERSIONS}").fetchone()
     if revision > REVISION:
         raise InvalidInput(f"store {path}: its schema {revision} is newer than {REVISION}, the newest known here")
 
 
 def _check_free(place: Path) -> None:
-    """Nothing is lost when a file gets this name."""
+    """Refuse to overwrite a store that holds data or is in use."""
     if not place.exists():
         log = place.with_name(f"{place.name}-wal")
         if log.exists():
-            raise InvalidInput(f"store {place}: is gone, but its log {log.name} is there; move that away first")
+            raise InvalidInput(f"store {place}: is missing, but its log {log.name} exists; move that away first")
         return
     with _opened(place, "mode=rw") as connection:
         if any(_rows(connection, table) for table in _tables(connection) - {VERSIONS}):
-            raise InvalidInput(f"store {place}: holds something already; restore into a new one")
+            raise InvalidInput(f"store {place}: is not empty; restore into a new one")
         connection.execute("PRAGMA busy_timeout = 0")
         try:
-            # Only who is alone with a database may take its log away.
+            # SQLite gives up the log only to the sole user of a database.
             connection.execute("PRAGMA journal_mode = DELETE")
         except sqlite3.OperationalError:
             raise InvalidInput(f"store {place}: is in use; end its twin first") from None
@@ -160,8 +160,8 @@ def _tables(connection: sqlite3.Connection) -> set[str]:
     return {name for (name,) in names}
 
 
-def _counts(connection: sqlite3.Connection) -> Counts:
-    return Counts(*(_rows(connection, table) for table in Counts._fields))
+def _counts(connection: sqlite3.Connection) -> RowCounts:
+    return RowCounts(*(_rows(connection, table) for table in RowCounts._fields))
 
 
 def _rows(connection: sqlite3.Connection, table: str) -> int:

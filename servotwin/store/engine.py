@@ -1,4 +1,4 @@
-"""Connections: SQLite with one writer and a write-ahead log, PostgreSQL with a pool."""
+"""Addresses and connections: SQLite with one writer and a write-ahead log, PostgreSQL with a pool."""
 
 from __future__ import annotations
 
@@ -11,24 +11,67 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy import event
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError
+from sqlalchemy.exc import ArgumentError, DataError, DBAPIError, IntegrityError, ProgrammingError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import QueuePool
 
 from servotwin.errors import InvalidInput
-from servotwin.store.address import SQLITE, file_of, shown
-from servotwin.store.errors import StoreUnavailable
 
+SQLITE, POSTGRESQL = "sqlite", "postgresql"
+_ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
 BUSY_S = 10.0
 _PAGE_BYTES = 8192
 _LOG_PAGES = 2000
 _READERS = 8
-_OURS = (IntegrityError, DataError, ProgrammingError)
+_CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 _LOST_RACES = ("40001", "40P01")
 
 
+class StoreUnavailable(RuntimeError):
+    """The database cannot be read or written now: a full or read-only disk, a lost connection. One sentence."""
+
+
+class StoreBusy(RuntimeError):
+    """Too many messages wait to be committed, so that no more are accepted. One sentence."""
+
+
+def parse_address(url: str, password: str | None = None) -> sa.URL:
+    """Parse an address; one without "://" is the name of an SQLite file. `password` replaces the one in it.
+
+    Raises
+    ------
+    InvalidInput
+        Neither SQLite nor PostgreSQL, or not an address. The message does not repeat the text: it may hold a password.
+    """
+    if "://" not in url:
+        return sa.URL.create(SQLITE, database=url) if url else _refuse("is empty")
+    try:
+        found = sa.make_url(url)
+    except (ArgumentError, ValueError):
+        return _refuse("cannot be read")
+    system = found.get_backend_name()
+    if system == POSTGRESQL:
+        return found.set(drivername="postgresql+psycopg", password=found.password if password is None else password)
+    return found.set(drivername=SQLITE) if system == SQLITE else _refuse(f"names {system!r}")
+
+
+def public_address(address: sa.URL) -> str:
+    """Address for logs and messages: without the password and without options, which may hold one too."""
+    return address.set(password=None, query={}).render_as_string()
+
+
+def sqlite_file(address: sa.URL) -> Path | None:
+    """The file of an SQLite store; None: it is in memory, or no file."""
+    database = address.database or ":memory:"
+    return None if address.get_backend_name() != SQLITE or database == ":memory:" else Path(database)
+
+
+def _refuse(fault: str) -> sa.URL:
+    raise InvalidInput(f"the store's address {fault}; {_ALLOWED}")
+
+
 class Engines(NamedTuple):
-    """Where transactions begin; of SQLite's writer there is one connection, so writers wait in line for it."""
+    """Engines for writing and reading; SQLite has one writing connection, which serialises writers."""
 
     writer: sa.Engine
     reader: sa.Engine
@@ -40,17 +83,17 @@ class Engines(NamedTuple):
 
 
 def engines_of(address: sa.URL) -> Engines:
-    """Engines that connect when they are first used.
+    """Make engines, which connect at their first use.
 
     Raises
     ------
     InvalidInput
-        The driver of PostgreSQL is missing, or an SQLite file cannot be made.
+        The driver of PostgreSQL is missing, or an SQLite file cannot be created.
     """
     if address.get_backend_name() != SQLITE:
         engine = _postgresql(address)
         return Engines(engine, engine)
-    path = file_of(address)
+    path = sqlite_file(address)
     if path is None:
         writer = _sqlite(address, 1, reading=False)
         return Engines(writer, writer)
@@ -60,17 +103,17 @@ def engines_of(address: sa.URL) -> Engines:
 
 @contextmanager
 def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
-    """A transaction, committed when the block ends well.
+    """Run a block in a transaction, which is committed unless the block raises.
 
     Raises
     ------
     StoreUnavailable
-        The database cannot do it now.
+        The database is not available now.
     """
     try:
         with engine.begin() as connection:
             yield connection
-    except _OURS:
+    except _CALLERS_FAULT:
         raise
     except DBAPIError as error:
         raise _unavailable(engine, str(error.orig)) from error.orig
@@ -79,13 +122,13 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
 
 
 def lost_race(error: StoreUnavailable) -> bool:
-    """Whether PostgreSQL undid a transaction only for meeting another one: it may be tried again at once."""
+    """Test whether PostgreSQL rolled a transaction back only because of a concurrent one: retry it at once."""
     return getattr(error.__cause__, "sqlstate", None) in _LOST_RACES
 
 
 def _unavailable(engine: sa.Engine, said: str) -> StoreUnavailable:
     reason = said.strip().splitlines()[0] if said.strip() else "no reason given"
-    return StoreUnavailable(f"store {shown(engine.url)}: not available now ({reason})")
+    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason})")
 
 
 def _postgresql(address: sa.URL) -> sa.Engine:
@@ -93,7 +136,7 @@ def _postgresql(address: sa.URL) -> sa.Engine:
         return sa.create_engine(address, hide_parameters=True, pool_size=_READERS, max_overflow=_READERS)
     except ModuleNotFoundError:
         raise InvalidInput(
-            f"store {shown(address)}: PostgreSQL needs the package psycopg; install servotwin[postgres]"
+            f"store {public_address(address)}: PostgreSQL needs the package psycopg; install servotwin[postgres]"
         ) from None
 
 
@@ -132,10 +175,10 @@ def _pragmas(reading: bool) -> tuple[str, ...]:
 
 
 def _make_private(path: Path) -> None:
-    """A new file that only its owner may read: the log beside it takes over its mode."""
+    """Create the file readable by its owner only; SQLite gives its log the same mode."""
     try:
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except FileExistsError:
         return
     except OSError as error:
-        raise InvalidInput(f"store {path}: cannot be made ({error.strerror})") from None
+        raise InvalidInput(f"store {path}: cannot be created ({error.strerror})") from None

@@ -1,4 +1,4 @@
-"""The schema of a database brought up to date, or the database refused."""
+"""Migration of a database to the newest schema."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.store.address import POSTGRESQL, shown
-from servotwin.store.engine import transaction
+from servotwin.store.engine import POSTGRESQL, public_address, transaction
 from servotwin.store.schema import REVISION, metadata
 
 VERSIONS = "servotwin_version"
-"""Table with the revision."""
+"""Name of the table that holds the revision."""
 SCRIPTS = Path(__file__).with_name("migrations")
-# Any number, the same in every process that migrates.
+# Key of PostgreSQL's advisory lock: an arbitrary number, the same in every process that migrates.
 _LOCK = 7461127
 
 
 def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> None:
-    """Make what is missing, up to a revision, by a folder of scripts; a database that is up to date is left alone.
+    """Upgrade a database to a revision with a folder of scripts; one that is up to date stays as it is.
 
     Raises
     ------
@@ -29,25 +28,25 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
         It cannot be read or written.
     """
     with transaction(engine) as connection:
-        if _found(connection) == to:
+        if _revision(connection) == to:
             return
         if connection.dialect.name == POSTGRESQL:
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
-        found = _found(connection)
+        found = _revision(connection)
         if found != to:
             _check(connection, found, to)
             _upgrade(connection, to, scripts)
 
 
-def _found(connection: sa.Connection) -> str | None:
-    """Revision of the database; None: it has none."""
+def _revision(connection: sa.Connection) -> str | None:
+    """Read the revision of a database; None: an empty one."""
     if not sa.inspect(connection).has_table(VERSIONS):
         return None
     return connection.execute(sa.text(f"SELECT version_num FROM {VERSIONS}")).scalar()
 
 
 def _check(connection: sa.Connection, found: str | None, to: str) -> None:
-    where = shown(connection.engine.url)
+    where = public_address(connection.engine.url)
     if found is None:
         theirs = sorted(set(sa.inspect(connection).get_table_names()) & set(metadata.tables))
         if theirs:
@@ -60,7 +59,7 @@ def _check(connection: sa.Connection, found: str | None, to: str) -> None:
 
 
 def _upgrade(connection: sa.Connection, to: str, scripts: Path) -> None:
-    # Alembic takes longer to import than all the rest of the store, and is mostly not needed.
+    # Imported late: alembic takes longer to import than the rest of the store and is rarely needed.
     from alembic import command
     from alembic.config import Config
 

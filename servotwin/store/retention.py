@@ -1,4 +1,4 @@
-"""What may be forgotten: bodies of old windows. Estimates, versions and receipts are kept for ever."""
+"""Retention: bodies of old windows are deleted; estimates, versions and receipts are kept for ever."""
 
 from __future__ import annotations
 
@@ -8,23 +8,22 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.store.address import SQLITE
-from servotwin.store.engine import transaction
+from servotwin.store.engine import SQLITE, transaction
 from servotwin.store.schema import WINDOWS, bodies, evidence, messages
 from servotwin.store.store import Store
 
 _PAGES = 512
 
 
-class Forgotten(NamedTuple):
-    """What retention did.
+class RetentionResult(NamedTuple):
+    """Numbers of windows that retention emptied and kept.
 
     Attributes
     ----------
     emptied, bytes : int
-        Windows whose bodies are gone, and how much that was.
+        Windows whose bodies were deleted, and the bytes of those bodies.
     kept : int
-        Old windows that it left: an update stands on them, or they are not yet processed.
+        Old windows that stay: an update is based on them, or they are not yet processed.
     """
 
     emptied: int
@@ -32,11 +31,13 @@ class Forgotten(NamedTuple):
     kept: int
 
 
-def forget(store: Store, before: float, batch: int = 256, pause: Callable[[], None] | None = None) -> Forgotten:
-    """Empty the windows received before a time.
+def delete_old_bodies(
+    store: Store, before: float, batch: int = 256, pause: Callable[[], None] | None = None
+) -> RetentionResult:
+    """Delete the bodies of windows received before a time.
 
-    Those that led to an update stay, and those that are not yet processed. The work is done in short transactions, with
-    `pause` called between them, so that what comes in meanwhile does not wait; ended early, it goes on next time.
+    Windows that led to an update and unprocessed ones stay. The work is done in short transactions, with `pause` called
+    between them, so that incoming messages do not wait. Interrupted, it continues at the next call.
 
     Parameters
     ----------
@@ -49,14 +50,14 @@ def forget(store: Store, before: float, batch: int = 256, pause: Callable[[], No
     Raises
     ------
     StoreUnavailable
-        What was done until then stays done.
+        Batches committed before stay deleted.
     """
     if batch < 1:
         raise InvalidInput(f"retention batch = {batch!r} windows: must be at least 1")
-    total, after = Forgotten(0, 0, 0), 0
+    total, after = RetentionResult(0, 0, 0), 0
     while rows := _next(store, after, batch):
         old = [row for row in rows if row.received < before]
-        # Ids rise with time, but for clocks that were set back: a whole batch of newer ones is the end.
+        # Ids rise with time, except after a clock was set back: a whole batch of newer windows ends the scan.
         if not old:
             break
         total = _add(total, _empty(store, old))
@@ -68,38 +69,38 @@ def forget(store: Store, before: float, batch: int = 256, pause: Callable[[], No
 
 def _next(store: Store, after: int, batch: int) -> Sequence[Any]:
     with transaction(store.engines.reader) as connection:
-        return connection.execute(_HELD, {"_after": after, "_batch": batch}).all()
+        return connection.execute(_OLD_WINDOWS, {"_after": after, "_batch": batch}).all()
 
 
-def _empty(store: Store, old: Sequence[Any]) -> Forgotten:
+def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:
     leaving = [row for row in old if not row.stays]
     if leaving:
         gone = [row.id for row in leaving]
         with transaction(store.engines.writer) as connection:
             connection.execute(sa.delete(bodies).where(bodies.c.message.in_(gone)))
         _shrink(store)
-    return Forgotten(len(leaving), sum(row.size for row in leaving), len(old) - len(leaving))
+    return RetentionResult(len(leaving), sum(row.size for row in leaving), len(old) - len(leaving))
 
 
 def _shrink(store: Store) -> None:
-    """Give pages that are free back to the file system; PostgreSQL uses them again by itself."""
+    """Return free pages to the file system; PostgreSQL reuses them by itself."""
     if store.engines.writer.dialect.name == SQLITE:
         with transaction(store.engines.writer) as connection:
-            # Each step of it frees one page, and it gives no rows: only as a script does the driver take all steps.
+            # Each step frees one page and returns no row; the driver takes all steps only of a script.
             connection.connection.cursor().executescript(f"PRAGMA incremental_vacuum({_PAGES})")
 
 
-def _add(one: Forgotten, other: Forgotten) -> Forgotten:
-    return Forgotten(*(a + b for a, b in zip(one, other, strict=True)))
+def _add(one: RetentionResult, other: RetentionResult) -> RetentionResult:
+    return RetentionResult(*(a + b for a, b in zip(one, other, strict=True)))
 
 
-_LED = sa.exists().where(evidence.c.message == messages.c.id, evidence.c.kind == "update")
-_HELD = (
+_LED_TO_UPDATE = sa.exists().where(evidence.c.message == messages.c.id, evidence.c.kind == "update")
+_OLD_WINDOWS = (
     sa.select(
         messages.c.id,
         messages.c.received,
         sa.func.length(bodies.c.body).label("size"),
-        sa.or_(messages.c.done.is_(None), _LED).label("stays"),
+        sa.or_(messages.c.done.is_(None), _LED_TO_UPDATE).label("stays"),
     )
     .select_from(bodies.join(messages, messages.c.id == bodies.c.message))
     .where(bodies.c.message > sa.bindparam("_after"), WINDOWS)

@@ -1,11 +1,11 @@
-"""The tables. Bodies and states lie apart from the rows that queries walk over, so that those stay small."""
+"""Tables. Bodies and states are in tables of their own, so that the rows that queries scan stay small."""
 
 from __future__ import annotations
 
 import sqlalchemy as sa
 
 REVISION = "0001"
-"""Newest migration: what the tables below are."""
+"""Newest migration, which makes the tables below."""
 
 metadata = sa.MetaData(
     naming_convention={
@@ -14,7 +14,7 @@ metadata = sa.MetaData(
         "fk": "fk_%(table_name)s_%(column_0_N_name)s",
     }
 )
-# SQLite counts only an INTEGER key by itself.
+# SQLite numbers rows by itself only for an INTEGER key.
 _Id = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
 twins = sa.Table(
@@ -25,7 +25,7 @@ twins = sa.Table(
     sa.Column("posted", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("windows", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
-    # When the oldest unprocessed window or letter (ready), or proof (asked), came; null: none is there.
+    # Time at which the oldest unprocessed window or letter (ready), or verification (asked), was received; null: none.
     sa.Column("ready", sa.Double),
     sa.Column("asked", sa.Double),
     sa.Column("wake", sa.Double),
@@ -105,11 +105,11 @@ outgoing = sa.Table(
     sa.Column("made", sa.Double, nullable=False),
 )
 
-# Written out, not bound: a planner takes a partial index only where it sees the index's own words in a query.
-_PROOF: sa.ColumnElement[str] = sa.literal_column("'proof'")
+# Literals, not parameters: a planner uses a partial index only where a query repeats its condition word for word.
+_VERIFICATION: sa.ColumnElement[str] = sa.literal_column("'proof'")
 _WINDOW: sa.ColumnElement[str] = sa.literal_column("'window'")
-WORK = sa.and_(messages.c.done.is_(None), messages.c.kind != _PROOF)
-PROOFS = sa.and_(messages.c.done.is_(None), messages.c.kind == _PROOF)
+WORK = sa.and_(messages.c.done.is_(None), messages.c.kind != _VERIFICATION)
+VERIFICATIONS = sa.and_(messages.c.done.is_(None), messages.c.kind == _VERIFICATION)
 WINDOWS = messages.c.kind == _WINDOW
 
 
@@ -118,7 +118,7 @@ def _index(name: str, *columns: sa.Column[object], where: sa.ColumnElement[bool]
 
 
 _index("ix_messages_work", messages.c.servo, messages.c.id, where=WORK)
-_index("ix_messages_proofs", messages.c.servo, messages.c.id, where=PROOFS)
+_index("ix_messages_proofs", messages.c.servo, messages.c.id, where=VERIFICATIONS)
 _index("ix_messages_windows", messages.c.servo, messages.c.id, where=WINDOWS)
 _index("ix_twins_ready", twins.c.ready, where=twins.c.ready.is_not(None))
 _index("ix_twins_asked", twins.c.asked, where=twins.c.asked.is_not(None))

@@ -1,4 +1,4 @@
-"""The store: what came, what was made of it and what goes out, committed."""
+"""The store: incoming messages, work results and outgoing messages, committed."""
 
 from __future__ import annotations
 
@@ -8,33 +8,51 @@ from typing import TypeVar
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.store import audit, lending, outcomes, putting, reading
-from servotwin.store.address import address_of, shown
-from servotwin.store.engine import Engines, engines_of, lost_race, transaction
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.links import Found, Held, Link
+from servotwin.store import incoming, leases, queries, results
+from servotwin.store.engine import (
+    Engines,
+    StoreUnavailable,
+    engines_of,
+    lost_race,
+    parse_address,
+    public_address,
+    transaction,
+)
 from servotwin.store.migrate import migrate
-from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Posted, Put, Stored, Summary, Waiting
+from servotwin.store.records import (
+    Backlog,
+    Incoming,
+    Lease,
+    MessageKind,
+    OutgoingMessage,
+    PutResult,
+    ServoSummary,
+    StoredEvidence,
+    StoredMessage,
+    StoredWindow,
+    WindowTrace,
+    WorkResult,
+)
 
-WORK_KINDS = (Kind.WINDOW, Kind.LETTER)
+WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER)
 _RACES = 8
-HIGHEST_HEARD = 2**52
-"""Of the serials that an edge may say to have heard: messages count to twice as far."""
+_MAX_SERIAL = 2**52
+"""Largest serial that an edge may report as received: messages count to twice as far."""
 
 _Result = TypeVar("_Result")
 
 
 class Store:
-    """A database of messages, evidence and twins; any thread may use it.
+    """Database of messages, evidence and twins; any thread may use it.
 
-    Every method that writes returns when the transaction is on the disk, and raises StoreUnavailable when it could not
-    be: then nothing of it was written. Those that read raise the same. Times are s since the epoch and come from
-    outside: processes that share a database need clocks that agree to a small part of a lease.
+    A method that writes returns when its transaction is on the disk. It raises StoreUnavailable where that failed:
+    then nothing was written. Methods that read raise the same. Times are s since the epoch and come from the caller:
+    the clocks of processes that share a database have to agree to a small part of a lease.
 
     Parameters
     ----------
     engines : Engines
-        Of a database that is up to date: `open_store` makes them.
+        Of a migrated database, as `open_store` makes them.
     """
 
     def __init__(self, engines: Engines) -> None:
@@ -42,54 +60,56 @@ class Store:
 
     @property
     def name(self) -> str:
-        """Where it is, for people; without a password."""
-        return shown(self.engines.writer.url)
+        """Address without the password."""
+        return public_address(self.engines.writer.url)
 
     def close(self) -> None:
         """Close every connection."""
         self.engines.dispose()
 
-    def put(self, items: Sequence[Incoming]) -> list[Put]:
-        """Keep messages, all in one transaction; what became of each.
+    def put(self, items: Sequence[Incoming]) -> list[PutResult]:
+        """Store messages in one transaction; returns the result of each.
 
-        CONFLICT: another message has the same key, and stays.
+        CONFLICT: another message with the same key is stored, and stays.
         """
-        return self._written(lambda connection: putting.put(connection, items))
+        return self._write(lambda connection: incoming.put(connection, items))
 
-    def commit(self, made: Sequence[Outcome], now: float) -> list[bool]:
-        """Commit outcomes, all in one transaction; whether each was valid, or void for another one before it.
+    def commit(self, work: Sequence[WorkResult], now: float) -> list[bool]:
+        """Commit work results in one transaction; False for those that are void, as another one was committed before.
 
         Raises
         ------
         ValueError, sqlalchemy.exc.IntegrityError
-            An outcome covers a message that is not an unprocessed one of its servo, or names no context: nothing is
-            written.
+            A result covers a message that is not an unprocessed one of its servo, or names an unknown context: nothing
+            is written.
         """
-        return self._written(lambda connection: outcomes.commit(connection, made, now))
+        return self._write(lambda connection: results.commit(connection, work, now))
 
-    def write(self, items: Sequence[Incoming], made: Sequence[Outcome], now: float) -> tuple[list[Put], list[bool]]:
+    def write(
+        self, items: Sequence[Incoming], work: Sequence[WorkResult], now: float
+    ) -> tuple[list[PutResult], list[bool]]:
         """`put` and `commit` in one transaction."""
-        return self._written(lambda c: (putting.put(c, items), outcomes.commit(c, made, now)))
+        return self._write(lambda c: (incoming.put(c, items), results.commit(c, work, now)))
 
-    def claim(
+    def lease(
         self,
         owner: str,
         limit: int,
         lease_s: float,
         now: float,
-        kinds: Collection[Kind] = WORK_KINDS,
+        kinds: Collection[MessageKind] = WORK_KINDS,
         per_servo: int = 16,
         servo: str | None = None,
-    ) -> list[Claim]:
-        """Borrow servos that have unprocessed messages of these kinds, or that are due to be woken.
+    ) -> list[Lease]:
+        """Lease servos that have unprocessed messages of these kinds, or that are due to be woken.
 
-        A servo is lent once at a time, until its outcome is committed, it is released, or `lease_s` s are over. Being
-        due counts only where windows or letters are asked for.
+        A servo has one lease at a time, until its result is committed, it is released, or `lease_s` have passed. Being
+        due counts only where `kinds` has windows or letters.
 
         Parameters
         ----------
         owner : str
-            Who borrows: unique among all processes.
+            Name of the owner, unique among all processes.
         limit, per_servo : int
             Servos, and messages of each, at most.
         lease_s, now : float
@@ -97,51 +117,51 @@ class Store:
         servo : str, optional
             Only this one.
         """
-        lent = self._written(lambda c: lending.lend(c, owner, limit, now + lease_s, now, kinds, servo))
-        if not lent:
+        leased = self._write(lambda c: leases.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
+        if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            found = lending.claims(connection, lent, kinds, per_servo)
-            due = lending.woken(connection, lent, now)
-        vain = {claim.servo for claim in found if not claim.messages and claim.servo not in due}
-        if vain:
-            self.release(owner, vain)
-        return [claim for claim in found if claim.servo not in vain]
+            found = leases.load(connection, leased, kinds, per_servo)
+            due = leases.due(connection, leased, now)
+        idle = {lease.servo for lease in found if not lease.messages and lease.servo not in due}
+        if idle:
+            self.release(owner, idle)
+        return [lease for lease in found if lease.servo not in idle]
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
-        """Give back what is borrowed, without an outcome: everything, or some servos."""
-        self._written(lambda connection: lending.release(connection, owner, servos))
+        """End leases without a result: all of an owner's, or those of some servos."""
+        self._write(lambda connection: leases.release(connection, owner, servos))
 
-    def outgoing(self, servo: str, after: int, limit: int = 64) -> list[Posted]:
-        """Messages to the edge of a serial above `after`, lowest first.
+    def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
+        """Messages to the edge with serials above `after`, lowest first.
 
-        An edge that has heard of later messages than there ever were knows a store from before this one was put back
-        from a backup: the next message gets a serial that the edge does not take for a repeated one.
+        An edge that reports a higher serial than any that was posted has talked to the store before it was restored
+        from a backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        found = self._read(lambda connection: reading.outgoing(connection, servo, after, limit))
-        if not found and self.posted([servo]).get(servo, after) < after <= HIGHEST_HEARD:
-            self._written(lambda connection: outcomes.pass_over(connection, servo, after))
+        found = self._read(lambda connection: queries.outgoing(connection, servo, after, limit))
+        if not found and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
+            self._write(lambda connection: results.skip_to_serial(connection, servo, after))
         return found
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
-        """Serial of the newest message to the edge of each of these servos that was heard of."""
-        return self._read(lambda connection: reading.posted(connection, servos))
+        """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
+        return self._read(lambda connection: queries.posted(connection, servos))
 
-    def waiting(self, now: float) -> Waiting:
-        """How much is not yet processed, and for how long."""
-        return self._read(lambda connection: reading.waiting(connection, now))
+    def backlog(self, now: float) -> Backlog:
+        """Number and age of the unprocessed messages."""
+        return self._read(lambda connection: queries.backlog(connection, now))
 
-    def servos(self, after: str = "", limit: int = 1000) -> list[Summary]:
-        """Servos by name, those after a name."""
-        return self._read(lambda connection: reading.servos(connection, after, limit))
+    def servos(self, after: str = "", limit: int = 1000) -> list[ServoSummary]:
+        """Summaries of the servos whose names follow `after`, by name."""
+        return self._read(lambda connection: queries.servos(connection, after, limit))
 
-    def servo(self, name: str) -> Summary | None:
-        """One servo; None: it was never heard of."""
-        return self._read(lambda connection: reading.servo(connection, name))
+    def servo(self, name: str) -> ServoSummary | None:
+        """Summary of one servo; None: it is unknown."""
+        return self._read(lambda connection: queries.servo(connection, name))
 
-    def window(self, servo: str, boot: str, sequence: int) -> Stored | None:
-        """A window with its body, empty once retention took it; None: it never came."""
-        return self._read(lambda connection: reading.window(connection, servo, boot, sequence))
+    def window(self, servo: str, boot: str, sequence: int) -> StoredMessage | None:
+        """A window with its body, which is empty once retention deleted it; None: it is unknown."""
+        return self._read(lambda connection: queries.window(connection, servo, boot, sequence))
 
     def audit(
         self,
@@ -150,8 +170,8 @@ class Store:
         limit: int = 100,
         window: tuple[str, int] | None = None,
         before: int | None = None,
-    ) -> list[Link]:
-        """The evidence chain, newest window first, in one query.
+    ) -> list[WindowTrace]:
+        """Evidence chains of a servo's windows, newest window first, in one query.
 
         Parameters
         ----------
@@ -162,34 +182,34 @@ class Store:
         window : (str, int), optional
             (boot, sequence): only this one.
         before : int, optional
-            Only windows of a lower id than this: the next page after the last one's.
+            Only windows with lower ids: the id of the last window gives the next page.
         """
-        return self._read(lambda connection: audit.audit(connection, servo, since, limit, window, before))
+        return self._read(lambda connection: queries.audit(connection, servo, since, limit, window, before))
 
-    def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[Found]:
-        """What belongs to no window, newest first: starts of the edge, fallbacks, answers, faults of the twin itself.
+    def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[StoredEvidence]:
+        """Evidence that belongs to no window, newest first: starts of the edge, fallbacks, answers, faults of the twin.
 
         Parameters
         ----------
         since : float
-            s since the epoch: only what was noted then or later.
+            s since the epoch: only evidence from then or later.
         """
-        return self._read(lambda connection: audit.events(connection, servo, since, limit))
+        return self._read(lambda connection: queries.events(connection, servo, since, limit))
 
-    def windows(self, servo: str, limit: int = 100, before: int | None = None) -> list[Held]:
+    def windows(self, servo: str, limit: int = 100, before: int | None = None) -> list[StoredWindow]:
         """Windows without bodies, newest first."""
-        return self._read(lambda connection: reading.windows(connection, servo, limit, before))
+        return self._read(lambda connection: queries.windows(connection, servo, limit, before))
 
     def contexts(self, keys: Collection[str]) -> dict[str, str]:
         """JSON texts of contexts by key; unknown keys are left out."""
-        return self._read(lambda connection: reading.contexts(connection, keys))
+        return self._read(lambda connection: queries.contexts(connection, keys))
 
     def _read(self, action: Callable[[sa.Connection], _Result]) -> _Result:
         with transaction(self.engines.reader) as connection:
             return action(connection)
 
-    def _written(self, action: Callable[[sa.Connection], _Result]) -> _Result:
-        """The action in a transaction, again when it only lost a race."""
+    def _write(self, action: Callable[[sa.Connection], _Result]) -> _Result:
+        """Run the action in a transaction; retry it where it only lost a race with another process."""
         for _ in range(_RACES):
             try:
                 with transaction(self.engines.writer) as connection:
@@ -201,7 +221,7 @@ class Store:
 
 
 def open_store(url: str, password: str | None = None) -> Store:
-    """The store at an address, made or brought up to date.
+    """Open the store at an address; create or migrate it where needed.
 
     Parameters
     ----------
@@ -213,10 +233,10 @@ def open_store(url: str, password: str | None = None) -> Store:
     Raises
     ------
     InvalidInput
-        No such address, the database cannot be opened, is not servotwin's, or is of a newer servotwin. Never with the
-        password in it.
+        The address is invalid, or the database cannot be opened, is not servotwin's or is of a newer servotwin. The
+        message never holds the password.
     """
-    engines = engines_of(address_of(url, password))
+    engines = engines_of(parse_address(url, password))
     try:
         migrate(engines.writer)
     except StoreUnavailable as error:

@@ -28,7 +28,7 @@ from servotwin.messages import (
 from servotwin.redesign.certified.certificate import Certificate, Refusal
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
-from servotwin.store.rows import Evidence
+from servotwin.store.records import EvidenceRecord
 from servotwin.twin.decode import decode_channel
 from servotwin.twin.glance import Glance
 from servotwin.twin.lookups import Question
@@ -76,14 +76,14 @@ class Rows:
     ----------
     message : int
         Id of the message that everything now follows from; 0: none.
-    found : list of Evidence
+    found : list of EvidenceRecord
     questions : list of Question
         What is still to be proved.
     """
 
     def __init__(self, context: str) -> None:
         self.context, self.message = context, 0
-        self.found: list[Evidence] = []
+        self.found: list[EvidenceRecord] = []
         self.questions: list[Question] = []
 
     def add_window(self, _window: Window) -> bool:
@@ -167,19 +167,21 @@ class Rows:
         self._message("hello", hello, hello.boot, hello.parameter_version)
 
     def _computed(self, kind: str, body: bytes, status: str, **values: Any) -> None:
-        self.found.append(Evidence(kind, self.message, body, status=short(status), context=self.context, **values))
+        self.found.append(
+            EvidenceRecord(kind, self.message, body, status=short(status), context=self.context, **values)
+        )
 
     def _of_update(self, kind: str, question: Question, body: bytes, status: str) -> None:
         self._computed(kind, body, status, version=question.version, window="{}/{}".format(*question.window))
 
     def _message(self, kind: str, message: ParameterMessage, status: str, version: int | None = None) -> None:
-        self.found.append(Evidence(kind, self.message, encode(message), version=version, status=short(status)))
+        self.found.append(EvidenceRecord(kind, self.message, encode(message), version=version, status=short(status)))
 
 
-def failed(message: int, why: str, body: Mapping[str, Any] | None = None) -> Evidence:
+def failed(message: int, why: str, body: Mapping[str, Any] | None = None) -> EvidenceRecord:
     """That nothing could be made of a message."""
     said = {"failed": why, **(body or {})}
-    return Evidence("estimate", message, plain(said), status=short(f"failed: {why}"))
+    return EvidenceRecord("estimate", message, plain(said), status=short(f"failed: {why}"))
 
 
 def plain(value: object) -> bytes:

@@ -15,7 +15,7 @@ from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Message, Window
 from servotwin.messages.compression import decompress
-from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Stored
+from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import Rows, failed
 from servotwin.twin.fleet import Fleet, Model
@@ -27,13 +27,13 @@ ONE_BY_ONE, GIVEN_UP = 3, 5
 is found; and from which on that one is given up."""
 
 
-def work(fleet: Fleet, claim: Claim, now: float) -> Outcome:
+def work(fleet: Fleet, claim: Lease, now: float) -> WorkResult:
     """What becomes of a claim.
 
     Parameters
     ----------
     fleet : Fleet
-    claim : Claim
+    claim : Lease
         Of a servo that the fleet does not know, every message fails.
     now : float
         s since the epoch; in lock-step, sample time. It may jump: what is waited for is waited for once more then, no
@@ -49,7 +49,7 @@ def work(fleet: Fleet, claim: Claim, now: float) -> Outcome:
 class _Worker:
     """One servo's twin for the length of one claim."""
 
-    def __init__(self, model: Model, claim: Claim) -> None:
+    def __init__(self, model: Model, claim: Lease) -> None:
         self.model, self.claim = model, claim
         self.context = context_of(model.servo, model.settings)
         self.rows = Rows(self.context[0])
@@ -57,7 +57,7 @@ class _Worker:
         self.twin = self._restored(claim.state)
         self.state = self.twin.state()
 
-    def outcome(self, taken: Sequence[Stored], now: float) -> Outcome:
+    def outcome(self, taken: Sequence[StoredMessage], now: float) -> WorkResult:
         """After these messages, and what is overdue."""
         given_up = self.claim.attempts >= GIVEN_UP
         for stored in taken:
@@ -66,7 +66,7 @@ class _Worker:
             else:
                 self._try(stored.id, partial(told, self.twin, stored, now))
         woken = not (given_up and not taken) and self._try(0, partial(self.twin.wake, now))
-        return Outcome(
+        return WorkResult(
             self.claim.servo,
             self.claim.serial,
             self.state,
@@ -104,7 +104,7 @@ class _Worker:
         return True
 
 
-def told(twin: Twin, stored: Stored, now: float) -> list[Message]:
+def told(twin: Twin, stored: StoredMessage, now: float) -> list[Message]:
     """What a twin sends after a stored message; one that is switched off does nothing.
 
     Raises
@@ -112,7 +112,7 @@ def told(twin: Twin, stored: Stored, now: float) -> list[Message]:
     InvalidMessage, InvalidInput
         The body is not understood, or nothing for a twin.
     """
-    if stored.kind is Kind.PROOF:
+    if stored.kind is MessageKind.VERIFICATION:
         if twin.settings.enabled:
             twin.prove(decode_question(stored.body))
         return []
@@ -126,10 +126,10 @@ def _asked(question: Question, now: float) -> Incoming:
     """A proof on the queue."""
     body = encode_question(question)
     digest = hashlib.sha256(body).digest()
-    return Incoming(question.servo, Kind.PROOF, digest.hex(), body, "", digest, now)
+    return Incoming(question.servo, MessageKind.VERIFICATION, digest.hex(), body, "", digest, now)
 
 
-def _unchanged(claim: Claim, taken: Sequence[Stored], why: str) -> Outcome:
+def _unchanged(claim: Lease, taken: Sequence[StoredMessage], why: str) -> WorkResult:
     """The twin as it was, waiting for nothing, and the messages done all the same."""
     evidence = tuple(failed(stored.id, why) for stored in taken)
-    return Outcome(claim.servo, claim.serial, claim.state, None, tuple(stored.id for stored in taken), evidence)
+    return WorkResult(claim.servo, claim.serial, claim.state, None, tuple(stored.id for stored in taken), evidence)

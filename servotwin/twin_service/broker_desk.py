@@ -20,7 +20,7 @@ from servotwin.link.exchange import (
 )
 from servotwin.link.seal import key_of
 from servotwin.messages import InvalidMessage, Refusal
-from servotwin.store.rows import Put
+from servotwin.store.records import PutResult
 from servotwin.twin_service.auth import Authority
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import Buckets
@@ -98,7 +98,7 @@ class Desk:
         """Commit, then say so."""
         self._parts.buckets.take(servo)
         incoming, _ = self._parts.ingest.read(servo, question.body, question.encoding)
-        if await self._parts.ingest.commit(incoming) is Put.NEW:
+        if await self._parts.ingest.commit(incoming) is PutResult.NEW:
             self._parts.came()
         return Taken()
 

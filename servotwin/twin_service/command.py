@@ -16,7 +16,7 @@ import sqlalchemy as sa
 import uvicorn
 
 from servotwin.errors import InvalidInput
-from servotwin.store.address import address_of, file_of
+from servotwin.store.engine import parse_address, sqlite_file
 from servotwin.store.store import Store, open_store
 from servotwin.twin_service import logs
 from servotwin.twin_service.alone import alone
@@ -79,7 +79,7 @@ def present_store(config: ServiceConfig) -> Store:
     InvalidInput
         There is none, or it cannot be opened.
     """
-    file = file_of(address_of(config.store))
+    file = sqlite_file(parse_address(config.store))
     if file is not None and not file.is_file():
         raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
     return store_of(config)

@@ -13,8 +13,8 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.rows import Claim, Evidence, Kind, Outcome
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.job import Done
@@ -53,7 +53,7 @@ class Parts(NamedTuple):
     store: Store
     shelf: Shelf
     pool: Pool
-    commit: Callable[[Outcome], Awaitable[bool]]
+    commit: Callable[[WorkResult], Awaitable[bool]]
     posted: Callable[[str], None]
     metrics: Metrics
     clocks: Clocks
@@ -106,14 +106,14 @@ class Dispatcher:
         except StoreUnavailable as error:
             log.warning("leases not given back", extra={"why": str(error)})
 
-    async def finish(self, claim: Claim, now: float, worker: Worker) -> Outcome | None:
+    async def finish(self, claim: Lease, now: float, worker: Worker) -> WorkResult | None:
         """One claim, to its commit; None where there is no outcome, and the servo is free again."""
-        outcome: Outcome | None = None
+        outcome: WorkResult | None = None
         async for done in worker.work([claim], now):
             outcome = await self._settle(claim, done, now)
         return outcome
 
-    async def _next(self) -> list[Claim]:
+    async def _next(self) -> list[Lease]:
         """Claims, as soon as there are some; none when it is time to stop."""
         while not self._stopping:
             self._came.clear()
@@ -129,19 +129,19 @@ class Dispatcher:
             await self._rest(REST_S)
         return []
 
-    async def _claim(self) -> list[Claim]:
+    async def _claim(self) -> list[Lease]:
         now = self._parts.clocks.wall()
         if self._proofs.may(self._parts.clocks.monotonic()):
-            proofs = await self._borrow(now, 1, (Kind.PROOF,))
+            proofs = await self._borrow(now, 1, (MessageKind.VERIFICATION,))
             if proofs:
                 self._proofs.take()
                 return proofs
         return await self._borrow(now, SERVOS, WORK_KINDS)
 
-    async def _borrow(self, now: float, servos: int, kinds: Collection[Kind]) -> list[Claim]:
+    async def _borrow(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
         store = self._parts.store
         return await self._parts.shelf.ask(
-            lambda: store.claim(self._owner, servos, LEASE_S, now, kinds, per_servo=MESSAGES)
+            lambda: store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=MESSAGES)
         )
 
     async def _rest(self, seconds: float) -> None:
@@ -151,7 +151,7 @@ class Dispatcher:
         except TimeoutError:
             return
 
-    async def _employ(self, worker: Worker, claims: Sequence[Claim]) -> None:
+    async def _employ(self, worker: Worker, claims: Sequence[Lease]) -> None:
         """Let a worker work on claims; those that failed before each alone, so that the fault is found."""
         claims = [claim._replace(attempts=1 + self._faults[_queue(claim)]) for claim in claims]
         jobs = [
@@ -159,7 +159,7 @@ class Dispatcher:
             *([claim] for claim in claims if claim.attempts > 1),
         ]
         left = dict.fromkeys(claim.servo for job in jobs for claim in job)
-        commits: list[asyncio.Task[Outcome | None]] = []
+        commits: list[asyncio.Task[WorkResult | None]] = []
         now = self._parts.clocks.wall()
         try:
             for job in filter(None, jobs):
@@ -174,7 +174,7 @@ class Dispatcher:
             self._parts.pool.take_back(worker)
         await asyncio.gather(*commits)
 
-    async def _lost(self, worker: Worker, claims: Sequence[Claim], left: Sequence[str], why: str) -> None:
+    async def _lost(self, worker: Worker, claims: Sequence[Lease], left: Sequence[str], why: str) -> None:
         """A worker is gone: whom it was at is suspect, and all that it did not come to is free again."""
         self._parts.metrics.workers_lost.add()
         at = next(claim for claim in claims if claim.servo == left[0]) if left else None
@@ -184,7 +184,7 @@ class Dispatcher:
         await self._parts.pool.replace(worker, why)
         self.poke()
 
-    async def _settle(self, claim: Claim, done: Done, now: float) -> Outcome | None:
+    async def _settle(self, claim: Lease, done: Done, now: float) -> WorkResult | None:
         """Commit what a worker made."""
         self._parts.metrics.work.observe(done.seconds)
         if done.outcome is None:
@@ -196,7 +196,7 @@ class Dispatcher:
         self._tell(claim, done.outcome, done.seconds, now)
         return done.outcome
 
-    async def _committed(self, outcome: Outcome) -> bool:
+    async def _committed(self, outcome: WorkResult) -> bool:
         counts = self._parts.metrics.outcomes
         try:
             valid = await self._parts.commit(outcome)
@@ -214,7 +214,7 @@ class Dispatcher:
             self.poke()
         return valid
 
-    def _failed(self, claim: Claim, why: str) -> None:
+    def _failed(self, claim: Lease, why: str) -> None:
         """A worker found no outcome: the next one is told how many did, and gives a message up at last."""
         self._faults[_queue(claim)] += 1
         self._parts.metrics.outcomes.add("failed")
@@ -229,7 +229,7 @@ class Dispatcher:
             await self._parts.shelf.ask(partial(self._parts.store.release, self._owner, servos))
             self._returns -= servos
 
-    def _tell(self, claim: Claim, outcome: Outcome, seconds: float, now: float) -> None:
+    def _tell(self, claim: Lease, outcome: WorkResult, seconds: float, now: float) -> None:
         """Count it, and log what was found."""
         metrics = self._parts.metrics
         for message in claim.messages:
@@ -238,7 +238,7 @@ class Dispatcher:
         for kind, number in kinds.items():
             metrics.evidence.add(kind, by=number)
         about = {"servo": claim.servo, "serial": claim.serial, "seconds": round(seconds, 6)}
-        windows = {message.id: message.key for message in claim.messages if message.kind is Kind.WINDOW}
+        windows = {message.id: message.key for message in claim.messages if message.kind is MessageKind.WINDOW}
         for found in outcome.evidence:
             what = _what(found)
             level = logging.WARNING if what in ALARMS else logging.DEBUG if what in QUIET else logging.INFO
@@ -246,17 +246,17 @@ class Dispatcher:
                 log.log(level, what, extra={**about, **_ids(found, windows)})
 
 
-def _queue(claim: Claim) -> tuple[str, bool]:
+def _queue(claim: Lease) -> tuple[str, bool]:
     """Where its faults are counted: of a proof that kills its workers, windows that succeed meanwhile say nothing."""
-    return claim.servo, any(message.kind is Kind.PROOF for message in claim.messages)
+    return claim.servo, any(message.kind is MessageKind.VERIFICATION for message in claim.messages)
 
 
-def _what(found: Evidence) -> str:
+def _what(found: EvidenceRecord) -> str:
     """Its kind; where nothing could be made of a message, whatever its kind, that."""
     return "failed" if found.status.startswith("failed") else found.kind
 
 
-def _ids(found: Evidence, windows: Mapping[int, str]) -> dict[str, object]:
+def _ids(found: EvidenceRecord, windows: Mapping[int, str]) -> dict[str, object]:
     """Of which window, under which version, in which context. An estimate is known by the message it was made of."""
     of = {"message_id": found.message, "window": windows.get(found.message)}
     known = {**of, "version": found.version, "status": found.status, "context": found.context}

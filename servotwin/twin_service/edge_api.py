@@ -10,7 +10,7 @@ from fastapi import Request, Response
 
 from servotwin.messages import Refusal
 from servotwin.messages.compression import ENCODINGS
-from servotwin.store.rows import Put
+from servotwin.store.records import PutResult
 from servotwin.twin_service.auth import Authority, bearer
 from servotwin.twin_service.ingest import Ingest, acknowledgement
 from servotwin.twin_service.limits import Bodies, Buckets
@@ -77,16 +77,16 @@ class EdgeApi:
         if (window.boot, str(window.sequence)) != (request.path_params["boot"], request.path_params["sequence"]):
             raise Refused(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
         put = await self._ingest.commit(incoming)
-        if put is Put.NEW:
+        if put is PutResult.NEW:
             self._came()
-        return packed([acknowledgement(window)], 201 if put is Put.NEW else 200)
+        return packed([acknowledgement(window)], 201 if put is PutResult.NEW else 200)
 
     async def post_letter(self, request: Request) -> Response:
         """Commit a hello, receipt, fallback or answer: 202."""
         servo = self._gate.admit(request)
         body = await self._bodies.read(request.headers.get("content-length"), request.receive)
         incoming, _ = self._ingest.read_letter(servo, body, encoding_of(request))
-        if await self._ingest.commit(incoming) is Put.NEW:
+        if await self._ingest.commit(incoming) is PutResult.NEW:
             self._came()
         return Response(status_code=202)
 

@@ -22,8 +22,8 @@ from servotwin.messages import (
     encode,
 )
 from servotwin.messages.compression import decompress
-from servotwin.store.errors import StoreBusy, StoreUnavailable
-from servotwin.store.rows import Incoming, Kind, Put
+from servotwin.store.engine import StoreBusy, StoreUnavailable
+from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.twin_service.future import Boots
 from servotwin.twin_service.metrics import Metrics
 from servotwin.twin_service.refused import Refused
@@ -68,7 +68,7 @@ class Ingest:
 
     def __init__(
         self,
-        put: Callable[[Incoming], Awaitable[Put]],
+        put: Callable[[Incoming], Awaitable[PutResult]],
         knows: Callable[[str], bool],
         boots: Boots,
         metrics: Metrics,
@@ -112,15 +112,15 @@ class Ingest:
         if isinstance(message, Window):
             self._boots.check(servo, message.boot, end_of(message), now)
             of_window = message.boot, message.sequence, message.start
-            whose = servo, Kind.WINDOW, f"{message.boot}/{message.sequence}"
+            whose = servo, MessageKind.WINDOW, f"{message.boot}/{message.sequence}"
             return Incoming(*whose, body, encoding, digest, self._clocks.wall(), *of_window), message
         if not isinstance(message, LETTERS):
             raise Refused(Refusal.NOT_UNDERSTOOD, f"a twin does not receive {_kind(message)} messages")
         if isinstance(message, Hello):
             self._boots.hello(servo, message.boot, message.time, now)
-        return Incoming(servo, Kind.LETTER, digest.hex(), body, encoding, digest, self._clocks.wall()), message
+        return Incoming(servo, MessageKind.LETTER, digest.hex(), body, encoding, digest, self._clocks.wall()), message
 
-    async def commit(self, incoming: Incoming) -> Put:
+    async def commit(self, incoming: Incoming) -> PutResult:
         """Commit; returns when it is safe.
 
         Raises
@@ -133,7 +133,7 @@ class Ingest:
             put = await self._put(incoming)
         except (StoreBusy, StoreUnavailable) as error:
             raise Refused(Refusal.UNAVAILABLE, _unavailable(error)) from None
-        if put is Put.CONFLICT:
+        if put is PutResult.CONFLICT:
             raise Refused(Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another one is kept")
         self._metrics.commit.observe(self._clocks.monotonic() - begun)
         self._metrics.taken.add(incoming.kind.value, put.value)

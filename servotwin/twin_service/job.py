@@ -1,15 +1,13 @@
-"""What goes to a worker and what comes back, in frames: a length in four bytes, then MessagePack; no pickles."""
+"""What goes to a worker and what comes back, in frames (`runtime.frames`) of MessagePack; no pickles."""
 
 from __future__ import annotations
 
-from struct import Struct as Layout
 from typing import NamedTuple
 
 import msgspec
 
-from servotwin.store.rows import Claim, Outcome
-
-LENGTH = Layout("<I")
+from servotwin.runtime.frames import frame
+from servotwin.store.records import Lease, WorkResult
 
 
 class Start(NamedTuple):
@@ -31,7 +29,7 @@ class Start(NamedTuple):
 class Job(NamedTuple):
     """Servos to be worked on one after the other; `now` in s: since the epoch, or sample time in lock-step."""
 
-    claims: tuple[Claim, ...]
+    claims: tuple[Lease, ...]
     now: float
 
 
@@ -40,14 +38,14 @@ class Done(NamedTuple):
 
     Attributes
     ----------
-    outcome : Outcome or None
+    outcome : WorkResult or None
     error : str
         Why there is none.
     seconds : float
         What it took.
     """
 
-    outcome: Outcome | None
+    outcome: WorkResult | None
     error: str
     seconds: float
 
@@ -60,5 +58,4 @@ done_of = msgspec.msgpack.Decoder(Done).decode
 
 def framed(message: Start | Job | Done) -> bytes:
     """The message's frame."""
-    body = _encoder.encode(message)
-    return LENGTH.pack(len(body)) + body
+    return frame(_encoder.encode(message))

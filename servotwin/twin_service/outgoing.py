@@ -8,10 +8,10 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 
 from servotwin.link.seal import TO_EDGE, key_of, seal
 from servotwin.messages import Refusal
-from servotwin.store.rows import Posted
+from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.refused import Refused
 
-Read = Callable[[str, int], Awaitable[Sequence[Posted]]]
+Read = Callable[[str, int], Awaitable[Sequence[OutgoingMessage]]]
 """(servo, serial) -> messages of higher serials, rising."""
 NEVER = 2**63
 LONGEST = 30.0
@@ -64,7 +64,7 @@ class Outgoing:
         for servo in list(self._waiting):
             self.post(servo)
 
-    async def after(self, servo: str, serial: int, wait: float) -> Sequence[Posted]:
+    async def after(self, servo: str, serial: int, wait: float) -> Sequence[OutgoingMessage]:
         """Messages of higher serials, as soon as there are some; none after `wait` s.
 
         Raises
@@ -80,7 +80,7 @@ class Outgoing:
         finally:
             self.polls -= 1
 
-    async def _poll(self, servo: str, serial: int, wait: float) -> Sequence[Posted]:
+    async def _poll(self, servo: str, serial: int, wait: float) -> Sequence[OutgoingMessage]:
         loop = asyncio.get_running_loop()
         until = loop.time() + wait
         while True:
@@ -92,7 +92,7 @@ class Outgoing:
             if posts == self._posts[servo]:
                 await self._sleep(servo, serial, left)
 
-    async def _look(self, servo: str, serial: int) -> Sequence[Posted]:
+    async def _look(self, servo: str, serial: int) -> Sequence[OutgoingMessage]:
         """Ask the store, unless it is known to hold nothing newer."""
         posts = self._posts[servo]
         if not self._shared and serial >= self._silent.get(servo, NEVER):
@@ -122,7 +122,7 @@ class Outgoing:
                 del self._waiting[servo]
 
 
-def sealed(verifier: bytes, servo: str, posted: Sequence[Posted]) -> list[bytes]:
+def sealed(verifier: bytes, servo: str, posted: Sequence[OutgoingMessage]) -> list[bytes]:
     """The messages as an edge takes them."""
     key = key_of(verifier)
     return [seal(key, TO_EDGE, servo, message.serial, message.body) for message in posted]

@@ -14,9 +14,8 @@ import msgspec
 from fastapi import Request, Response
 
 from servotwin.messages import NAME_PATTERN, Refusal
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.links import Found, Link
-from servotwin.store.rows import Waiting
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import Backlog, StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import Authority
 from servotwin.twin_service.edge_api import MSGPACK, seconds, token_of, whole
@@ -57,7 +56,7 @@ class ReadApi:
         self._authority, self._store, self._shelf = authority, store, shelf
         self._health, self._metrics, self._wall = health, metrics, wall
         self._counting = asyncio.Lock()
-        self._count: tuple[float, Waiting | None] = -math.inf, None
+        self._count: tuple[float, Backlog | None] = -math.inf, None
         metrics.watch("servotwin_waiting", "Messages and proofs not yet worked on.", self._numbers, "kind")
         metrics.watch("servotwin_waiting_seconds", "For how long the oldest message waits.", self._age)
 
@@ -128,12 +127,12 @@ class ReadApi:
         found = self._count[1]
         return math.nan if found is None else found.age
 
-    async def _counted(self) -> Waiting:
+    async def _counted(self) -> Backlog:
         """How much waits; counted now and then only, as anybody may ask, and as often as he likes."""
         async with self._counting:
             at, found = self._count
             if found is None or self._wall() - at >= FRESH_S:
-                found = await self._shelf.ask(lambda: self._store.waiting(self._wall()))
+                found = await self._shelf.ask(lambda: self._store.backlog(self._wall()))
                 self._count = self._wall(), found
             return found
 
@@ -157,7 +156,7 @@ def as_json(value: Any, status: int = 200) -> Response:
     return Response(msgspec.json.encode(value), status, media_type="application/json")
 
 
-def told(link: Link) -> dict[str, Any]:
+def told(link: WindowTrace) -> dict[str, Any]:
     """A link of the evidence chain, what lies in it as MessagePack opened."""
     return {
         "window": link.window._asdict(),
@@ -179,7 +178,7 @@ def told(link: Link) -> dict[str, Any]:
     }
 
 
-def shown(found: Found) -> dict[str, Any]:
+def shown(found: StoredEvidence) -> dict[str, Any]:
     """A piece of evidence, its body opened."""
     return {**found._asdict(), "body": _opened(found.body)}
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from servotwin.store.errors import StoreUnavailable
+from servotwin.store.engine import StoreUnavailable
 
 _Result = TypeVar("_Result")
 THREADS = 4

@@ -8,8 +8,8 @@ from collections import defaultdict
 from fastapi import Request, Response
 
 from servotwin.messages import Refusal, Window
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.rows import Claim, Kind, Put
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import Lease, MessageKind, PutResult
 from servotwin.twin_service.dispatcher import LEASE_S, Dispatcher, Parts
 from servotwin.twin_service.edge_api import Gate, encoding_of, packed, seconds
 from servotwin.twin_service.ingest import Ingest, acknowledgement, end_of
@@ -51,7 +51,7 @@ class StepApi:
             raise Refused(Refusal.FUTURE, f"the window ends at {end_of(message):g} s, and it is {now:g} s")
         async with self._turns[servo]:
             put = await self._ingest.commit(incoming._replace(received=now))
-            sent = await self._through(servo, now) if put is Put.NEW else []
+            sent = await self._through(servo, now) if put is PutResult.NEW else []
         first = [acknowledgement(message)] if isinstance(message, Window) else []
         return await self._answer(servo, first + sent)
 
@@ -92,17 +92,17 @@ class StepApi:
         self._parts.pool.take_back(worker)
         return sent
 
-    async def _claim(self, servo: str, now: float) -> Claim | None:
+    async def _claim(self, servo: str, now: float) -> Lease | None:
         store = self._parts.store
         try:
             found = await self._parts.shelf.ask(
-                lambda: store.claim(self._owner, 1, LEASE_S, now, tuple(Kind), servo=servo)
+                lambda: store.lease(self._owner, 1, LEASE_S, now, tuple(MessageKind), servo=servo)
             )
         except StoreUnavailable:
             raise Refused(Refusal.UNAVAILABLE, _AGAIN) from None
         return found[0] if found else None
 
-    async def _finished(self, claim: Claim, now: float, worker: Worker) -> tuple[bytes, ...]:
+    async def _finished(self, claim: Lease, now: float, worker: Worker) -> tuple[bytes, ...]:
         outcome = await self._dispatcher.finish(claim, now, worker)
         if outcome is None:
             raise Refused(Refusal.UNAVAILABLE, _AGAIN)

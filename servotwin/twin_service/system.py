@@ -17,10 +17,10 @@ from fastapi import FastAPI
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.groupcommit import Bounds, GroupCommit
-from servotwin.store.retention import forget
-from servotwin.store.rows import Incoming, Outcome, Posted, Put
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.group_commit import CommitLimits, GroupCommit
+from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
+from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.fleet import Fleet
 from servotwin.twin_service import broker_desk
@@ -77,7 +77,7 @@ class System:
         alone, self._knows = self.config.store.startswith(SQLITE), knowing(twin.fleet)
         self._owner = ALONE if alone else uuid4().hex
         self.outgoing = Outgoing(self._posted, self.config.long_polls, shared=not alone)
-        self.commits = GroupCommit(store, Bounds(waiting=self.config.queue), self.clocks.wall)
+        self.commits = GroupCommit(store, CommitLimits(waiting=self.config.queue), self.clocks.wall)
         self.ingest = self._ingest()
         self._parts = Parts(store, self.shelf, self.pool, self._commit, self.outgoing.post, self.metrics, self.clocks)
         self.dispatcher = Dispatcher(self._parts, self._owner, Allowance(self.config.proofs_per_minute))
@@ -148,10 +148,10 @@ class System:
         )
         return Bridge(self.config.mqtt.broker, broker_desk.Desk(parts), self.config.mqtt.group)
 
-    async def _put(self, incoming: Incoming) -> Put:
+    async def _put(self, incoming: Incoming) -> PutResult:
         return await self._written(self.commits.put, incoming)
 
-    async def _commit(self, outcome: Outcome) -> bool:
+    async def _commit(self, outcome: WorkResult) -> bool:
         return await self._written(self.commits.commit, outcome)
 
     async def _written(self, write: Callable[[_What], Future[_Result]], what: _What) -> _Result:
@@ -168,7 +168,7 @@ class System:
         """Whether the last call and the last write succeeded, or it failed long ago: nobody may have tried since."""
         return not self.shelf.fault and self.clocks.monotonic() - self._failed_at >= DOUBT_S
 
-    async def _posted(self, servo: str, serial: int) -> Sequence[Posted]:
+    async def _posted(self, servo: str, serial: int) -> Sequence[OutgoingMessage]:
         return await self.shelf.ask(lambda: self.store.outgoing(servo, serial))
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
@@ -195,7 +195,7 @@ class System:
         while True:
             before = self.clocks.wall() - self.config.retention_days * DAY
             with suppress(StoreUnavailable):
-                done = await self.shelf.ask(partial(forget, self.store, before))
+                done = await self.shelf.ask(partial(delete_old_bodies, self.store, before))
                 if done.emptied:
                     log.info("windows forgotten", extra=done._asdict())
             await asyncio.sleep(RETENTION_S)

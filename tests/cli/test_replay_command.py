@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from servotwin.cli import app as cli
 from servotwin.cosim.scenario import Scenario
-from servotwin.store.retention import forget
+from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import open_store
 
 
@@ -107,7 +107,7 @@ def test_another_model_of_today_is_named_with_what_it_changes(folder: Path) -> N
 def test_windows_that_retention_took_are_counted_and_the_rest_is_compared(folder: Path) -> None:
     store = open_store(f"sqlite:///{folder / 'twin.db'}")
     try:
-        gone = forget(store, inf)
+        gone = delete_old_bodies(store, inf)
     finally:
         store.close()
     assert gone.emptied > 0

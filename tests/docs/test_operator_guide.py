@@ -24,7 +24,7 @@ from servotwin.edge import outlet
 from servotwin.edge_process import outlet as pipe_outlet
 from servotwin.link import outbox, sqlite_outbox
 from servotwin.messages import Cause, Outcome, Reason, Refusal
-from servotwin.store.rows import Waiting
+from servotwin.store.records import Backlog
 from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import ALARMS
 from servotwin.twin_service.pool import Pool
@@ -135,7 +135,7 @@ def test_every_metric_is_explained(system: System) -> None:
 
 def test_every_field_of_health_is_explained(system: System) -> None:
     assert set(named("Health of the twin")) == {*system.health(), "waiting"}
-    assert all(f"`{name}`" in section("Health of the twin") for name in Waiting._fields)
+    assert all(f"`{name}`" in section("Health of the twin") for name in Backlog._fields)
 
 
 def test_every_line_of_the_twin_s_log_is_explained() -> None:

@@ -8,14 +8,14 @@ from store_cases import bodies_of, claim, letter, outcome, proof, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
-from servotwin.store.lending import MOST_BYTES
-from servotwin.store.rows import Claim, Evidence, Kind, Posted, Put, Waiting
+from servotwin.store.leases import MAX_LEASE_BYTES
+from servotwin.store.records import Backlog, EvidenceRecord, Lease, MessageKind, OutgoingMessage, PutResult
 from servotwin.store.schema import bodies, contexts, evidence, messages, outgoing, twins
 from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
 
-NEW, KNOWN, CONFLICT = Put.NEW, Put.KNOWN, Put.CONFLICT
+NEW, KNOWN, CONFLICT = PutResult.NEW, PutResult.KNOWN, PutResult.CONFLICT
 
 
 def rows(store: Store, table: sa.Table) -> int:
@@ -49,7 +49,11 @@ def test_a_claim_holds_windows_and_letters_in_order_and_is_lent_once(store: Stor
     store.put([window(sequence=2, body=b"second"), window(sequence=1, body=b"third")])
     found = {one.servo: one for one in claim(store)}
     assert bodies_of(found["a"]) == [b"first", b"second", b"third"]
-    assert [message.kind for message in found["a"].messages] == [Kind.LETTER, Kind.WINDOW, Kind.WINDOW]
+    assert [message.kind for message in found["a"].messages] == [
+        MessageKind.LETTER,
+        MessageKind.WINDOW,
+        MessageKind.WINDOW,
+    ]
     assert (found["a"].state, found["a"].serial, found["a"].attempts) == (b"", 0, 1)
     assert claim(store, "you") == []
 
@@ -88,7 +92,7 @@ def test_a_servo_is_woken_when_it_is_time(store: Store) -> None:
     first = {one.servo: one for one in claim(store)}
     store.commit([outcome(first["a"], wake=300.0), outcome(first["b"])], 201.0)
     assert claim(store, now=299.0) == []
-    assert claim(store, now=300.0, kinds=(Kind.PROOF,)) == []
+    assert claim(store, now=300.0, kinds=(MessageKind.VERIFICATION,)) == []
     (woken,) = claim(store, now=300.0)
     assert (woken.servo, woken.messages) == ("a", ())
 
@@ -104,14 +108,14 @@ def test_those_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Stor
 
 
 def test_large_messages_are_claimed_a_few_at_a_time(store: Store) -> None:
-    large, small = b"x" * (MOST_BYTES // 2), b"y"
+    large, small = b"x" * (MAX_LEASE_BYTES // 2), b"y"
     store.put([window("a", sequence, large) for sequence in range(3)])
     store.put([window("a", 3, small), window("b", 0, large + large + small), window("b", 1, small)])
-    one, other = store.claim("me", 10, 60.0, 200.0)
+    one, other = store.lease("me", 10, 60.0, 200.0)
     assert [message.key for message in one.messages] == ["boot/0", "boot/1"]
     assert [message.key for message in other.messages] == ["boot/0"]
     assert store.commit([outcome(one), outcome(other)], 200.0) == [True, True]
-    one, other = store.claim("me", 10, 60.0, 200.0)
+    one, other = store.lease("me", 10, 60.0, 200.0)
     assert [message.key for message in one.messages] == ["boot/2", "boot/3"]
     assert [message.body for message in other.messages] == [small]
 
@@ -119,7 +123,7 @@ def test_large_messages_are_claimed_a_few_at_a_time(store: Store) -> None:
 def test_messages_from_before_a_clock_was_set_back_are_claimed(store: Store) -> None:
     store.put([window(received=9000.0)])
     assert len(claim(store, now=200.0)) == 1
-    assert store.waiting(200.0) == Waiting(1, 0, 0.0)
+    assert store.backlog(200.0) == Backlog(1, 0, 0.0)
 
 
 def test_a_lease_from_before_a_clock_was_set_back_has_ended(store: Store) -> None:
@@ -135,19 +139,19 @@ def test_proofs_are_claimed_only_when_asked_for(store: Store) -> None:
     (lent,) = claim(store)
     assert store.commit([outcome(lent, enqueue=(proof(), proof(body=b"another")))], 201.0) == [True]
     assert claim(store) == []
-    assert store.waiting(202.0) == Waiting(0, 2, 0.0)
-    (asked,) = claim(store, kinds=(Kind.PROOF,), per_servo=1)
+    assert store.backlog(202.0) == Backlog(0, 2, 0.0)
+    (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,), per_servo=1)
     assert bodies_of(asked) == [b"prove it"]
     store.put([window(sequence=2)])
     assert claim(store, "you") == []
     assert store.commit([outcome(asked)], 202.0) == [True]
-    (both,) = claim(store, kinds=tuple(Kind))
+    (both,) = claim(store, kinds=tuple(MessageKind))
     assert sorted(bodies_of(both)) == [b"another", b"samples"]
 
 
 def test_a_claim_of_one_kind_lends_nothing_in_vain(store: Store) -> None:
     store.put([window(), letter("b")])
-    (only,) = claim(store, kinds=(Kind.LETTER,))
+    (only,) = claim(store, kinds=(MessageKind.LETTER,))
     assert only.servo == "b"
     assert [one.servo for one in claim(store, "you")] == ["a"]
 
@@ -155,25 +159,27 @@ def test_a_claim_of_one_kind_lends_nothing_in_vain(store: Store) -> None:
 def test_of_two_outcomes_of_one_claim_the_second_is_void(store: Store) -> None:
     store.put([window(), window("b")])
     a, b = claim(store)
-    late = outcome(a, Evidence("estimate", a.messages[0].id, b"2"), outgoing=(b"2",), state=b"2")
-    first = outcome(a, Evidence("estimate", a.messages[0].id, b"1"), outgoing=(b"1",), state=b"1")
+    late = outcome(a, EvidenceRecord("estimate", a.messages[0].id, b"2"), outgoing=(b"2",), state=b"2")
+    first = outcome(a, EvidenceRecord("estimate", a.messages[0].id, b"1"), outgoing=(b"1",), state=b"1")
     assert store.commit([first, late, outcome(b)], 201.0) == [True, False, True]
     assert store.commit([late], 202.0) == [False]
-    assert store.outgoing("a", 0) == [Posted(1, b"1")]
+    assert store.outgoing("a", 0) == [OutgoingMessage(1, b"1")]
     assert rows(store, evidence) == 1
     store.put([window(sequence=2)])
     assert claim(store)[0].state == b"1"
 
 
 def test_an_outcome_for_an_unknown_servo_is_void(store: Store) -> None:
-    assert store.commit([outcome(Claim("nobody", b"", 0, ()))], 200.0) == [False]
+    assert store.commit([outcome(Lease("nobody", b"", 0, ()))], 200.0) == [False]
 
 
 @pytest.mark.parametrize("fault", ["context", "message", "foreign message", "done message"])
 def test_a_faulty_outcome_leaves_nothing_behind(store: Store, fault: str) -> None:
     store.put([window(), window("b")])
     a, b = sorted(claim(store))
-    faulty = outcome(a, Evidence("estimate", 0, b"", context="nowhere" if fault == "context" else ""), outgoing=(b"u",))
+    faulty = outcome(
+        a, EvidenceRecord("estimate", 0, b"", context="nowhere" if fault == "context" else ""), outgoing=(b"u",)
+    )
     if fault == "done message":
         store.commit([outcome(a)], 201.0)
         faulty = faulty._replace(serial=1)
@@ -189,7 +195,7 @@ def test_a_faulty_outcome_leaves_nothing_behind(store: Store, fault: str) -> Non
 
 
 def test_many_threads_with_the_same_windows_keep_each_once(store: Store) -> None:
-    became: list[list[Put]] = []
+    became: list[list[PutResult]] = []
     barrier = threading.Barrier(4)
 
     def send() -> None:
@@ -268,7 +274,7 @@ def test_when_all_is_done_nothing_is_marked_as_waiting(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)
     store.commit([outcome(lent, enqueue=(proof(),))], 201.0)
-    (asked,) = claim(store, kinds=(Kind.PROOF,))
+    (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,))
     store.commit([outcome(asked)], 202.0)
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.select(twins.c.ready, twins.c.asked)).all() == [(None, None)]

@@ -12,10 +12,10 @@ from store_cases import NewAddress, filled, letter, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
-from servotwin.store.backup import Counts, backup, restore
+from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.store.engine import transaction
-from servotwin.store.retention import Forgotten, forget
-from servotwin.store.rows import Evidence, Put
+from servotwin.store.records import EvidenceRecord, PutResult
+from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.schema import bodies
 from servotwin.store.store import open_store
 
@@ -28,12 +28,12 @@ SECRET = "unspeakable"
 
 def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     store = filled(url)
-    (claim,) = store.claim("me", 1, 30.0, 200.0)
-    store.commit([outcome(claim, Evidence("estimate", claim.messages[0].id, b"e"), outgoing=(b"u",))], 201.0)
+    (claim,) = store.lease("me", 1, 30.0, 200.0)
+    store.commit([outcome(claim, EvidenceRecord("estimate", claim.messages[0].id, b"e"), outgoing=(b"u",))], 201.0)
     pages: list[tuple[int, int]] = []
     saved = tmp_path / "backup.db"
     counts = backup(url, saved, lambda *of: pages.append(of))
-    assert counts == Counts(twins=1, messages=5, bodies=5, evidence=1, outgoing=1)
+    assert counts == RowCounts(twins=1, messages=5, bodies=5, evidence=1, outgoing=1)
     assert pages[-1][0] == 0
     assert saved.stat().st_mode & 0o777 == 0o600
     store.put([window(sequence=9)])
@@ -47,7 +47,7 @@ def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     (summary,) = restored.servos()
     assert summary.posted > store.servos()[0].posted + 100_000
     restored.put([window(sequence=9)])
-    (claim,) = restored.claim("me", 1, 30.0, 300.0)
+    (claim,) = restored.lease("me", 1, 30.0, 300.0)
     restored.commit([outcome(claim, outgoing=(b"v", b"w"))], 301.0)
     assert [posted.serial for posted in restored.outgoing("a", 1)] == [summary.posted + 1, summary.posted + 2]
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(("backup", ".backup"))) == ["backup.db"]
@@ -87,7 +87,7 @@ def test_what_cannot_be_backed_up(url: str, tmp_path: Path) -> None:
     assert SECRET not in str(refused.value)
     other = tmp_path / "other.db"
     sqlite3.connect(other).close()
-    with pytest.raises(InvalidInput, match="is not one of servotwin's"):
+    with pytest.raises(InvalidInput, match="is not a store of servotwin"):
         backup(str(other), to)
     store = filled(url)
     with pytest.raises(InvalidInput, match="is the store itself"):
@@ -101,7 +101,7 @@ def test_what_cannot_be_backed_up(url: str, tmp_path: Path) -> None:
 def test_a_restore_overwrites_nothing(url: str, tmp_path: Path) -> None:
     store, saved = filled(url), tmp_path / "backup.db"
     backup(url, saved)
-    with pytest.raises(InvalidInput, match="holds something already"):
+    with pytest.raises(InvalidInput, match="is not empty"):
         restore(saved, url)
     empty = tmp_path / "empty.db"
     in_use = open_store(str(empty))
@@ -114,7 +114,7 @@ def test_a_restore_overwrites_nothing(url: str, tmp_path: Path) -> None:
     opened.close()
     left = tmp_path / "gone.db"
     left.with_name("gone.db-wal").write_bytes(b"log")
-    with pytest.raises(InvalidInput, match=r"its log gone\.db-wal is there"):
+    with pytest.raises(InvalidInput, match=r"its log gone\.db-wal exists"):
         restore(saved, str(left))
     store.close()
 
@@ -155,27 +155,29 @@ def test_retention_empties_old_windows_but_those_that_matter(new_address: NewAdd
     store = open_store(new_address())
     store.put([window(sequence=n, body=bytes(1000), received=100.0 + n) for n in range(10)])
     store.put([letter(received=100.0)])
-    (claim,) = store.claim("me", 1, 30.0, 200.0, per_servo=8)
-    led = Evidence("update", claim.messages[2].id, b"", version=1)
-    every = [Evidence("estimate", message.id, b"e") for message in claim.messages]
+    (claim,) = store.lease("me", 1, 30.0, 200.0, per_servo=8)
+    led = EvidenceRecord("update", claim.messages[2].id, b"", version=1)
+    every = [EvidenceRecord("estimate", message.id, b"e") for message in claim.messages]
     store.commit([outcome(claim, led, *every)], 201.0)
     pauses: list[None] = []
-    assert forget(store, 109.0, 3, lambda: pauses.append(None)) == Forgotten(emptied=7, bytes=7000, kept=2)
+    assert delete_old_bodies(store, 109.0, 3, lambda: pauses.append(None)) == RetentionResult(
+        emptied=7, bytes=7000, kept=2
+    )
     assert pauses
     bodies = {n: store.window("a", "boot", n).body for n in range(10)}
     assert [n for n, body in bodies.items() if body] == [2, 8, 9]
     assert len([link for link in store.audit("a") if link.found or link.steps]) == 8
-    assert store.put([window(body=bytes(1000))]) == [Put.KNOWN]
-    (rest,) = store.claim("me", 1, 30.0, 300.0)
+    assert store.put([window(body=bytes(1000))]) == [PutResult.KNOWN]
+    (rest,) = store.lease("me", 1, 30.0, 300.0)
     assert len(rest.messages) == 3
-    assert forget(store, 109.0) == Forgotten(0, 0, 2)
+    assert delete_old_bodies(store, 109.0) == RetentionResult(0, 0, 2)
     store.close()
 
 
 def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
     store = open_store(url)
     store.put([window(sequence=n, body=os.urandom(20_000), received=100.0) for n in range(100)])
-    while claims := store.claim("me", 1, 30.0, 200.0):
+    while claims := store.lease("me", 1, 30.0, 200.0):
         store.commit([outcome(claim) for claim in claims], 201.0)
 
     def pages() -> int:
@@ -183,7 +185,7 @@ def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
             return connection.exec_driver_sql("PRAGMA page_count").scalar_one()
 
     before = pages()
-    assert forget(store, 1000.0, 10).emptied == 100
+    assert delete_old_bodies(store, 1000.0, 10).emptied == 100
     assert pages() < before / 5
     store.close()
 
@@ -191,16 +193,16 @@ def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
 def test_retention_ended_early_goes_on_next_time(url: str) -> None:
     store = open_store(url)
     store.put([window(sequence=n, received=100.0) for n in range(10)])
-    store.commit([outcome(claim) for claim in store.claim("me", 1, 30.0, 200.0)], 201.0)
+    store.commit([outcome(claim) for claim in store.lease("me", 1, 30.0, 200.0)], 201.0)
 
     def stop() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        forget(store, 1000.0, 4, stop)
-    assert forget(store, 1000.0, 4).emptied == 6
+        delete_old_bodies(store, 1000.0, 4, stop)
+    assert delete_old_bodies(store, 1000.0, 4).emptied == 6
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.select(sa.func.count()).select_from(bodies)).scalar_one() == 0
     with pytest.raises(InvalidInput, match="must be at least 1"):
-        forget(store, 1000.0, 0)
+        delete_old_bodies(store, 1000.0, 0)
     store.close()

@@ -14,7 +14,7 @@ import store_process
 from store_cases import NewAddress, window
 
 from servotwin.store.engine import transaction
-from servotwin.store.rows import Put
+from servotwin.store.records import PutResult
 from servotwin.store.schema import evidence, messages
 from servotwin.store.store import Store, open_store
 
@@ -29,7 +29,7 @@ FAR = 4e9
 def process(role: str, url: str) -> Iterator[subprocess.Popen[str]]:
     """One that is killed when the block ends."""
     command = [sys.executable, str(PROGRAM), role, url]
-    paths = os.pathsep.join((str(PROGRAM.parent), str(PROGRAM.parent.parent)))
+    paths = os.pathsep.join((str(PROGRAM.parent), str(PROGRAM.parents[2])))
     started = subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ, "PYTHONPATH": paths}
     )
@@ -59,7 +59,7 @@ def rest(started: subprocess.Popen[str]) -> list[list[str]]:
 
 def finish(store: Store) -> None:
     """Work through everything that is left."""
-    while found := store.claim("finisher", 16, 1.0, FAR):
+    while found := store.lease("finisher", 16, 1.0, FAR):
         assert all(store.commit([store_process.worked(one) for one in found], FAR))
 
 
@@ -95,7 +95,7 @@ def test_killed_in_the_middle_of_group_commits(new_address: NewAddress) -> None:
                 lines(working, 1)
         safe |= {(servo, int(sequence)) for _, servo, sequence in told}
         store = open_store(url)
-        assert set(store.put([window(servo, n, store_process.BODY) for servo, n in sorted(safe)])) == {Put.KNOWN}
+        assert set(store.put([window(servo, n, store_process.BODY) for servo, n in sorted(safe)])) == {PutResult.KNOWN}
         store.close()
     store = open_store(url)
     finish(store)
@@ -129,7 +129,7 @@ def test_what_a_killed_process_had_borrowed_another_one_does(new_address: NewAdd
     with process("hold", url) as holding:
         assert [words[0] for words in lines(holding, 2)] == ["HELD", "HELD"]
     with process("work", url) as working:
-        while store.waiting(0.0).messages:
+        while store.backlog(0.0).messages:
             lines(working, 1)
     check_each_once(store)
     store.close()
@@ -142,7 +142,7 @@ def test_two_processes_share_the_work_and_one_is_killed(new_address: NewAddress)
     with process("work", url) as one, process("work", url) as other:
         lines(one, 2)
         kill(one)
-        while store.waiting(0.0).messages:
+        while store.backlog(0.0).messages:
             lines(other, 1)
     check_each_once(store)
     store.close()

@@ -1,4 +1,4 @@
-"""What surrounds the tables: addresses, migrations, passwords that are not shown."""
+"""What surrounds the tables: addresses, migrations, passwords that are not public_address."""
 
 import os
 import random
@@ -18,11 +18,9 @@ from store_cases import MORE, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
-from servotwin.store.address import address_of, shown
-from servotwin.store.engine import engines_of, transaction
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.outcomes import _holding
-from servotwin.store.rows import Put
+from servotwin.store.engine import StoreUnavailable, engines_of, parse_address, public_address, transaction
+from servotwin.store.records import PutResult
+from servotwin.store.results import _locked_serials
 from servotwin.store.schema import REVISION, metadata, twins
 from servotwin.store.store import open_store
 
@@ -74,7 +72,7 @@ def test_a_migration_that_fails_leaves_nothing(new_address: NewAddress, later_sc
     filled(url).close()
     broken = later_scripts / "versions" / "0002_more.py"
     broken.write_text(MORE + '    op.execute("INSERT INTO nowhere VALUES (1)")\n')
-    engines = engines_of(address_of(url))
+    engines = engines_of(parse_address(url))
     with pytest.raises((StoreUnavailable, sa.exc.DBAPIError)):
         migrations.migrate(engines.writer, "0002", later_scripts)
     engines.dispose()
@@ -86,7 +84,7 @@ def test_a_migration_that_fails_leaves_nothing(new_address: NewAddress, later_sc
 
 def test_a_database_of_another_program_is_refused(new_address: NewAddress) -> None:
     url = new_address()
-    engines = engines_of(address_of(url))
+    engines = engines_of(parse_address(url))
     with transaction(engines.writer) as connection:
         connection.execute(sa.text("CREATE TABLE messages (words TEXT)"))
     engines.dispose()
@@ -132,8 +130,8 @@ def test_a_new_file_is_its_owners_alone(tmp_path: Path) -> None:
 
 def test_a_store_in_memory() -> None:
     store = open_store("sqlite://")
-    assert store.put([window()]) == [Put.NEW]
-    (claim,) = store.claim("me", 1, 1.0, 200.0)
+    assert store.put([window()]) == [PutResult.NEW]
+    (claim,) = store.lease("me", 1, 1.0, 200.0)
     assert store.commit([outcome(claim)], 200.0) == [True]
     store.close()
 
@@ -146,7 +144,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="cannot be made"):
+    with pytest.raises(InvalidInput, match="cannot be created"):
         open_store(str(tmp_path / "nowhere" / "store.db"))
 
 
@@ -161,13 +159,13 @@ def test_a_file_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
 def test_a_password_is_never_shown(url: str) -> None:
     with pytest.raises(InvalidInput, match="not available now") as refused:
         open_store(url)
-    seen = [str(refused.value), repr(refused.value), shown(address_of(url)), repr(refused.value.__cause__)]
+    seen = [str(refused.value), repr(refused.value), public_address(parse_address(url)), repr(refused.value.__cause__)]
     assert SECRET not in " ".join(seen)
 
 
 def test_a_password_of_its_own_replaces_that_of_the_address() -> None:
-    assert address_of("postgresql://u:old@h/d", SECRET).password == SECRET
-    assert address_of("postgresql://u:old@h/d").password == "old"
+    assert parse_address("postgresql://u:old@h/d", SECRET).password == SECRET
+    assert parse_address("postgresql://u:old@h/d").password == "old"
 
 
 def test_without_psycopg_the_error_names_the_extra() -> None:
@@ -195,7 +193,7 @@ def test_a_server_that_cuts_its_connections_is_survived() -> None:
         server.run("postgres", "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'cut'")
         with pytest.raises(StoreUnavailable, match="not available now"):
             store.put([window(sequence=2)])
-        assert store.put([window(sequence=2)]) == [Put.NEW]
+        assert store.put([window(sequence=2)]) == [PutResult.NEW]
         assert store.servo("a").windows == 2
         store.close()
 
@@ -212,7 +210,7 @@ def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in(
         store.put([window(name) for name in names])
         with store.engines.reader.connect() as connection:
             by_people = connection.scalars(sa.select(twins.c.servo).order_by(twins.c.servo)).all()
-            held = connection.execute(_holding("postgresql"), {"_servos": names}).all()
+            held = connection.execute(_locked_serials("postgresql"), {"_servos": names}).all()
         store.close()
     assert by_people != sorted(names)
     assert [row.servo for row in held] == sorted(names)

@@ -14,10 +14,9 @@ from sqlalchemy import event
 from store_cases import letter, outcome, window
 
 from servotwin.errors import InvalidInput
-from servotwin.store.engine import transaction
-from servotwin.store.errors import StoreBusy, StoreUnavailable
-from servotwin.store.groupcommit import Bounds, GroupCommit
-from servotwin.store.rows import Evidence, Incoming, Outcome, Put
+from servotwin.store.engine import StoreBusy, StoreUnavailable, transaction
+from servotwin.store.group_commit import CommitLimits, GroupCommit
+from servotwin.store.records import EvidenceRecord, Incoming, PutResult, WorkResult
 from servotwin.store.store import Store, open_store
 
 PATIENCE_S = 60.0
@@ -46,7 +45,9 @@ class Gate:
         self.sizes: list[int] = []
         self.name = store.name
 
-    def write(self, items: Sequence[Incoming], made: Sequence[Outcome], now: float) -> tuple[list[Put], list[bool]]:
+    def write(
+        self, items: Sequence[Incoming], made: Sequence[WorkResult], now: float
+    ) -> tuple[list[PutResult], list[bool]]:
         self.sizes.append(len(items) + len(made))
         self.entered.set()
         assert self.opened.wait(PATIENCE_S)
@@ -60,14 +61,14 @@ def gate(store: Store) -> Iterator[Gate]:
     made.opened.set()
 
 
-def results(futures: Sequence[Future[Put]]) -> list[Put]:
+def results(futures: Sequence[Future[PutResult]]) -> list[PutResult]:
     return [future.result(PATIENCE_S) for future in futures]
 
 
 def test_messages_and_outcomes_of_many_threads(store: Store, group: GroupCommit) -> None:
     store.put([window("worked")])
-    (claim,) = store.claim("me", 1, 30.0, 200.0)
-    became: list[Put] = []
+    (claim,) = store.lease("me", 1, 30.0, 200.0)
+    became: list[PutResult] = []
 
     def send(servo: str) -> None:
         became.extend(group.put(window(servo, n % 20)).result(PATIENCE_S) for n in range(40))
@@ -79,24 +80,24 @@ def test_messages_and_outcomes_of_many_threads(store: Store, group: GroupCommit)
     assert group.commit(outcome(claim)).result(PATIENCE_S) is False
     for thread in threads:
         thread.join()
-    assert (became.count(Put.NEW), became.count(Put.KNOWN)) == (160, 160)
+    assert (became.count(PutResult.NEW), became.count(PutResult.KNOWN)) == (160, 160)
     assert store.servo("worked").posted == 1
 
 
 def test_whatever_waits_is_taken_together(gate: Gate) -> None:
-    group = GroupCommit(gate, Bounds(together=8))
+    group = GroupCommit(gate, CommitLimits(together=8))
     first = group.put(window(sequence=0))
     assert gate.entered.wait(PATIENCE_S)
     others = [group.put(window(sequence=n)) for n in range(1, 12)]
     assert not first.done()
     gate.opened.set()
-    assert results([first, *others]) == [Put.NEW] * 12
+    assert results([first, *others]) == [PutResult.NEW] * 12
     assert gate.sizes == [1, 8, 3]
     group.close()
 
 
 def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
-    group = GroupCommit(gate, Bounds(together_bytes=2000))
+    group = GroupCommit(gate, CommitLimits(together_bytes=2000))
     futures = [group.put(window(sequence=0))]
     assert gate.entered.wait(PATIENCE_S)
     futures += [group.put(window(sequence=n, body=bytes(1000))) for n in range(1, 6)]
@@ -106,10 +107,10 @@ def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
     group.close()
 
 
-@pytest.mark.parametrize("bounds", [Bounds(waiting=3), Bounds(waiting_bytes=3 * 7)])
-def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds: Bounds) -> None:
+@pytest.mark.parametrize("bounds", [CommitLimits(waiting=3), CommitLimits(waiting_bytes=3 * 7)])
+def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds: CommitLimits) -> None:
     gate.store.put([window("worked")])
-    (claim,) = gate.store.claim("me", 1, 30.0, 200.0)
+    (claim,) = gate.store.lease("me", 1, 30.0, 200.0)
     group = GroupCommit(gate, bounds)
     futures = [group.put(window(sequence=0))]
     assert gate.entered.wait(PATIENCE_S)
@@ -119,9 +120,9 @@ def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds
     committed = group.commit(outcome(claim))
     assert group.waiting == 4
     gate.opened.set()
-    assert results(futures) == [Put.NEW] * 4
+    assert results(futures) == [PutResult.NEW] * 4
     assert committed.result(PATIENCE_S) is True
-    assert results([group.put(window(sequence=4))]) == [Put.NEW]
+    assert results([group.put(window(sequence=4))]) == [PutResult.NEW]
     group.close()
 
 
@@ -130,7 +131,7 @@ def test_what_is_handed_over_cannot_be_cancelled(gate: Gate) -> None:
     futures = [group.put(window(sequence=n)) for n in range(3)]
     assert not any(future.cancel() for future in futures)
     gate.opened.set()
-    assert results(futures) == [Put.NEW] * 3
+    assert results(futures) == [PutResult.NEW] * 3
     group.close()
 
 
@@ -147,15 +148,15 @@ def test_closing_commits_what_waits_and_takes_nothing_more(gate: Gate) -> None:
 
 def test_a_faulty_outcome_fails_alone(store: Store, gate: Gate) -> None:
     store.put([window("a"), window("b")])
-    a, b = sorted(store.claim("me", 2, 30.0, 200.0))
+    a, b = sorted(store.lease("me", 2, 30.0, 200.0))
     group = GroupCommit(gate)
     futures = [group.put(letter("c"))]
     assert gate.entered.wait(PATIENCE_S)
-    faulty = group.commit(outcome(a, Evidence("estimate", 0, b"", context="nowhere")))
+    faulty = group.commit(outcome(a, EvidenceRecord("estimate", 0, b"", context="nowhere")))
     futures.append(group.put(letter("d")))
     valid = group.commit(outcome(b))
     gate.opened.set()
-    assert results(futures) == [Put.NEW] * 2
+    assert results(futures) == [PutResult.NEW] * 2
     assert valid.result(PATIENCE_S) is True
     assert isinstance(faulty.exception(PATIENCE_S), sa.exc.IntegrityError)
     assert (store.servo("a").serial, store.servo("b").serial) == (0, 1)
@@ -170,7 +171,7 @@ def limit_pages(store: Store, more: int | None) -> None:
 
 
 def test_a_full_disk_fails_what_it_must_and_is_survived(store: Store, group: GroupCommit) -> None:
-    assert results([group.put(window(sequence=0))]) == [Put.NEW]
+    assert results([group.put(window(sequence=0))]) == [PutResult.NEW]
     limit_pages(store, 20)
     futures = [group.put(window(sequence=n, body=bytes(50_000))) for n in range(1, 30)]
     wait(futures, PATIENCE_S)
@@ -181,12 +182,12 @@ def test_a_full_disk_fails_what_it_must_and_is_survived(store: Store, group: Gro
     assert store.servo("a").windows == 1 + len(safe)
     limit_pages(store, None)
     again = results([group.put(window(sequence=n, body=bytes(50_000))) for n in range(1, 30)])
-    assert again == [Put.KNOWN if n in safe else Put.NEW for n in range(1, 30)]
+    assert again == [PutResult.KNOWN if n in safe else PutResult.NEW for n in range(1, 30)]
 
 
 def test_a_full_disk_loses_no_outcome_that_was_acknowledged(store: Store, group: GroupCommit) -> None:
     store.put([window()])
-    (claim,) = store.claim("me", 1, 30.0, 200.0)
+    (claim,) = store.lease("me", 1, 30.0, 200.0)
     limit_pages(store, 2)
     large = outcome(claim, outgoing=(bytes(200_000),))
     assert isinstance(group.commit(large).exception(PATIENCE_S), StoreUnavailable)
@@ -205,7 +206,7 @@ def test_a_read_only_database_is_survived(store: Store, group: GroupCommit) -> N
     with transaction(store.engines.reader) as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM messages").scalar_one() == 0
     store.engines.writer.dispose()
-    assert results([group.put(window())]) == [Put.NEW]
+    assert results([group.put(window())]) == [PutResult.NEW]
 
 
 def test_a_lost_connection_is_survived(store: Store, group: GroupCommit) -> None:
@@ -219,7 +220,7 @@ def test_a_lost_connection_is_survived(store: Store, group: GroupCommit) -> None
     with pytest.raises(StoreUnavailable, match="connection was cut"):
         results([group.put(window())])
     failing = False
-    assert results([group.put(window())]) == [Put.NEW]
+    assert results([group.put(window())]) == [PutResult.NEW]
 
 
 @pytest.fixture
@@ -248,7 +249,7 @@ def test_a_disk_that_is_really_full_and_then_really_read_only(small_disk: Path) 
     assert errors
     assert all(isinstance(error, StoreUnavailable) for error in errors)
     hoard.unlink()
-    assert results([group.put(window(sequence=100))]) == [Put.NEW]
+    assert results([group.put(window(sequence=100))]) == [PutResult.NEW]
     safe = 1 + sum(future.exception() is None for future in futures)
     assert store.servo("a").windows == safe
     group.close()

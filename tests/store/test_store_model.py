@@ -10,11 +10,15 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, multiple, rule
 from store_cases import incoming
 
-from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome, Posted, Put
+from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.store import open_store
 
 LEASE_S = 10.0
-QUEUES = {(Kind.WINDOW, Kind.LETTER), (Kind.PROOF,), (Kind.WINDOW, Kind.LETTER, Kind.PROOF)}
+QUEUES = {
+    (MessageKind.WINDOW, MessageKind.LETTER),
+    (MessageKind.VERIFICATION,),
+    (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.VERIFICATION),
+}
 
 servos = st.sampled_from(["a", "b", "c"])
 keys = st.sampled_from([f"k{n}" for n in range(8)])
@@ -53,34 +57,34 @@ class Against(RuleBasedStateMachine):
         self.store.close()
         shutil.rmtree(self.folder)
 
-    @rule(items=st.lists(st.tuples(servos, keys, texts, st.sampled_from(Kind)), min_size=1, max_size=5))
-    def put(self, items: list[tuple[str, str, bytes, Kind]]) -> None:
+    @rule(items=st.lists(st.tuples(servos, keys, texts, st.sampled_from(MessageKind)), min_size=1, max_size=5))
+    def put(self, items: list[tuple[str, str, bytes, MessageKind]]) -> None:
         # A key is of one kind for ever, as a boot and a sequence are.
         made = [incoming(s, f"{kind} {key}", body, kind, self.now) for s, key, body, kind in items]
         assert self.store.put(made) == [self.expect_put(item) for item in made]
 
-    def expect_put(self, item: Incoming) -> Put:
+    def expect_put(self, item: Incoming) -> PutResult:
         self.servos.setdefault(item.servo, Model())
         kept = self.kept.setdefault((item.servo, item.key), Kept(item))
         if kept.item is item:
-            return Put.NEW
-        return Put.KNOWN if kept.item.digest == item.digest else Put.CONFLICT
+            return PutResult.NEW
+        return PutResult.KNOWN if kept.item.digest == item.digest else PutResult.CONFLICT
 
-    def undone(self, servo: str, kinds: tuple[Kind, ...]) -> list[bytes]:
+    def undone(self, servo: str, kinds: tuple[MessageKind, ...]) -> list[bytes]:
         of = (kept.item for (whose, _), kept in self.kept.items() if whose == servo and not kept.done)
         return [item.body + item.key.encode() for item in of if item.kind in kinds]
 
-    def due(self, servo: str, kinds: tuple[Kind, ...]) -> bool:
+    def due(self, servo: str, kinds: tuple[MessageKind, ...]) -> bool:
         model = self.servos[servo]
         if model.lent_until is not None and model.lent_until > self.now:
             return False
-        woken = model.wake is not None and model.wake <= self.now and Kind.WINDOW in kinds
+        woken = model.wake is not None and model.wake <= self.now and MessageKind.WINDOW in kinds
         return woken or bool(self.undone(servo, kinds))
 
     @rule(target=claims, limit=st.integers(1, 3), per_servo=st.integers(1, 4), kinds=st.sampled_from(sorted(QUEUES)))
-    def claim(self, limit: int, per_servo: int, kinds: tuple[Kind, ...]) -> object:
+    def claim(self, limit: int, per_servo: int, kinds: tuple[MessageKind, ...]) -> object:
         due = {servo for servo in self.servos if self.due(servo, kinds)}
-        found = self.store.claim("me", limit, LEASE_S, self.now, kinds, per_servo)
+        found = self.store.lease("me", limit, LEASE_S, self.now, kinds, per_servo)
         assert {one.servo for one in found} <= due
         assert len(found) == min(limit, len(due))
         for one in found:
@@ -88,7 +92,7 @@ class Against(RuleBasedStateMachine):
             self.servos[one.servo].lent_until = self.now + LEASE_S
         return multiple(*found)
 
-    def check(self, claim: Claim, kinds: tuple[Kind, ...], per_servo: int) -> None:
+    def check(self, claim: Lease, kinds: tuple[MessageKind, ...], per_servo: int) -> None:
         model = self.servos[claim.servo]
         assert (claim.state, claim.serial) == (model.state, model.serial)
         expected = self.undone(claim.servo, kinds)
@@ -112,19 +116,23 @@ class Against(RuleBasedStateMachine):
         ask=st.none() | keys,
         again=st.booleans(),
     )
-    def commit(self, lent: list[Claim], letters: list[bytes], wake: float | None, ask: str | None, again: bool) -> None:
+    def commit(self, lent: list[Lease], letters: list[bytes], wake: float | None, ask: str | None, again: bool) -> None:
         made = [self.outcome(claim, letters, wake, ask) for claim in lent]
         made += made[:1] if again else []
         assert self.store.commit(made, self.now) == [self.expect_commit(one) for one in made]
 
-    def outcome(self, claim: Claim, letters: list[bytes], wake: float | None, ask: str | None) -> Outcome:
+    def outcome(self, claim: Lease, letters: list[bytes], wake: float | None, ask: str | None) -> WorkResult:
         done = tuple(message.id for message in claim.messages)
-        found = tuple(Evidence("estimate", message, b"") for message in done)
-        asked = () if ask is None else (incoming(claim.servo, f"{Kind.PROOF} {ask}", b"x", Kind.PROOF, self.now),)
+        found = tuple(EvidenceRecord("estimate", message, b"") for message in done)
+        asked = (
+            ()
+            if ask is None
+            else (incoming(claim.servo, f"{MessageKind.VERIFICATION} {ask}", b"x", MessageKind.VERIFICATION, self.now),)
+        )
         at = None if wake is None else self.now + wake
-        return Outcome(claim.servo, claim.serial, b"%d" % claim.serial, at, done, found, tuple(letters), asked)
+        return WorkResult(claim.servo, claim.serial, b"%d" % claim.serial, at, done, found, tuple(letters), asked)
 
-    def expect_commit(self, made: Outcome) -> bool:
+    def expect_commit(self, made: WorkResult) -> bool:
         model = self.servos[made.servo]
         if model.serial != made.serial:
             return False
@@ -162,11 +170,13 @@ class Against(RuleBasedStateMachine):
         for name, model in self.servos.items():
             found = self.store.servo(name)
             assert (found.serial, found.wake) == (model.serial, model.wake)
-            assert found.waiting == len(self.undone(name, (Kind.WINDOW, Kind.LETTER)))
-            assert self.store.outgoing(name, 0) == [Posted(n, body) for n, body in enumerate(model.letters, 1)]
-        waiting = self.store.waiting(self.now)
-        assert waiting.messages == sum(len(self.undone(name, (Kind.WINDOW, Kind.LETTER))) for name in self.servos)
-        assert waiting.proofs == sum(len(self.undone(name, (Kind.PROOF,))) for name in self.servos)
+            assert found.waiting == len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER)))
+            assert self.store.outgoing(name, 0) == [OutgoingMessage(n, body) for n, body in enumerate(model.letters, 1)]
+        waiting = self.store.backlog(self.now)
+        assert waiting.messages == sum(
+            len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER))) for name in self.servos
+        )
+        assert waiting.proofs == sum(len(self.undone(name, (MessageKind.VERIFICATION,))) for name in self.servos)
 
 
 Against.TestCase.settings = settings(max_examples=25, stateful_step_count=25)

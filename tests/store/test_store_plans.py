@@ -9,8 +9,8 @@ import pytest
 import sqlalchemy as sa
 from store_cases import letter, outcome, proof, window
 
-from servotwin.store.retention import forget
-from servotwin.store.rows import Evidence, Kind
+from servotwin.store.records import EvidenceRecord, MessageKind
+from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
 
 WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|proofs)")
@@ -41,24 +41,24 @@ def exercise(store: Store) -> None:
     sent = [window("a", 1), window("a", 2), window("b", 1), letter("b"), proof("a")]
     store.put(sent)
     store.put([*sent, window("a", 1, b"other")])
-    for kinds in ((Kind.WINDOW, Kind.LETTER), (Kind.PROOF,), (Kind.LETTER,)):
+    for kinds in ((MessageKind.WINDOW, MessageKind.LETTER), (MessageKind.VERIFICATION,), (MessageKind.LETTER,)):
         for servo in (None, "a"):
-            for claim in store.claim("me", 16, 60.0, 100.0, kinds, servo=servo):
+            for claim in store.lease("me", 16, 60.0, 100.0, kinds, servo=servo):
                 first = claim.messages[0].id
                 found = (
-                    Evidence("estimate", first, b"1", version=1, gap=0.1, std=0.01, status="ok", context="c"),
-                    Evidence("update", first, b"2", version=2),
-                    Evidence("receipt", 0, b"3", version=2, status="applied", window="boot/1"),
+                    EvidenceRecord("estimate", first, b"1", version=1, gap=0.1, std=0.01, status="ok", context="c"),
+                    EvidenceRecord("update", first, b"2", version=2),
+                    EvidenceRecord("receipt", 0, b"3", version=2, status="applied", window="boot/1"),
                 )
                 made = outcome(claim, *found, outgoing=(b"update",), contexts=(("c", "{}"),), wake=150.0)
                 store.write([window("c", first)], [made], 100.0)
-    store.claim("me", 16, 60.0, 300.0)
+    store.lease("me", 16, 60.0, 300.0)
     store.release("me", ["a"])
     store.release("me")
     store.outgoing("a", 0)
     store.outgoing("a", 99)
     store.posted(["a", "b"])
-    store.waiting(200.0)
+    store.backlog(200.0)
     store.servos()
     store.servo("a")
     store.window("a", "boot", 1)
@@ -68,7 +68,7 @@ def exercise(store: Store) -> None:
     store.audit("a", since=0.0, before=10)
     store.audit("a", window=("boot", 1))
     store.events("a")
-    forget(store, 1e9)
+    delete_old_bodies(store, 1e9)
 
 
 def plan(path: str, statement: str, parameters: Any) -> list[str]:

@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 from store_cases import NewAddress, bodies_of, claim, letter, outcome, proof, window
 
-from servotwin.store.rows import Evidence, Kind, Posted, Waiting
+from servotwin.store.records import Backlog, EvidenceRecord, MessageKind, OutgoingMessage
 from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -13,9 +13,14 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
     for sequence in (1, 2):
         store.put([window(sequence=sequence), window("b", sequence)])
         store.commit([outcome(one, outgoing=(b"x%d" % sequence, b"y%d" % sequence)) for one in claim(store)], 201.0)
-    assert store.outgoing("a", 0) == [Posted(1, b"x1"), Posted(2, b"y1"), Posted(3, b"x2"), Posted(4, b"y2")]
-    assert store.outgoing("b", 2) == [Posted(3, b"x2"), Posted(4, b"y2")]
-    assert store.outgoing("a", 0, limit=1) == [Posted(1, b"x1")]
+    assert store.outgoing("a", 0) == [
+        OutgoingMessage(1, b"x1"),
+        OutgoingMessage(2, b"y1"),
+        OutgoingMessage(3, b"x2"),
+        OutgoingMessage(4, b"y2"),
+    ]
+    assert store.outgoing("b", 2) == [OutgoingMessage(3, b"x2"), OutgoingMessage(4, b"y2")]
+    assert store.outgoing("a", 0, limit=1) == [OutgoingMessage(1, b"x1")]
     assert store.outgoing("a", 4) == store.outgoing("nobody", 0) == []
 
 
@@ -24,23 +29,23 @@ def test_an_edge_that_has_heard_more_than_a_restored_store_knows_hears_what_come
         store.put([window(sequence=sequence), window("b", sequence)])
         assert store.outgoing("a", heard) == []
         store.commit([outcome(one, outgoing=(b"x%d" % sequence,)) for one in claim(store)], 201.0)
-    assert store.outgoing("a", 900) == [Posted(901, b"x2"), Posted(902, b"x3")]
+    assert store.outgoing("a", 900) == [OutgoingMessage(901, b"x2"), OutgoingMessage(902, b"x3")]
     assert [post.serial for post in store.outgoing("b", 0)] == [1, 2, 3]
     assert store.outgoing("nobody", 7) == []
 
 
 def test_what_waits_and_for_how_long(store: Store) -> None:
-    assert store.waiting(200.0) == Waiting(0, 0, 0.0)
+    assert store.backlog(200.0) == Backlog(0, 0, 0.0)
     store.put([window(received=110.0), letter(received=120.0), window("b", received=150.0)])
-    assert store.waiting(200.0) == Waiting(3, 0, 90.0)
+    assert store.backlog(200.0) == Backlog(3, 0, 90.0)
     store.commit([outcome(claim(store, servo="a")[0])], 201.0)
-    assert store.waiting(200.0) == Waiting(1, 0, 50.0)
+    assert store.backlog(200.0) == Backlog(1, 0, 50.0)
 
 
 def test_contexts_are_kept_once(store: Store) -> None:
     store.put([window(), window("b")])
     known = (("k1", '{"numpy": "2"}'),)
-    made = [outcome(one, Evidence("estimate", 0, b"", context="k1"), contexts=known) for one in claim(store)]
+    made = [outcome(one, EvidenceRecord("estimate", 0, b"", context="k1"), contexts=known) for one in claim(store)]
     assert store.commit(made, 201.0) == [True, True]
     assert store.contexts(["k1", "k2"]) == {"k1": '{"numpy": "2"}'}
 
@@ -48,10 +53,10 @@ def test_contexts_are_kept_once(store: Store) -> None:
 def test_a_servo_at_a_glance(store: Store) -> None:
     store.put([window(), letter(received=150.0), window("b")])
     found = (
-        Evidence("glance", 0, b"", gap=0.1, std=0.01, status="calm"),
-        Evidence("estimate", 0, b"", gap=0.2, std=0.02, status="ok"),
-        Evidence("update", 0, b"", version=3, gap=0.2),
-        Evidence("receipt", 0, b"", version=3, status="applied"),
+        EvidenceRecord("glance", 0, b"", gap=0.1, std=0.01, status="calm"),
+        EvidenceRecord("estimate", 0, b"", gap=0.2, std=0.02, status="ok"),
+        EvidenceRecord("update", 0, b"", version=3, gap=0.2),
+        EvidenceRecord("receipt", 0, b"", version=3, status="applied"),
     )
     store.commit([outcome(claim(store, servo="a")[0], *found, outgoing=(b"u",), wake=400.0)], 201.0)
     store.put([window(sequence=2, received=160.0)])
@@ -66,14 +71,14 @@ def test_a_servo_at_a_glance(store: Store) -> None:
 def test_a_window_with_its_body(store: Store) -> None:
     store.put([window(body=b"packed")._replace(encoding="zstd")])
     found = store.window("a", "boot", 1)
-    assert (found.kind, found.body, found.encoding, found.received) == (Kind.WINDOW, b"packed", "zstd", 100.0)
+    assert (found.kind, found.body, found.encoding, found.received) == (MessageKind.WINDOW, b"packed", "zstd", 100.0)
     assert store.window("a", "boot", 2) is store.window("b", "boot", 1) is None
     store.put([window(sequence=2), window(sequence=3)])
     assert [held.sequence for held in store.windows("a", limit=2)] == [3, 2]
     assert [held.sequence for held in store.windows("a", before=store.windows("a")[1].id)] == [1]
 
 
-def process(store: Store, *found: Evidence, servo: str = "a") -> None:
+def process(store: Store, *found: EvidenceRecord, servo: str = "a") -> None:
     """Claim and commit, with this evidence of the claim's first message."""
     (lent,) = claim(store, servo=servo)
     mine = [one._replace(message=one.message or lent.messages[0].id) for one in found]
@@ -83,19 +88,21 @@ def process(store: Store, *found: Evidence, servo: str = "a") -> None:
 def test_the_evidence_chain(store: Store) -> None:
     store.put([window(sequence=1)])
     process(
-        store, Evidence("estimate", 0, b"e1", version=0, gap=0.1, status="ok", tail=9e-4), Evidence("trend", 0, b"")
+        store,
+        EvidenceRecord("estimate", 0, b"e1", version=0, gap=0.1, status="ok", tail=9e-4),
+        EvidenceRecord("trend", 0, b""),
     )
     store.put([window(sequence=2)])
-    seen = Evidence("estimate", 0, b"e2", version=0, gap=0.2, std=0.01, status="ok", tail=8e-4)
-    process(store, Evidence("glance", 0, b"g2", version=0), seen, Evidence("update", 0, b"u", version=1))
+    seen = EvidenceRecord("estimate", 0, b"e2", version=0, gap=0.2, std=0.01, status="ok", tail=8e-4)
+    process(store, EvidenceRecord("glance", 0, b"g2", version=0), seen, EvidenceRecord("update", 0, b"u", version=1))
     store.put([letter(body=b"receipt")])
-    process(store, Evidence("receipt", 0, b"r", version=1, status="applied"))
+    process(store, EvidenceRecord("receipt", 0, b"r", version=1, status="applied"))
     store.put([window("b", 1)])
-    process(store, Evidence("glance", 0, b"", version=1, tail=0.5), servo="b")
+    process(store, EvidenceRecord("glance", 0, b"", version=1, tail=0.5), servo="b")
     store.put([window(sequence=3)])
-    process(store, Evidence("glance", 0, b"g3", version=1, gap=0.2, status="calm", tail=1e-5))
+    process(store, EvidenceRecord("glance", 0, b"g3", version=1, gap=0.2, status="calm", tail=1e-5))
     store.put([window(sequence=4)])
-    process(store, Evidence("glance", 0, b"g4", version=1, tail=2e-5))
+    process(store, EvidenceRecord("glance", 0, b"g4", version=1, tail=2e-5))
 
     links = store.audit("a")
     assert [link.window.sequence for link in links] == [4, 3, 2, 1]
@@ -122,9 +129,9 @@ def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> Non
 def test_an_update_after_a_proof_hangs_on_its_window(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)
-    store.commit([outcome(lent, Evidence("estimate", lent.messages[0].id, b""), enqueue=(proof(),))], 201.0)
-    (asked,) = claim(store, kinds=(Kind.PROOF,))
-    late = Evidence("update", asked.messages[0].id, b"", version=1, window="boot/1")
+    store.commit([outcome(lent, EvidenceRecord("estimate", lent.messages[0].id, b""), enqueue=(proof(),))], 201.0)
+    (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,))
+    late = EvidenceRecord("update", asked.messages[0].id, b"", version=1, window="boot/1")
     store.commit([outcome(asked, late)], 202.0)
     (link,) = store.audit("a")
     assert [step.update.version for step in link.steps] == [1]
@@ -160,13 +167,16 @@ def test_what_belongs_to_no_window(store: Store) -> None:
     first, second = claim(store, servo="a")[0], claim(store, servo="b")[0]
     word, cut = first.messages[0].id, first.messages[1].id
     found = (
-        Evidence("hello", word, b"h", version=0, status="boot"),
-        Evidence("receipt", word, b"r", version=1, status="applied"),
-        Evidence("estimate", cut, b"e", status="ok"),
-        Evidence("fallback", word, b"f", version=1, status="limit cycle"),
-        Evidence("estimate", 0, b"s", status="failed: no state"),
+        EvidenceRecord("hello", word, b"h", version=0, status="boot"),
+        EvidenceRecord("receipt", word, b"r", version=1, status="applied"),
+        EvidenceRecord("estimate", cut, b"e", status="ok"),
+        EvidenceRecord("fallback", word, b"f", version=1, status="limit cycle"),
+        EvidenceRecord("estimate", 0, b"s", status="failed: no state"),
     )
-    assert store.commit([outcome(first, *found), outcome(second, Evidence("hello", 0, b"other"))], 201.0) == [True] * 2
+    assert (
+        store.commit([outcome(first, *found), outcome(second, EvidenceRecord("hello", 0, b"other"))], 201.0)
+        == [True] * 2
+    )
     assert [(one.kind, one.status, one.made) for one in store.events("a")] == [
         ("estimate", "failed: no state", 201.0), ("fallback", "limit cycle", 201.0), ("hello", "boot", 201.0)
     ]  # fmt: skip

@@ -12,8 +12,8 @@ from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
 from servotwin.link.transport import Parcel, Unreachable, squeezed
 from servotwin.messages import Window, checksum, encode, pack_channel
-from servotwin.store.groupcommit import GroupCommit
-from servotwin.store.rows import Outcome, Posted
+from servotwin.store.group_commit import GroupCommit
+from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import Authority
 from servotwin.twin_service.broker_desk import Desk, Parts
@@ -53,9 +53,11 @@ class Twin:
 
     def post(self, servo: str, body: bytes) -> None:
         """What a worker's outcome does."""
-        (claim,) = (each for each in self.store.claim("test", 10, 60.0, 0.0) if each.servo == servo)
+        (claim,) = (each for each in self.store.lease("test", 10, 60.0, 0.0) if each.servo == servo)
         done = tuple(message.id for message in claim.messages)
-        assert self.store.commit([Outcome(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [True]
+        assert self.store.commit([WorkResult(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [
+            True
+        ]
         self._loop.call_soon_threadsafe(self.outgoing.post, servo)
 
     def close(self) -> None:
@@ -84,7 +86,7 @@ class Twin:
         self.outgoing.close()
         await bridge.end()
 
-    async def _posted(self, servo: str, serial: int) -> list[Posted]:
+    async def _posted(self, servo: str, serial: int) -> list[OutgoingMessage]:
         return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
 
 

@@ -5,20 +5,20 @@ import sys
 import time
 
 from servotwin.messages import decode
-from servotwin.store.rows import Claim, Evidence, Outcome
+from servotwin.store.records import EvidenceRecord, Lease, WorkResult
 from servotwin.twin_service import worker
 
 GIVEN_UP = 3
 
 
-def work(claim: Claim, now: float) -> Outcome:
+def work(claim: Lease, now: float) -> WorkResult:
     """One piece of evidence for each message; a message that others died of is given up."""
     messages = claim.messages[:1] if claim.attempts > 1 else claim.messages
     evidence = []
     for message in messages:
         wanted = decode(message.body).reason
         if claim.attempts >= GIVEN_UP:
-            evidence.append(Evidence("estimate", message.id, b"\xc0", status="failed: given up"))
+            evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status="failed: given up"))
             continue
         if wanted == "die":
             os._exit(9)
@@ -26,10 +26,10 @@ def work(claim: Claim, now: float) -> Outcome:
             time.sleep(600.0)
         if wanted == "raise":
             raise ValueError("this one cannot be worked on")
-        evidence.append(Evidence("estimate", message.id, b"\xc0", status=f"at {now:.0f}"))
+        evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status=f"at {now:.0f}"))
     done = tuple(message.id for message in messages)
     sent = tuple(b"news" for _ in messages)
-    return Outcome(claim.servo, claim.serial, claim.state + b"x" * len(done), None, done, tuple(evidence), sent)
+    return WorkResult(claim.servo, claim.serial, claim.state + b"x" * len(done), None, done, tuple(evidence), sent)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import postgres
 
-from servotwin.store.rows import Claim, Evidence, Incoming, Kind, Outcome
+from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, WorkResult
 from servotwin.store.store import Store, open_store
 
 SYSTEMS = ("sqlite", "postgresql")
@@ -38,36 +38,38 @@ def addresses(system: str, folder: Path) -> Iterator[NewAddress]:
             yield lambda: server.database(f"store{next(_numbers)}")
 
 
-def incoming(servo: str, key: str, body: bytes, kind: Kind, received: float = 100.0, encoding: str = "") -> Incoming:
+def incoming(
+    servo: str, key: str, body: bytes, kind: MessageKind, received: float = 100.0, encoding: str = ""
+) -> Incoming:
     return Incoming(servo, kind, key, body, encoding, hashlib.sha256(body).digest(), received)
 
 
 def window(servo: str = "a", sequence: int = 1, body: bytes = b"samples", received: float = 100.0) -> Incoming:
-    plain = incoming(servo, f"boot/{sequence}", body, Kind.WINDOW, received)
+    plain = incoming(servo, f"boot/{sequence}", body, MessageKind.WINDOW, received)
     return plain._replace(boot="boot", sequence=sequence, start=2.0 * sequence)
 
 
 def letter(servo: str = "a", body: bytes = b"hello", received: float = 100.0) -> Incoming:
-    return incoming(servo, hashlib.sha256(body).hexdigest(), body, Kind.LETTER, received)
+    return incoming(servo, hashlib.sha256(body).hexdigest(), body, MessageKind.LETTER, received)
 
 
 def proof(servo: str = "a", body: bytes = b"prove it", received: float = 100.0) -> Incoming:
-    return incoming(servo, f"proof {body!r}", body, Kind.PROOF, received)
+    return incoming(servo, f"proof {body!r}", body, MessageKind.VERIFICATION, received)
 
 
-def outcome(claim: Claim, *evidence: Evidence, outgoing: tuple[bytes, ...] = (), **other: object) -> Outcome:
+def outcome(claim: Lease, *evidence: EvidenceRecord, outgoing: tuple[bytes, ...] = (), **other: object) -> WorkResult:
     """One that covers everything of a claim."""
     done = tuple(message.id for message in claim.messages)
     values = {"state": b"state", "wake": None} | other
-    return Outcome(claim.servo, claim.serial, done=done, evidence=evidence, outgoing=outgoing, **values)
+    return WorkResult(claim.servo, claim.serial, done=done, evidence=evidence, outgoing=outgoing, **values)
 
 
-def bodies_of(claim: Claim) -> list[bytes]:
+def bodies_of(claim: Lease) -> list[bytes]:
     return [message.body for message in claim.messages]
 
 
-def claim(store: Store, owner: str = "me", now: float = 200.0, **more: object) -> list[Claim]:
-    return store.claim(owner, more.pop("limit", 10), more.pop("lease_s", 30.0), now, **more)
+def claim(store: Store, owner: str = "me", now: float = 200.0, **more: object) -> list[Lease]:
+    return store.lease(owner, more.pop("limit", 10), more.pop("lease_s", 30.0), now, **more)
 
 
 def filled(url: str, windows: int = 5) -> Store:

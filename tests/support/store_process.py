@@ -13,8 +13,8 @@ import time
 
 from store_cases import outcome, window
 
-from servotwin.store.groupcommit import GroupCommit
-from servotwin.store.rows import Claim, Evidence, Outcome
+from servotwin.store.group_commit import GroupCommit
+from servotwin.store.records import EvidenceRecord, Lease, WorkResult
 from servotwin.store.store import Store, open_store
 
 LEASE_S = 2.0
@@ -34,15 +34,15 @@ def put_all(group: GroupCommit, servo: str) -> None:
         tell(group.put(window(servo, sequence, BODY)).result().name, servo, sequence)
 
 
-def worked(claim: Claim) -> Outcome:
-    evidence = [Evidence("estimate", message.id, b"seen") for message in claim.messages]
+def worked(claim: Lease) -> WorkResult:
+    evidence = [EvidenceRecord("estimate", message.id, b"seen") for message in claim.messages]
     letters = tuple(b"about %d" % message.id for message in claim.messages)
     return outcome(claim, *evidence, outgoing=letters)
 
 
 def work(store: Store, group: GroupCommit, owner: str) -> None:
     while True:
-        claims = store.claim(owner, 2, LEASE_S, time.time(), per_servo=5)
+        claims = store.lease(owner, 2, LEASE_S, time.time(), per_servo=5)
         futures = [group.commit(worked(claim)) for claim in claims]
         tell("DONE", sum(future.result() for future in futures))
         if not claims:
@@ -50,7 +50,7 @@ def work(store: Store, group: GroupCommit, owner: str) -> None:
 
 
 def hold(store: Store, owner: str) -> None:
-    for claim in store.claim(owner, 2, LEASE_S, time.time(), per_servo=5):
+    for claim in store.lease(owner, 2, LEASE_S, time.time(), per_servo=5):
         tell("HELD", claim.servo, len(claim.messages))
     threading.Event().wait()
 

@@ -13,19 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
-from servotwin.messages import Acknowledge, checksum, encode
+from servotwin.messages import Acknowledge, Setting, checksum, encode
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.store.rows import Claim, Kind, Stored
+from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.evidence import plain
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.replay import replay
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.work import work
@@ -37,11 +37,11 @@ NAMES = ("fig15", "fig16", "calm")
 def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], Model]:
     """(window, evidence, context) of each estimate that a scenario led to."""
     scenario = Scenario.preset(name).replace(duration=65.0)
-    model = Model("m", scenario.model, scenario.twin, InForce(scenario.start_law, scenario.start_tolerance))
+    model = Model("m", scenario.model, scenario.twin, Setting(scenario.start_tolerance, gains_of(scenario.start_law)))
     fleet, state, found = Fleet((model,), (("*", "m"),)), b"", []
     for each in (m for m in cosimulate(scenario).messages if m.direction == "up"):
-        stored = Stored(1, Kind.WINDOW, each.data, "", each.arrival)
-        outcome = work(fleet, Claim(scenario.name, state, 0, (stored,)), each.arrival)
+        stored = StoredMessage(1, MessageKind.WINDOW, each.data, "", each.arrival)
+        outcome = work(fleet, Lease(scenario.name, state, 0, (stored,)), each.arrival)
         rows = [row for row in outcome.evidence if row.kind == "estimate"]
         found += [(each.data, row.body, dict(outcome.contexts)[row.context]) for row in rows]
         state = outcome.state
@@ -131,7 +131,9 @@ def test_a_window_that_no_estimator_took_is_the_same_again():
     blind = msgspec.structs.replace(window, channels=channels, crc=checksum(channels))
     model = estimated("fig15")[1]
     fleet = Fleet((model,), (("*", "m"),))
-    outcome = work(fleet, Claim(window.servo, b"", 0, (Stored(1, Kind.WINDOW, encode(blind), "", 0.0),)), 0.0)
+    outcome = work(
+        fleet, Lease(window.servo, b"", 0, (StoredMessage(1, MessageKind.WINDOW, encode(blind), "", 0.0),)), 0.0
+    )
     row = next(row for row in outcome.evidence if row.kind == "estimate")
     again = replay(encode(blind), row.body, dict(outcome.contexts)[row.context])
     assert (again.same, again.differs) == (True, ())

@@ -13,14 +13,13 @@ import pytest
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Cause, Fallback, Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.store.rows import Claim, Incoming, Kind, Outcome, Stored
+from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.lookups import Question, decode_question
 from servotwin.twin.policies import certified
 from servotwin.twin.settings import TriageSettings, TwinSettings
@@ -48,7 +47,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(file: Path) -> Fleet:
-    start = InForce(SCENARIO.start_law, SCENARIO.start_tolerance)
+    start = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
     return Fleet((Model("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
 
 
@@ -58,33 +57,35 @@ class Queue:
     def __init__(self, fleet: Fleet) -> None:
         self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
 
-    def give(self, message: Window | Receipt | Fallback | Incoming) -> Outcome:
-        body, kind = (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), Kind.WINDOW)
+    def give(self, message: Window | Receipt | Fallback | Incoming) -> WorkResult:
+        body, kind = (
+            (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), MessageKind.WINDOW)
+        )
         self.serial += 1
-        stored = Stored(self.serial, kind, body, "", float(self.serial))
-        outcome = work(self.fleet, Claim("axis", self.state, self.serial - 1, (stored,)), float(self.serial))
+        stored = StoredMessage(self.serial, kind, body, "", float(self.serial))
+        outcome = work(self.fleet, Lease("axis", self.state, self.serial - 1, (stored,)), float(self.serial))
         self.state = outcome.state
         self.outcomes.append(outcome)
         return outcome
 
-    def window(self, number: int, version: int = 0, **changes) -> Outcome:
+    def window(self, number: int, version: int = 0, **changes) -> WorkResult:
         return self.give(msgspec.structs.replace(windows()[number], parameter_version=version, **changes))
 
-    def applied(self, update: Update) -> Outcome:
+    def applied(self, update: Update) -> WorkResult:
         sample = round(update.data_time * 5000.0) + 20000
         return self.give(
             Receipt("axis", update.version, True, sample, Reason.APPLIED, update.version, update.window[0])
         )
 
 
-def sent(outcome: Outcome) -> Update:
+def sent(outcome: WorkResult) -> Update:
     (body,) = outcome.outgoing
     update = decode(body)
     assert isinstance(update, Update)
     return update
 
 
-def kinds(outcome: Outcome) -> list[str]:
+def kinds(outcome: WorkResult) -> list[str]:
     return [row.kind for row in outcome.evidence]
 
 
@@ -108,9 +109,9 @@ def begun(fleet: Fleet) -> tuple[Queue, Update, Incoming]:
 def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: Fleet) -> None:
     _, update, asked = begun(fleet)
     question = decode_question(asked.body)
-    assert (asked.servo, asked.kind, asked.encoding) == ("axis", Kind.PROOF, "")
+    assert (asked.servo, asked.kind, asked.encoding) == ("axis", MessageKind.VERIFICATION, "")
     assert (question.version, question.window) == (update.version, update.window)
-    assert gains_of(question.setting.controller) == update.controller
+    assert gains_of(question.setting.controller) == update.setting.gains
     assert question.region.gap[0] < 12.0 * DEG < question.region.gap[1]
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
@@ -149,8 +150,8 @@ def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: F
     proved = certified(SERVO, fleet.models[0].settings).fallback()
     assert back.base_version == update.version
     assert back.data_time > update.data_time
-    law = proved.setting.controller.replace(feedforward=back.controller.feedforward)
-    assert back.controller == gains_of(law)
+    law = proved.setting.controller.replace(feedforward=back.setting.gains.feedforward)
+    assert back.setting.gains == gains_of(law)
     assert not following.enqueue
     said = {row.kind: row.status for row in following.evidence}
     assert "the proof of version" in said["glance"]
@@ -191,7 +192,9 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> N
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
     assert kinds(quiet) == ["glance"]
-    told = Fallback("axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, 0.0)
+    told = Fallback(
+        "axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, Setting(0.0)
+    )
     queue.give(told)
     outcome = queue.window(2, update.version + 1)
     assert "estimate" in kinds(outcome)

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Sequence
 
-from servotwin.store.rows import Claim, Kind, Outcome, Stored
+from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin_service.dispatcher import Dispatcher, Parts
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.job import Done
@@ -15,21 +15,21 @@ from servotwin.twin_service.shelf import Shelf
 DIES, FAILS = b"dies", b"fails"
 
 
-def claim(servo: str, body: bytes = b"", kind: Kind = Kind.WINDOW) -> Claim:
-    return Claim(servo, b"", 0, (Stored(1, kind, body, "", 0.0),))
+def claim(servo: str, body: bytes = b"", kind: MessageKind = MessageKind.WINDOW) -> Lease:
+    return Lease(servo, b"", 0, (StoredMessage(1, kind, body, "", 0.0),))
 
 
 class Lender:
     """A store that lends what it is told, one list after the other; and its workers."""
 
-    def __init__(self, turns: Sequence[Sequence[Claim]]) -> None:
+    def __init__(self, turns: Sequence[Sequence[Lease]]) -> None:
         self.turns = list(turns)
         self.seen: list[tuple[str, int]] = []
         self.released: list[frozenset[str]] = []
         self.through = asyncio.Event()
 
-    def claim(self, _owner, _limit, _lease, _now, kinds, **_more) -> list[Claim]:
-        if Kind.PROOF in kinds:
+    def lease(self, _owner, _limit, _lease, _now, kinds, **_more) -> list[Lease]:
+        if MessageKind.VERIFICATION in kinds:
             return []
         return list(self.turns.pop(0)) if self.turns else []
 
@@ -49,20 +49,20 @@ class Lender:
     async def replace(self, _worker, _why) -> None:
         pass
 
-    async def work(self, claims: Sequence[Claim], _now: float) -> AsyncIterator[Done]:
+    async def work(self, claims: Sequence[Lease], _now: float) -> AsyncIterator[Done]:
         for each in claims:
             self.seen.append((each.servo, each.attempts))
             body = each.messages[0].body
             if body == DIES:
                 raise WorkerLost("it died")
-            made = None if body == FAILS else Outcome(each.servo, each.serial, b"", None, (1,))
+            made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,))
             yield Done(made, "it failed", 0.0)
 
 
-def through(turns: Sequence[Sequence[Claim]], valid: bool = True) -> Lender:
+def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
     """All turns, one after the other."""
 
-    async def commit(_outcome: Outcome) -> bool:
+    async def commit(_outcome: WorkResult) -> bool:
         return valid
 
     async def body() -> Lender:
@@ -94,7 +94,7 @@ def test_blamed_is_whom_the_worker_was_at_though_others_failed_before():
 
 
 def test_a_proof_that_kills_its_workers_is_counted_though_windows_succeed():
-    proof, window = claim("a", DIES, Kind.PROOF), claim("a")
+    proof, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
     lender = through([[proof], [window], [proof], [window], [proof]])
     assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
 

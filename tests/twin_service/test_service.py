@@ -24,10 +24,10 @@ from service_system import (
 )
 
 from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
-from servotwin.messages import Acknowledge, Update, decode, encode
+from servotwin.messages import Acknowledge, Setting, Update, decode, encode
 from servotwin.messages.compression import compress
-from servotwin.store.errors import StoreUnavailable
-from servotwin.store.rows import Outcome
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import WorkResult
 from servotwin.twin_service.system import System
 from servotwin.twin_service.tokens import read_tokens, write_tokens
 
@@ -260,7 +260,7 @@ def test_a_full_queue_and_a_store_that_cannot_write_are_for_later(serving):
 
 
 def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
-    update = Update("ax-1", 1, 0, ("b", 0), 0.0, 0.1, 0.01, (0.0, None), "ok", 1e-4, 100.0)
+    update = Update("ax-1", 1, 0, ("b", 0), 0.0, 0.1, 0.01, (0.0, None), "ok", Setting(1e-4), 100.0)
 
     async def body(system, client):
         await client.post("/v1/servos/ax-1/letters", content=hello(), headers=bearer())
@@ -268,9 +268,9 @@ def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
         waiting = asyncio.create_task(asked)
         await asyncio.sleep(0.1)
         assert not waiting.done()
-        [claim] = system.store.claim("me", 1, 10.0, system.clocks.wall())
+        [claim] = system.store.lease("me", 1, 10.0, system.clocks.wall())
         done = tuple(message.id for message in claim.messages)
-        made = Outcome("ax-1", claim.serial, b"state", None, done, outgoing=(encode(update),))
+        made = WorkResult("ax-1", claim.serial, b"state", None, done, outgoing=(encode(update),))
         assert await system.dispatcher._committed(made)
         again = await client.get("/v1/servos/ax-1/outgoing", headers=bearer())
         for answer in (await waiting, again):

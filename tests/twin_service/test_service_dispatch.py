@@ -12,7 +12,7 @@ from service_system import bearer, place, twin_file, unpacked, window
 from store_cases import SYSTEMS, addresses
 
 from servotwin.messages import encode
-from servotwin.store.errors import StoreUnavailable
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
 from servotwin.twin_service.pool import Pool
 from servotwin.twin_service.proofs import Allowance

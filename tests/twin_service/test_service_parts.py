@@ -16,7 +16,7 @@ from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import Refusal
-from servotwin.store.rows import Posted
+from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service import logs
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, service
 from servotwin.twin_service.future import Boots
@@ -207,7 +207,7 @@ def test_polls_ask_the_store_only_when_something_may_be_there():
         assert len(asked) == 1
         waiting = [asyncio.create_task(outgoing.after("a", 0, 60.0)) for _ in range(3)]
         await asyncio.sleep(0.01)
-        posted.append(Posted(1, b"x"))
+        posted.append(OutgoingMessage(1, b"x"))
         outgoing.post("b")
         await asyncio.sleep(0.01)
         assert not any(task.done() for task in waiting)
@@ -235,7 +235,7 @@ def test_a_message_posted_while_the_store_is_asked_is_not_missed():
         outgoing = Outgoing(read, 10)
         poll = asyncio.create_task(outgoing.after("a", 0, 60.0))
         await begun.wait()
-        posted.append(Posted(1, b"x"))
+        posted.append(OutgoingMessage(1, b"x"))
         outgoing.post("a")
         go_on.set()
         assert await asyncio.wait_for(poll, 10.0) == posted
@@ -339,11 +339,11 @@ def test_what_others_posted_ends_the_polls_that_it_is_for():
         outgoing.posted({"a": 0, "b": 7})
         await asyncio.sleep(0.01)
         assert not early.done()
-        posted.append(Posted(1, b"x"))
+        posted.append(OutgoingMessage(1, b"x"))
         outgoing.posted({"a": 1})
         assert await early == posted
         assert not late.done()
-        posted.append(Posted(2, b"y"))
+        posted.append(OutgoingMessage(2, b"y"))
         outgoing.posted({"a": 2})
         assert await late == posted[1:]
 

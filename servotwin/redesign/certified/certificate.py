@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
-from servotwin.redesign.setting import Setting
+from servotwin.redesign.design import Design
 
 
 @settings("demands")
@@ -67,7 +67,7 @@ class Certificate:
 
     Attributes
     ----------
-    setting : Setting
+    setting : Design
     gap, input_bias, step, friction : (float, float)
         rad, V, m, N m: ranges of the members.
     members : int
@@ -94,7 +94,7 @@ class Certificate:
         What it took.
     """
 
-    setting: Setting
+    setting: Design
     gap: tuple[float, float]
     input_bias: tuple[float, float]
     step: tuple[float, float]

@@ -1,4 +1,4 @@
-"""Servos with work to do, lent to one worker at a time."""
+"""Leases: servos with work to do, each held by one worker at a time."""
 
 from __future__ import annotations
 
@@ -9,33 +9,36 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from servotwin.store.rows import Claim, Kind, Stored
-from servotwin.store.schema import PROOFS, WORK, bodies, messages, states, twins
+from servotwin.store.records import Lease, MessageKind, StoredMessage
+from servotwin.store.schema import VERIFICATIONS, WORK, bodies, messages, states, twins
 
-MOST_BYTES = 4 * 1024 * 1024
-"""Of the bodies that are lent of one servo at once, but for the first, which may be as large as any."""
+MAX_LEASE_BYTES = 4 * 1024 * 1024
+"""Bytes of the bodies in one lease; its first body may be larger."""
 
 
-def lend(
+def acquire(
     connection: sa.Connection,
     owner: str,
     limit: int,
     until: float,
     now: float,
-    kinds: Collection[Kind],
+    kinds: Collection[MessageKind],
     only: str | None,
 ) -> list[str]:
-    """Lease the servos that have waited longest; those due to be woken get half of the places at least."""
-    lent: list[str] = []
-    # A lease that ends later than any made by now comes from before a clock was set back.
+    """Lease the servos that have waited longest; servos due to be woken get at least half of the places.
+
+    Returns their names.
+    """
+    leased: list[str] = []
+    # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
     for query, share in _queues(frozenset(kinds), only is not None):
-        wanted = min(math.ceil(share * limit), limit - len(lent))
+        wanted = min(math.ceil(share * limit), limit - len(leased))
         found = connection.scalars(query, bound | {"_wanted": wanted}).all()
         if found:
             connection.execute(_LEASE, {"_servos": found, "_owner": owner, "_until": until})
-            lent += found
-    return lent
+            leased += found
+    return leased
 
 
 def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
@@ -44,67 +47,71 @@ def release(connection: sa.Connection, owner: str, servos: Collection[str] | Non
     connection.execute(ending if servos is None else ending.where(twins.c.servo.in_(servos)))
 
 
-def claims(connection: sa.Connection, servos: Sequence[str], kinds: Collection[Kind], per_servo: int) -> list[Claim]:
-    """What there is to do for servos that are lent, in their order."""
+def load(
+    connection: sa.Connection, servos: Sequence[str], kinds: Collection[MessageKind], per_servo: int
+) -> list[Lease]:
+    """State and pending messages of leased servos, in their order."""
     rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
-    undone = _undone(connection, servos, kinds, per_servo)
+    pending = _pending(connection, servos, kinds, per_servo)
     return [
-        Claim(servo, rows[servo].state or b"", rows[servo].serial, tuple(undone[servo]), rows[servo].attempts)
+        Lease(servo, rows[servo].state or b"", rows[servo].serial, tuple(pending[servo]), rows[servo].attempts)
         for servo in servos
     ]
 
 
-def woken(connection: sa.Connection, servos: Collection[str], now: float) -> set[str]:
-    """Which of them are due to be woken."""
-    return set(connection.scalars(_WOKEN, {"_servos": list(servos), "_now": now}))
+def due(connection: sa.Connection, servos: Collection[str], now: float) -> set[str]:
+    """Servos among these that are due to be woken."""
+    return set(connection.scalars(_DUE, {"_servos": list(servos), "_now": now}))
 
 
 @lru_cache(maxsize=32)
-def _queues(kinds: frozenset[Kind], one: bool) -> list[tuple[sa.Select[Any], float]]:
-    """(who is next in a queue, how much of all it may take at most); of `one` servo alone."""
+def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[Any], float]]:
+    """(query of the next servos in a queue, largest share of the limit that it may take); of `one` servo only."""
     found: list[tuple[sa.Select[Any], float]] = []
-    if Kind.WINDOW in kinds or Kind.LETTER in kinds:
+    if MessageKind.WINDOW in kinds or MessageKind.LETTER in kinds:
         due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
         found.append((_next(due, twins.c.wake, one), 0.5))
         found.append((_next(ready, twins.c.ready, one), 1.0))
         found.append((_next(due, twins.c.wake, one), 1.0))
-    if Kind.PROOF in kinds:
+    if MessageKind.VERIFICATION in kinds:
         found.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
     return found
 
 
 def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: bool) -> sa.Select[Any]:
-    """Those whose turn it is and that nobody has."""
+    """Query of servos whose turn it is and that are not leased."""
     until = twins.c.lease_until
     late = sa.bindparam("_late", type_=sa.Double)
     free = sa.or_(until.is_(None), until <= _NOW, until > late)
     wanted = sa.bindparam("_wanted", type_=sa.Integer)
     query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(wanted)
     query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
-    # SQLite has one writer at a time, and leaves this out.
+    # SQLite has one writer at a time and ignores this.
     return query.with_for_update(skip_locked=True)
 
 
-def _undone(
-    connection: sa.Connection, servos: Sequence[str], kinds: Collection[Kind], per_servo: int
-) -> dict[str, list[Stored]]:
-    found: dict[str, list[Stored]] = {servo: [] for servo in servos}
-    for of in ({Kind.WINDOW, Kind.LETTER}, {Kind.PROOF}):
+def _pending(
+    connection: sa.Connection, servos: Sequence[str], kinds: Collection[MessageKind], per_servo: int
+) -> dict[str, list[StoredMessage]]:
+    found: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
+    for of in ({MessageKind.WINDOW, MessageKind.LETTER}, {MessageKind.VERIFICATION}):
         wanted = frozenset(of & set(kinds))
         if wanted:
             for row in connection.execute(_oldest(wanted), {"_servos": servos, "_per_servo": per_servo}):
-                found[row.servo].append(Stored(row.id, Kind(row.kind), row.body, row.encoding, row.received, row.key))
+                found[row.servo].append(
+                    StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
+                )
     return found
 
 
 @lru_cache(maxsize=8)
-def _oldest(kinds: frozenset[Kind]) -> sa.Select[Any]:
-    """The first messages of these kinds of each servo, proofs alone or the others."""
-    proofs = Kind.PROOF in kinds
+def _oldest(kinds: frozenset[MessageKind]) -> sa.Select[Any]:
+    """Query of the first pending messages of each servo, of these kinds: verifications only, or all others."""
+    verifications = MessageKind.VERIFICATION in kinds
     place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=messages.c.id).label("place")
     waiting = sa.select(messages.c.id, messages.c.servo, place)
-    waiting = waiting.where(PROOFS if proofs else WORK, messages.c.servo.in_(_SERVOS))
-    if len(kinds) == 1 and not proofs:
+    waiting = waiting.where(VERIFICATIONS if verifications else WORK, messages.c.servo.in_(_SERVOS))
+    if len(kinds) == 1 and not verifications:
         waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
     first = waiting.subquery()
     few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
@@ -113,7 +120,7 @@ def _oldest(kinds: frozenset[Kind]) -> sa.Select[Any]:
     some = sized.where(few).subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
     joined = some.join(messages, messages.c.id == some.c.id).join(bodies, bodies.c.message == messages.c.id)
-    small = sa.or_(some.c.place == 1, some.c.so_far <= MOST_BYTES)
+    small = sa.or_(some.c.place == 1, some.c.so_far <= MAX_LEASE_BYTES)
     return sa.select(*known, bodies.c.body).select_from(joined).where(small).order_by(messages.c.id)
 
 
@@ -134,4 +141,4 @@ _STATES = (
     .outerjoin(states, states.c.servo == twins.c.servo)
     .where(twins.c.servo.in_(_SERVOS))
 )
-_WOKEN = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), twins.c.wake <= _NOW)
+_DUE = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), twins.c.wake <= _NOW)

@@ -1,4 +1,4 @@
-"""Many small writes in few transactions: one thread takes whatever waits, commits it together, then answers."""
+"""Group commit: one thread commits all waiting writes in one transaction, then resolves their futures."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple
 
-from servotwin.store.errors import StoreBusy, StoreUnavailable
-from servotwin.store.rows import Incoming, Outcome, Put
+from servotwin.store.engine import StoreBusy, StoreUnavailable
+from servotwin.store.records import Incoming, PutResult, WorkResult
 from servotwin.store.store import Store
 
 
-class Bounds(NamedTuple):
-    """How much may wait, and how much one transaction takes.
+class CommitLimits(NamedTuple):
+    """Limits of the queue and of one transaction.
 
     Attributes
     ----------
     waiting, waiting_bytes : int
-        Messages, and bytes of their bodies, that may wait; beyond it more are refused. Outcomes are not: there are no
-        more of them than servos lent.
+        Messages, and bytes of their bodies, that may wait; more are rejected. Work results are always accepted: there
+        is at most one per lease.
     together, together_bytes : int
-        Messages and outcomes in one transaction, and bytes of bodies.
+        Messages and results in one transaction, and bytes of bodies.
     """
 
     waiting: int = 4096
@@ -32,30 +32,32 @@ class Bounds(NamedTuple):
     together_bytes: int = 8 * 1024 * 1024
 
 
-class _Job(NamedTuple):
-    what: Incoming | Outcome
+class _Write(NamedTuple):
+    what: Incoming | WorkResult
     size: int
     future: Future[Any]
 
 
 class GroupCommit:
-    """Writes for many threads.
+    """Writer for many threads.
 
-    A future is resolved when its transaction is on the disk. If that fails, the futures of everything in it get
-    StoreUnavailable, and the thread goes on with what came meanwhile. What is wrong in itself (an outcome for a message
-    that it was not lent) fails alone: the others are committed without it.
+    A future is resolved when its transaction is on the disk. If the transaction fails, all its futures get
+    StoreUnavailable, and the thread continues with the next writes. A write that is invalid by itself (a result that
+    covers a message of another lease) fails alone: the others are committed without it.
 
     Parameters
     ----------
     store : Store
-    bounds : Bounds
+    limits : CommitLimits
     clock : callable
         s since the epoch.
     """
 
-    def __init__(self, store: Store, bounds: Bounds | None = None, clock: Callable[[], float] = time.time) -> None:
-        self._store, self._bounds, self._clock = store, bounds or Bounds(), clock
-        self._jobs: deque[_Job] = deque()
+    def __init__(
+        self, store: Store, limits: CommitLimits | None = None, clock: Callable[[], float] = time.time
+    ) -> None:
+        self._store, self._limits, self._clock = store, limits or CommitLimits(), clock
+        self._jobs: deque[_Write] = deque()
         self._messages = self._bytes = 0
         self._closing = False
         self._changed = threading.Condition()
@@ -64,29 +66,29 @@ class GroupCommit:
 
     @property
     def waiting(self) -> int:
-        """Messages and outcomes that wait for a transaction."""
+        """Number of messages and results that wait for a transaction."""
         return len(self._jobs)
 
-    def put(self, item: Incoming) -> Future[Put]:
-        """Keep a message.
+    def put(self, item: Incoming) -> Future[PutResult]:
+        """Store a message.
 
         Raises
         ------
         StoreBusy
-            Too much waits already: try again later.
+            The queue is full: try again later.
         StoreUnavailable
             It is closed.
         """
         size = len(item.body)
         with self._changed:
-            if self._messages >= self._bounds.waiting or self._bytes + size > self._bounds.waiting_bytes:
+            if self._messages >= self._limits.waiting or self._bytes + size > self._limits.waiting_bytes:
                 raise StoreBusy(f"store {self._store.name}: {self._messages} messages wait to be committed; try later")
-            future: Future[Put] = self._queued(item, size)
+            future: Future[PutResult] = self._queued(item, size)
             self._messages, self._bytes = self._messages + 1, self._bytes + size
         return future
 
-    def commit(self, outcome: Outcome) -> Future[bool]:
-        """Commit an outcome; whether it was valid, or void for another one before it.
+    def commit(self, result: WorkResult) -> Future[bool]:
+        """Commit a work result; False: it is void, as another result of the servo was committed before it.
 
         Raises
         ------
@@ -94,22 +96,22 @@ class GroupCommit:
             It is closed.
         """
         with self._changed:
-            return self._queued(outcome, sum(map(len, outcome.outgoing)))
+            return self._queued(result, sum(map(len, result.outgoing)))
 
     def close(self) -> None:
-        """Take nothing more, commit what waits, end the thread; the store stays open."""
+        """Accept nothing more, commit the waiting writes, end the thread; the store stays open."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._thread.join()
 
-    def _queued(self, what: Incoming | Outcome, size: int) -> Future[Any]:
+    def _queued(self, what: Incoming | WorkResult, size: int) -> Future[Any]:
         if self._closing:
             raise StoreUnavailable(f"store {self._store.name}: is being closed")
         future: Future[Any] = Future()
-        # From here on nobody can cancel it: what was handed over will be written.
+        # From here on the future cannot be cancelled: the write will be done.
         future.set_running_or_notify_cancel()
-        self._jobs.append(_Job(what, size, future))
+        self._jobs.append(_Write(what, size, future))
         self._changed.notify()
         return future
 
@@ -117,13 +119,13 @@ class GroupCommit:
         while jobs := self._take():
             self._write(jobs)
 
-    def _take(self) -> list[_Job]:
-        """What goes into the next transaction; nothing: it is closed and all is written."""
-        taken: list[_Job] = []
+    def _take(self) -> list[_Write]:
+        """Wait for the writes of the next transaction; none: closed, and all is written."""
+        taken: list[_Write] = []
         size = 0
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closing)
-            while self._jobs and len(taken) < self._bounds.together and size < self._bounds.together_bytes:
+            while self._jobs and len(taken) < self._limits.together and size < self._limits.together_bytes:
                 job = self._jobs.popleft()
                 taken.append(job)
                 size += job.size
@@ -131,7 +133,7 @@ class GroupCommit:
                     self._messages, self._bytes = self._messages - 1, self._bytes - job.size
         return taken
 
-    def _write(self, jobs: Sequence[_Job]) -> None:
+    def _write(self, jobs: Sequence[_Write]) -> None:
         try:
             self._commit(jobs)
         except StoreUnavailable as error:
@@ -143,12 +145,12 @@ class GroupCommit:
             for job in jobs:
                 self._write([job])
 
-    def _commit(self, jobs: Sequence[_Job]) -> None:
+    def _commit(self, jobs: Sequence[_Write]) -> None:
         puts = [(job.what, job.future) for job in jobs if isinstance(job.what, Incoming)]
-        commits = [(job.what, job.future) for job in jobs if isinstance(job.what, Outcome)]
-        items, outcomes = [item for item, _ in puts], [outcome for outcome, _ in commits]
-        became, valid = self._store.write(items, outcomes, self._clock())
-        _resolve([future for _, future in puts], became)
+        commits = [(job.what, job.future) for job in jobs if isinstance(job.what, WorkResult)]
+        items, results = [item for item, _ in puts], [result for result, _ in commits]
+        stored, valid = self._store.write(items, results, self._clock())
+        _resolve([future for _, future in puts], stored)
         _resolve([future for _, future in commits], valid)
 
 
@@ -157,6 +159,6 @@ def _resolve(futures: Sequence[Future[Any]], answers: Sequence[object]) -> None:
         future.set_result(answer)
 
 
-def _fail(jobs: Sequence[_Job], error: Exception) -> None:
+def _fail(jobs: Sequence[_Write], error: Exception) -> None:
     for job in jobs:
         job.future.set_exception(error)

@@ -1,0 +1,149 @@
+"""Storage of incoming messages, each exactly once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from servotwin.store.engine import SQLITE
+from servotwin.store.records import Incoming, MessageKind, PutResult
+from servotwin.store.schema import bodies, messages, twins
+
+Name = tuple[str, str]
+"""(servo, key)."""
+
+
+def put(connection: sa.Connection, items: Sequence[Incoming]) -> list[PutResult]:
+    """Store the new ones; returns the result of each."""
+    if not items:
+        return []
+    firsts: dict[Name, Incoming] = {}
+    for item in items:
+        firsts.setdefault((item.servo, item.key), item)
+    _insert_servos(connection, {item.servo for item in items})
+    ids = _insert(connection, _by_lock_order(firsts.values()))
+    _mark_ready(connection, [firsts[name] for name in ids])
+    digests = {name: firsts[name].digest for name in ids} | _digests(connection, firsts.keys() - ids.keys())
+    return [_result_of(item, item is firsts[item.servo, item.key], ids, digests) for item in items]
+
+
+@lru_cache(maxsize=8)
+def insert_once(dialect: str, table: sa.Table) -> Any:
+    """Insert statement that skips existing rows."""
+    chosen = sqlite.insert if dialect == SQLITE else postgresql.insert
+    return chosen(table).on_conflict_do_nothing()
+
+
+def _result_of(item: Incoming, first: bool, ids: Mapping[Name, int], digests: Mapping[Name, bytes]) -> PutResult:
+    name = item.servo, item.key
+    if first and name in ids:
+        return PutResult.NEW
+    return PutResult.KNOWN if digests[name] == item.digest else PutResult.CONFLICT
+
+
+def _by_lock_order(items: Iterable[Incoming]) -> list[Incoming]:
+    """Sort by servo, the order in which every transaction takes its locks; the order within a servo stays."""
+    return sorted(items, key=lambda item: item.servo)
+
+
+def _insert_servos(connection: sa.Connection, servos: Iterable[str]) -> None:
+    connection.execute(insert_once(connection.dialect.name, twins), [{"servo": servo} for servo in sorted(servos)])
+
+
+def _insert(connection: sa.Connection, items: Sequence[Incoming]) -> dict[Name, int]:
+    """Insert messages; returns the ids of those that were new."""
+    rows = connection.execute(_inserting(connection.dialect.name), [_row(item) for item in items])
+    ids = {(servo, key): id_ for id_, servo, key in rows}
+    filled = [{"message": ids[i.servo, i.key], "body": i.body} for i in items if (i.servo, i.key) in ids]
+    if filled:
+        connection.execute(sa.insert(bodies), filled)
+    return ids
+
+
+@lru_cache(maxsize=2)
+def _inserting(dialect: str) -> Any:
+    return insert_once(dialect, messages).returning(messages.c.id, messages.c.servo, messages.c.key)
+
+
+def _row(item: Incoming) -> dict[str, Any]:
+    row = item._asdict()
+    del row["body"]
+    return row | {"kind": item.kind.value}
+
+
+def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
+    """Mark the servos as having work to do.
+
+    The row is always written, changed or not: on PostgreSQL that waits for a result of the same servo that is being
+    committed and has not seen these messages.
+    """
+    if not new:
+        return
+    windows = Counter(item.servo for item in new if item.kind is MessageKind.WINDOW)
+    rows = [
+        {
+            "_servo": servo,
+            "_windows": windows[servo],
+            "_heard": max((i.received for i in of if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_ready": min((i.received for i in of if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_asked": min((i.received for i in of if i.kind is MessageKind.VERIFICATION), default=None),
+        }
+        for servo, of in _by_servo(new)
+    ]
+    connection.execute(_MARK_READY, rows)
+
+
+def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:
+    found: dict[str, list[Incoming]] = {}
+    for item in items:
+        found.setdefault(item.servo, []).append(item)
+    return sorted(found.items())
+
+
+def _digests(connection: sa.Connection, names: Iterable[Name]) -> dict[Name, bytes]:
+    return {(row.servo, row.key): row.digest for row in rows_by_name(connection, _DIGESTS, names)}
+
+
+def rows_by_name(connection: sa.Connection, query: sa.Select[Any], names: Iterable[Name]) -> Iterator[sa.Row[Any]]:
+    """Rows of a query made by `select_by_name` for these (servo, key) pairs.
+
+    One query per servo: for a list of pairs SQLite would scan the whole table.
+    """
+    keys: dict[str, list[str]] = {}
+    for servo, key in sorted(names):
+        keys.setdefault(servo, []).append(key)
+    for servo, of in keys.items():
+        yield from connection.execute(query, {"_servo": servo, "_keys": of})
+
+
+def select_by_name(*columns: sa.ColumnElement[Any]) -> sa.Select[Any]:
+    """Query of messages by `_servo` and `_keys`, for `rows_by_name`."""
+    keys: sa.BindParameter[Any] = sa.bindparam("_keys", expanding=True)
+    query = sa.select(messages.c.servo, messages.c.key, *columns)
+    return query.where(messages.c.servo == sa.bindparam("_servo"), messages.c.key.in_(keys))
+
+
+def _min_or_max(column: sa.Column[Any], name: str, *, least: bool) -> sa.ColumnElement[Any]:
+    """Minimum or maximum of a column and a value, either of which may be null."""
+    value = sa.bindparam(name, type_=sa.Double)
+    taken = column > value if least else column < value
+    return sa.case((column.is_(None), value), (taken, value), else_=column)
+
+
+_MARK_READY = (
+    sa.update(twins)
+    .where(twins.c.servo == sa.bindparam("_servo"))
+    .values(
+        windows=twins.c.windows + sa.bindparam("_windows", type_=sa.BigInteger),
+        heard=_min_or_max(twins.c.heard, "_heard", least=False),
+        ready=_min_or_max(twins.c.ready, "_ready", least=True),
+        asked=_min_or_max(twins.c.asked, "_asked", least=True),
+    )
+)
+
+_DIGESTS = select_by_name(messages.c.digest)

@@ -1,0 +1,202 @@
+"""Queries: messages to the edges, summaries, windows, and the evidence chain of a window in one statement."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import sqlalchemy as sa
+
+from servotwin.store.records import (
+    Backlog,
+    MessageKind,
+    OutgoingMessage,
+    ServoSummary,
+    StoredEvidence,
+    StoredMessage,
+    StoredWindow,
+    UpdateEffect,
+    UpdateTrace,
+    WindowTrace,
+)
+from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, evidence, messages, twins
+from servotwin.store.schema import contexts as context_table
+from servotwin.store.schema import outgoing as outgoing_table
+
+_NAMES_PER_QUERY = 5000
+_ESTIMATES = ("glance", "estimate")
+_ANSWERS = ("receipt", "fallback")
+_EVENTS = ("hello", "fallback", "answer")
+"""Kinds of evidence that an edge reports by itself, not about a window."""
+_WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
+
+
+def outgoing(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
+    """Messages to the edge with serials above `after`."""
+    table = outgoing_table
+    query = sa.select(table.c.serial, table.c.body).where(table.c.servo == servo, table.c.serial > after)
+    rows = connection.execute(query.order_by(table.c.serial).limit(limit))
+    return [OutgoingMessage(row.serial, row.body) for row in rows]
+
+
+def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
+    """Serials of the newest messages to the edges of these servos."""
+    names, found = list(servos), dict[str, int]()
+    for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
+        part = names[begin : begin + _NAMES_PER_QUERY]
+        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
+        found.update((servo, serial) for servo, serial in connection.execute(query))
+    return found
+
+
+def backlog(connection: sa.Connection, now: float) -> Backlog:
+    """Number and age of the unprocessed messages."""
+    counts = [sa.select(sa.func.count()).select_from(messages).where(queue) for queue in (WORK, VERIFICATIONS)]
+    first = sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None))
+    query = sa.select(*(count.scalar_subquery() for count in counts), first.scalar_subquery())
+    row: Any = connection.execute(query).one()
+    work, verifications, oldest = row
+    return Backlog(work, verifications, 0.0 if oldest is None else max(0.0, now - oldest))
+
+
+def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSummary]:
+    """Summaries by name."""
+    query = _SUMMARY.where(twins.c.servo > after).order_by(twins.c.servo).limit(limit)
+    return [ServoSummary(*row) for row in connection.execute(query)]
+
+
+def servo(connection: sa.Connection, name: str) -> ServoSummary | None:
+    """Summary of one servo."""
+    row = connection.execute(_SUMMARY.where(twins.c.servo == name)).one_or_none()
+    return None if row is None else ServoSummary(*row)
+
+
+def window(connection: sa.Connection, servo: str, boot: str, sequence: int) -> StoredMessage | None:
+    """A window with its body."""
+    columns = messages.c.id, messages.c.kind, bodies.c.body, messages.c.encoding, messages.c.received
+    joined = messages.outerjoin(bodies, bodies.c.message == messages.c.id)
+    query = sa.select(*columns).select_from(joined).where(_is_window(servo, boot, sequence))
+    row = connection.execute(query).one_or_none()
+    if row is None:
+        return None
+    return StoredMessage(row.id, MessageKind(row.kind), row.body or b"", row.encoding, row.received)
+
+
+def windows(connection: sa.Connection, servo: str, limit: int, before: int | None) -> list[StoredWindow]:
+    """Windows without bodies, newest first."""
+    query = sa.select(*_WINDOW_COLUMNS).where(WINDOWS, messages.c.servo == servo)
+    if before is not None:
+        query = query.where(messages.c.id < before)
+    return [StoredWindow(*row) for row in connection.execute(query.order_by(messages.c.id.desc()).limit(limit))]
+
+
+def contexts(connection: sa.Connection, keys: Collection[str]) -> dict[str, str]:
+    """Texts of contexts by key."""
+    table = context_table
+    rows = connection.execute(sa.select(table.c.key, table.c.text).where(table.c.key.in_(keys)))
+    return {row.key: row.text for row in rows}
+
+
+def events(connection: sa.Connection, servo: str, since: float, limit: int) -> list[StoredEvidence]:
+    """Evidence that belongs to no window, newest first."""
+    columns = [evidence.c[name] for name in StoredEvidence._fields]
+    apart = sa.or_(evidence.c.kind.in_(_EVENTS), evidence.c.message.is_(None))
+    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.made >= since)
+    rows = connection.execute(query.order_by(evidence.c.id.desc()).limit(limit)).all()
+    return [record for row in rows if (record := _evidence(row, 0)) is not None]
+
+
+def audit(
+    connection: sa.Connection,
+    servo: str,
+    since: float | None,
+    limit: int,
+    window: tuple[str, int] | None,
+    before: int | None,
+) -> list[WindowTrace]:
+    """Traces of a servo's newest windows, newest first."""
+    query = sa.select(*_WINDOW_COLUMNS).where(WINDOWS, messages.c.servo == servo)
+    if window is not None:
+        query = query.where(_is_window(servo, *window))
+    if since is not None:
+        query = query.where(messages.c.received >= since)
+    if before is not None:
+        query = query.where(messages.c.id < before)
+    selected = query.order_by(messages.c.id.desc()).limit(limit).cte("chosen")
+    rows_of: dict[int, list[Any]] = {}
+    for row in connection.execute(_chain(servo, selected)).all():
+        rows_of.setdefault(row[0], []).append(row)
+    return [_window_trace(rows) for rows in rows_of.values()]
+
+
+def _chain(servo: str, selected: sa.CTE) -> sa.Select[Any]:
+    """One row per window, evidence of it, answer to it and first sign of its effect."""
+    found, answer, after = (evidence.alias(name) for name in ("found", "answer", "after"))
+    later = messages.alias("later")
+    is_update = found.c.kind == "update"
+    joined = selected.outerjoin(found, found.c.message == selected.c.id)
+    answers = sa.and_(is_update, _same_version(answer, servo, found), answer.c.kind.in_(_ANSWERS))
+    joined = joined.outerjoin(answer, answers)
+    joined = joined.outerjoin(after, sa.and_(is_update, after.c.id == _first_estimate_under(servo, found)))
+    joined = joined.outerjoin(later, later.c.id == after.c.message)
+    columns = [
+        *selected.c,
+        *(alias.c[name] for alias in (found, answer, after) for name in StoredEvidence._fields),
+        *(later.c[name] for name in StoredWindow._fields),
+    ]
+    labelled = [column.label(f"c{i}") for i, column in enumerate(columns)]
+    return sa.select(*labelled).select_from(joined).order_by(selected.c.id.desc(), found.c.id, answer.c.id)
+
+
+def _same_version(alias: sa.FromClause, servo: str, found: sa.FromClause) -> sa.ColumnElement[bool]:
+    return sa.and_(alias.c.servo == servo, alias.c.version == found.c.version)
+
+
+def _first_estimate_under(servo: str, found: sa.FromClause) -> sa.ScalarSelect[Any]:
+    """Id of the first glance or estimate of a window that was cut under an update's version."""
+    first = evidence.alias("first")
+    query = sa.select(sa.func.min(first.c.id)).where(_same_version(first, servo, found), first.c.kind.in_(_ESTIMATES))
+    return query.correlate(found).scalar_subquery()
+
+
+_WIDTH, _EVIDENCE_WIDTH = len(StoredWindow._fields), len(StoredEvidence._fields)
+
+
+def _window_trace(rows: list[Any]) -> WindowTrace:
+    """The trace of one window from its rows."""
+    records = {record.id: record for row in rows if (record := _evidence(row, _WIDTH)) is not None}
+    estimate = next((record for record in reversed(records.values()) if record.kind in _ESTIMATES), None)
+    updates = tuple(_update_trace(record, rows, estimate) for record in records.values() if record.kind == "update")
+    rest = tuple(record for record in records.values() if record.kind != "update")
+    return WindowTrace(StoredWindow(*rows[0][:_WIDTH]), rest, updates)
+
+
+def _update_trace(update: StoredEvidence, rows: list[Any], before: StoredEvidence | None) -> UpdateTrace:
+    mine = [row for row in rows if row[_WIDTH] == update.id]
+    answers = {each.id: each for row in mine if (each := _evidence(row, _WIDTH + _EVIDENCE_WIDTH)) is not None}
+    after = _evidence(mine[0], _WIDTH + 2 * _EVIDENCE_WIDTH)
+    if after is None:
+        return UpdateTrace(update, tuple(answers.values()), None)
+    window = StoredWindow(*mine[0][_WIDTH + 3 * _EVIDENCE_WIDTH :])
+    return UpdateTrace(update, tuple(answers.values()), UpdateEffect(window, before, after))
+
+
+def _evidence(row: Any, offset: int) -> StoredEvidence | None:
+    """The evidence in a row's columns from `offset` on; None: the outer join found none."""
+    values = row[offset : offset + _EVIDENCE_WIDTH]
+    if values[0] is None:
+        return None
+    record = StoredEvidence(*values)
+    return record._replace(message=record.message or 0, context=record.context or "")
+
+
+def _is_window(servo: str, boot: str, sequence: int) -> sa.ColumnElement[bool]:
+    return sa.and_(messages.c.servo == servo, messages.c.key == f"{boot}/{sequence}", WINDOWS)
+
+
+def _count(queue: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
+    counted = sa.select(sa.func.count()).select_from(messages).where(queue, messages.c.servo == twins.c.servo)
+    return counted.correlate(twins).scalar_subquery().label("waiting")
+
+
+_SUMMARY = sa.select(*(_count(WORK) if name == "waiting" else twins.c[name] for name in ServoSummary._fields))

@@ -1,0 +1,194 @@
+"""Storage of work results, each as a whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from itertools import groupby
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from servotwin.store.engine import SQLITE
+from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
+from servotwin.store.records import EvidenceRecord, MessageKind, WorkResult
+from servotwin.store.schema import VERIFICATIONS, WORK, contexts, evidence, messages, outgoing, states, twins
+
+_ESTIMATES = ("glance", "estimate")
+
+
+def commit(connection: sa.Connection, results: Sequence[WorkResult], now: float) -> list[bool]:
+    """Write the results whose serial is still the servo's; returns for each whether it was written.
+
+    The comparison of serials makes every effect happen exactly once, whoever holds the lease: of two workers that had
+    the same servo the first to commit wins, and the result of the other is void.
+    """
+    valid = _valid(connection, results)
+    if valid:
+        _write(connection, [(results[i], last) for i, last in valid.items()], now)
+    return [i in valid for i in range(len(results))]
+
+
+def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int, int]:
+    """Lock the servos; returns index of each valid result -> serial of its last message to the edge, in lock order."""
+    if not results:
+        return {}
+    servos = sorted({result.servo for result in results})
+    rows = connection.execute(_locked_serials(connection.dialect.name), {"_servos": servos})
+    serials = {row.servo: (row.serial, row.posted) for row in rows}
+    valid: dict[int, int] = {}
+    for i in sorted(range(len(results)), key=lambda i: results[i].servo):
+        serial, posted = serials.get(results[i].servo, (None, 0))
+        if results[i].serial == serial:
+            valid[i] = posted + len(results[i].outgoing)
+            serials[results[i].servo] = serial + 1, valid[i]
+    return valid
+
+
+def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
+    """Make the serial of the next message to the edge exceed `serial`."""
+    behind = twins.c.servo == servo, twins.c.posted < serial
+    connection.execute(sa.update(twins).where(*behind).values(posted=serial))
+
+
+def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], now: float) -> None:
+    results = [result for result, _ in valid]
+    _advance(connection, valid)
+    _states(connection, results)
+    _done(connection, results, now)
+    known = {key: text for result in results for key, text in result.contexts}
+    _insert_all(
+        connection,
+        insert_once(connection.dialect.name, contexts),
+        ({"key": key, "text": text} for key, text in sorted(known.items())),
+    )
+    found = [(result.servo, one) for result in results for one in result.evidence]
+    windows = _windows(connection, found)
+    _insert_all(connection, sa.insert(evidence), (_evidence_row(servo, one, windows, now) for servo, one in found))
+    _insert_all(
+        connection, sa.insert(outgoing), (row for result, last in valid for row in _outgoing_rows(result, last, now))
+    )
+    put(connection, [item for result in results for item in result.enqueue])
+    connection.execute(_RESCHEDULE, {"_servos": sorted({result.servo for result in results})})
+
+
+def _advance(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]]) -> None:
+    """Advance the servos' serials, end their leases and update their summaries.
+
+    Consecutive results that set the same columns share one statement.
+    """
+    rows = [(_summary(result.evidence), result, last) for result, last in valid]
+    for names, alike in groupby(rows, lambda row: tuple(sorted(row[0]))):
+        bound = [
+            {f"_{name}": value for name, value in known.items()}
+            | {"_servo": result.servo, "_serial": result.serial + 1, "_posted": last, "_wake": result.wake}
+            for known, result, last in alike
+        ]
+        connection.execute(_advancing(names), bound)
+
+
+def _states(connection: sa.Connection, results: Sequence[WorkResult]) -> None:
+    rows = [{"servo": result.servo, "state": result.state} for result in results]
+    connection.execute(_upsert_state(connection.dialect.name), rows)
+
+
+def _done(connection: sa.Connection, results: Sequence[WorkResult], now: float) -> None:
+    rows = [
+        {"_servo": result.servo, "_id": message, "_now": now}
+        for result in results
+        for message in dict.fromkeys(result.done)
+    ]
+    if rows and connection.execute(_DONE, rows).rowcount != len(rows):
+        servos = ", ".join(sorted({result.servo for result in results}))
+        raise ValueError(f"work result of {servos}: covers a message that is not an unprocessed one of its own")
+
+
+def _insert_all(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, Any]]) -> None:
+    found = list(rows)
+    if found:
+        connection.execute(statement, found)
+
+
+def _windows(connection: sa.Connection, found: Sequence[tuple[str, EvidenceRecord]]) -> dict[tuple[str, str], int]:
+    """Ids of the windows that evidence names, by (servo, key)."""
+    rows = rows_by_name(connection, _WINDOW_IDS, {(servo, one.window) for servo, one in found if one.window})
+    return {(row.servo, row.key): row.id for row in rows if row.kind == MessageKind.WINDOW}
+
+
+def _evidence_row(
+    servo: str, found: EvidenceRecord, windows: Mapping[tuple[str, str], int], now: float
+) -> dict[str, Any]:
+    row = found._asdict()
+    message = windows.get((servo, row.pop("window")), found.message)
+    return row | {"message": message or None, "context": found.context or None, "servo": servo, "made": now}
+
+
+def _outgoing_rows(result: WorkResult, last: int, now: float) -> list[dict[str, Any]]:
+    first = last - len(result.outgoing) + 1
+    return [
+        {"servo": result.servo, "serial": first + i, "body": body, "made": now}
+        for i, body in enumerate(result.outgoing)
+    ]
+
+
+def _summary(found: Sequence[EvidenceRecord]) -> dict[str, Any]:
+    """Columns of the servo's row that a new estimate, update or receipt sets."""
+    known: dict[str, Any] = {}
+    for one in found:
+        if one.kind in _ESTIMATES:
+            known |= {"gap": one.gap, "std": one.std, "status": one.status}
+        elif one.kind == "update":
+            known["version"] = one.version
+        elif one.kind == "receipt":
+            known["receipt"] = one.status
+    return known
+
+
+_WINDOW_IDS = select_by_name(messages.c.id, messages.c.kind)
+
+_DONE = (
+    sa.update(messages)
+    .where(messages.c.id == sa.bindparam("_id"), messages.c.servo == sa.bindparam("_servo"), messages.c.done.is_(None))
+    .values(done=sa.bindparam("_now", type_=sa.Double))
+)
+
+
+@lru_cache(maxsize=2)
+def _locked_serials(dialect: str) -> sa.Select[Any]:
+    """Select and lock the serials of servos in the lock order of `incoming.put`: by code points, whatever the collation
+    of the database. The lock allows other messages to refer to the row (FOR NO KEY UPDATE).
+    """
+    order = twins.c.servo if dialect == SQLITE else twins.c.servo.collate("C")
+    servos: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
+    query = sa.select(twins.c.servo, twins.c.serial, twins.c.posted).where(twins.c.servo.in_(servos))
+    return query.order_by(order).with_for_update(key_share=True)
+
+
+@lru_cache(maxsize=32)
+def _advancing(names: tuple[str, ...]) -> sa.Update:
+    """Update of a servo's serial and of these columns."""
+    new = {name: sa.bindparam(f"_{name}", type_=twins.c[name].type) for name in ("serial", "posted", "wake", *names)}
+    values = {"attempts": 0, "lease_owner": None, "lease_until": None} | new
+    return sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values)
+
+
+@lru_cache(maxsize=2)
+def _upsert_state(dialect: str) -> Any:
+    """Insert or replace a servo's state."""
+    new = (sqlite.insert if dialect == SQLITE else postgresql.insert)(states)
+    return new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
+
+
+def _oldest(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
+    oldest = sa.select(messages.c.received).where(queue, messages.c.servo == twins.c.servo)
+    return oldest.order_by(messages.c.id).limit(1).correlate(twins).scalar_subquery()
+
+
+# A separate statement after the serials were advanced: on PostgreSQL those rows are locked by then. Messages put before
+# that are seen here; a later put waits for the lock and marks the servo itself.
+_RESCHEDULE = (
+    sa.update(twins)
+    .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
+    .values(ready=_oldest(WORK), asked=_oldest(VERIFICATIONS))
+)
