@@ -227,10 +227,10 @@ def test_what_cannot_be_is_said(channels, options, word):
     ("settings", "words"),
     [
         ({"spreads": {"k": 1.0}}, "allowed are k/m"),
-        ({"spreads": {"k/m": 0.0}}, "above 0"),
-        ({"inflation": math.nan}, "inflation = nan: must be a finite number of at least 0"),
-        ({"whitenings": 2.5}, "whitenings = 2.5: must be a whole number of at least 0"),
-        ({"noise_order": True}, "noise_order = True: must be a whole number of at least 0"),
+        ({"spreads": {"k/m": 0.0}}, "must be a positive number"),
+        ({"inflation": math.nan}, "inflation = nan: must be a number, at least 0, finite"),
+        ({"whitenings": 2.5}, "whitenings = 2.5: must be an integer, at least 0"),
+        ({"noise_order": True}, "noise_order = True: must be an integer, at least 0"),
     ],
 )
 def test_settings_are_checked(settings, words):
