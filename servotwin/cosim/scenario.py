@@ -26,10 +26,11 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
-from servotwin.messages import NAME_PATTERN
+from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.plant.signals import SignalLike, as_gap, as_pieces
+from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
@@ -39,7 +40,7 @@ MOST_SAMPLES = 1e8  # some 10 GB of signals
 PRESETS = ("fig15", "fig15-sampled", "fig16", "calm", "certified")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """One servo, its wear, its link and its twin.
 
@@ -111,8 +112,26 @@ class Scenario:
             raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
         self._check_rates()
         as_pieces(self.reference, self.duration)
-        as_nonnegative(self.gap, self.duration, "gap", "rad")
+        as_gap(self.gap, self.duration)
         self._check_window()
+
+    def __repr__(self) -> str:
+        """Name, length, servo and policy in one line."""
+        return f"<Scenario {self.name!r}: {self.duration:g} s, policy {self.twin.policy!r}, {self.servo!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        rows = {
+            "servo": repr(self.servo),
+            "controller": repr(self.law),
+            "duration": f"{self.duration:g} s",
+            "reference": repr(self.reference),
+            "gap": repr(self.gap),
+            "policy": self.twin.policy,
+            "estimator": self.twin.method,
+            "seed": str(self.seed),
+        }
+        return html_table(f"Scenario {self.name}", rows)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scenario:
@@ -187,17 +206,17 @@ class Scenario:
             fallback = guarded.supervision.fallback if guarded is not None and own else None
             return Parameters() if fallback is None else start_of(fallback)
         k_dz = 1.0 if self.twin.k_dz is None else self.twin.k_dz
-        return Parameters(tolerance=self.servo.tolerance_for(self.twin.initial_gap, k_dz))
+        return Parameters(setting=Setting(self.servo.tolerance_for(self.twin.initial_gap, k_dz)))
 
     @property
     def start_law(self) -> Controller:
         """The controller before the first update."""
-        return with_gains(self.law, self.start.gains)
+        return with_gains(self.law, self.start.setting.gains)
 
     @property
     def start_tolerance(self) -> float:
         """Dead-zone half-width before the first update, m."""
-        return self.start.tolerance
+        return self.start.setting.tolerance
 
     @property
     def samples(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -129,7 +130,7 @@ def _plants(servo: Servo, widths: tuple[float, ...], count: int, seed: int) -> t
 
 
 def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
-    changes = {}
+    changes: dict[str, Any] = {}
     for name, factor in factors.items():
         value = getattr(servo, name)
         changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
