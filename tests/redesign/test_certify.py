@@ -103,6 +103,16 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
         Uncertainty().replace(kk=0.1)
 
 
+def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
+    """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
+    held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)
+    found = certify(held, Uncertainty(gap=gaps(0, 5)), SMALL, SHORT)
+    assert isinstance(found, Refusal)
+    assert "no gain crossover" in found.reason
+    assert found.best is not None
+    assert (found.best.crossover, found.best.phase_margin) == (0.0, math.pi)
+
+
 # --- measures
 
 
