@@ -3,12 +3,18 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed-from-lock
 
-.PHONY: help demo reproduce test lint format lock clean packages
+PACKAGES ?= yes
+
+.PHONY: help demo reproduce check test fuzz bench lint format lock clean packages
 
 help:
 	@echo "make demo       a worn servo loses stability; its digital twin wins it back"
 	@echo "make reproduce  every figure and claim of the paper beside what is measured"
-	@echo "make test       format, lint, types, layers, tests"
+	@echo "make check      format, lint, types, layers and the fast tests, about a minute"
+	@echo "make test       the same and all tests, about five minutes; as root it installs the Debian packages"
+	@echo "                that some tests need (make test PACKAGES=no: skip those tests instead)"
+	@echo "make fuzz       the random tests with fresh and with more examples"
+	@echo "make bench      speed beside what one would use instead; or: python -m benchmarks NAME"
 	@echo "make format     format the code and fix what can be fixed"
 	@echo "make lock       pin the dependencies anew (needs uv)"
 
@@ -18,11 +24,20 @@ demo: $(STAMP)
 reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
+check: lint
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
 test: lint packages
 	$(BIN)/python -m pytest -q -n 2
 
+fuzz: $(STAMP)
+	$(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-profile=fuzz
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks
+
 packages:
-	@sh tests/packages.sh
+	@PACKAGES=$(PACKAGES) sh tests/packages.sh
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

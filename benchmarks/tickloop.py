@@ -31,7 +31,7 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import calm, hurry
 from servotwin.edge_process.ticks import Counts, summary
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Band
+from servotwin.messages import Band, Setting
 
 STEP_S = 2.0
 _REPEATS = 20
@@ -95,7 +95,7 @@ class PacedDrive:
 def config(rate: float, folder: Path) -> EdgeConfig:
     """An edge that watches its loop, as a certified one does, and has no twin."""
     law = Controller(500.0, 0.0, -50.0, 0.1, voltage_limit=10.0, sample_rate=rate)
-    watched = Supervision(FallbackSet(1e-4, band=Band(1.0, 1.0, 100.0, 3.0)), WatchSettings())
+    watched = Supervision(FallbackSet(Setting(1e-4, band=Band(1.0, 1.0, 100.0, 3.0))), WatchSettings())
     agent = AgentSettings("axis-1", UNBOOTED, rate, supervision=watched, fine_angle=True)
     return EdgeConfig(agent, "control", law, {"kind": "simulated"}, folder=folder)
 

@@ -17,6 +17,7 @@ go_on() {
     exit 0
 }
 
+[ "${PACKAGES:-yes}" = yes ] || go_on "PACKAGES=${PACKAGES}."
 [ "$(id -u)" = 0 ] || go_on "installing it takes root (apt-get install$missing)."
 command -v apt-get >/dev/null || go_on "it is not installed and there is no apt-get."
 
@@ -33,7 +34,8 @@ fi
 export DEBIAN_FRONTEND=noninteractive
 apt() { apt-get -qq -o DPkg::Lock::Timeout=300 -o Dpkg::Use-Pty=0 "$@" >"$said" 2>&1 || { cat "$said" >&2 && false; }; }
 
-echo "installing$missing for the tests (once)"
+echo "installing Debian packages that some tests need (once):$missing"
+echo "(make test PACKAGES=no leaves the system as it is and skips those tests)"
 apt update || echo "apt-get update failed; trying with what is known"
 # shellcheck disable=SC2086  # one word each
 apt install --yes --no-install-recommends $missing || {

@@ -57,7 +57,7 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     write = writer(output)
     text, described = _read(scenario)
     found = recording(_run(described, console or Console()), text)
-    with files.written(output) as temporary:
+    with files.atomic_output(output) as temporary:
         write(found, temporary)
     (console or Console()).print(f"{_rows(found)} samples: {output}", soft_wrap=True, highlight=False)
     return output
@@ -77,7 +77,7 @@ def convert(log: Path, output: Path) -> Path:
     columns = {"time_s": whole.time, "measured_position_m": whole.position}
     others = {"theta_m_rad": whole.theta_m, "voltage_v": whole.voltage, "reference_m": whole.reference}
     columns |= {name: values for name, values in others.items() if values is not None}
-    with files.written(output) as temporary:
+    with files.atomic_output(output) as temporary:
         write(Recording(columns, found.metadata), temporary)
     return output
 

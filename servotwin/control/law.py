@@ -103,7 +103,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     Notes
     -----
     Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and it gives no voltage
-    (decision E16): what is left is the feedforward and the offset. With limits off the voltage equals the continuous
+    (erratum E16): what is left is the feedforward and the offset. With limits off the voltage equals the continuous
     PIDF's driven by the held error. The limits act on the sum.
     """
     filtered = measurement + (1.0 - parameters.loop_step) * (state.filtered - measurement)

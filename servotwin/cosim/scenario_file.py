@@ -18,12 +18,12 @@ from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
-from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
+from servotwin.runtime.retry import Retry
 from servotwin.twin import settings_file as twinfile
 
 MM = 1e-3

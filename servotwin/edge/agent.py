@@ -24,11 +24,11 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import Store
+from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Update
+from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
 
 
 class Outgoing(NamedTuple):
@@ -58,7 +58,7 @@ class Agent:
     settings : AgentSettings
     outbox : Outbox, optional
         In memory by default.
-    store : Store, optional
+    store : ParameterStore, optional
         Of the last parameters that were proved; without one each boot begins as configured.
     outlet : Outlet, optional
         Where cut windows go; by default they are packed here and kept in `outbox`.
@@ -68,7 +68,7 @@ class Agent:
         self,
         settings: AgentSettings,
         outbox: Outbox | None = None,
-        store: Store | None = None,
+        store: ParameterStore | None = None,
         outlet: Outlet | None = None,
     ) -> None:
         self.settings = settings
@@ -94,7 +94,7 @@ class Agent:
     def controller(self) -> Controller | None:
         """The controller with the gains in force; None where updates set the tolerance only."""
         configured = self.settings.controller
-        return None if configured is None else with_gains(configured, self.parameters.gains)
+        return None if configured is None else with_gains(configured, self.parameters.setting.gains)
 
     @property
     def probe(self) -> ProbingMove | None:
@@ -185,8 +185,8 @@ class Agent:
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller
-        gains = None if law is None else gains_of(law)
-        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, p.tolerance, s.model_version, gains)
+        setting = Setting(p.setting.tolerance, None if law is None else gains_of(law))
+        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """Where in a block the next thing may happen: its end, the deadline, just after a change of the reference."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.log import say
 from servotwin.errors import InvalidInput
+from servotwin.runtime.locks import locked
 
 
 @contextmanager
@@ -21,18 +20,12 @@ def alone(config: EdgeConfig) -> Iterator[None]:
     InvalidInput
         Another process holds them.
     """
-    with ExitStack() as held:
+    with ExitStack() as locks:
         for name in dict.fromkeys((config.keeping.parameters, config.keeping.outbox)):
-            _hold(config, name, held)
+            try:
+                locks.enter_context(locked(config.path(f"{name}-lock")))
+            except BlockingIOError:
+                raise InvalidInput(f"{config.source}: another edge runs on its files; end that one first") from None
+            except OSError as error:
+                say("not locked", error=str(error))
         yield
-
-
-def _hold(config: EdgeConfig, name: str, held: ExitStack) -> None:
-    try:
-        descriptor = os.open(config.path(f"{name}-lock"), os.O_RDWR | os.O_CREAT, 0o600)
-        held.callback(os.close, descriptor)
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise InvalidInput(f"{config.source}: another edge runs on its files; end that one first") from None
-    except OSError as error:
-        say("not locked", error=str(error))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import os
+from contextlib import suppress
 from pathlib import Path
+
+from servotwin.runtime.files import replace_file
 
 
 def next_boot(path: Path, random: bytes) -> str:
@@ -17,15 +19,8 @@ def next_boot(path: Path, random: bytes) -> str:
         8 bytes.
     """
     count = _count(path) + 1
-    try:
-        beside = path.with_name(f"{path.name}.new")
-        with beside.open("w", encoding="ascii") as file:
-            file.write(f"{count}\n")
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError:
-        pass
+    with suppress(OSError):
+        replace_file(path, f"{count}\n".encode("ascii"), durable=True)
     return f"b{count}-{random.hex()}"
 
 

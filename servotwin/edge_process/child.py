@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import socket
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from servotwin.edge_process.log import say
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.pipe import Pipe
-from servotwin.link.transport import Backoff
+from servotwin.runtime.child_process import ChildProcess
+from servotwin.runtime.frames import FrameSocket
+from servotwin.runtime.retry import Backoff, Retry
 
-Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
+Start = Callable[[socket.socket], ChildProcess]
 _ENDING_S = 10.0
 
 
 def starter(file: Path) -> Start:
     """How a link process for an `edge.toml` is started; no secret is in its arguments."""
 
-    def start(end: socket.socket) -> subprocess.Popen[bytes]:
+    def start(end: socket.socket) -> ChildProcess:
         command = [sys.executable, "-m", "servotwin.edge_process.link_process", str(file), str(end.fileno())]
-        return subprocess.Popen(command, pass_fds=(end.fileno(),), stdin=subprocess.DEVNULL)
+        return ChildProcess(command, pass_fds=(end.fileno(),))
 
     return start
 
@@ -39,8 +39,8 @@ class LinkChild:
 
     def __init__(self, start: Start, outlet: PipeOutlet) -> None:
         self._start, self._outlet = start, outlet
-        self._process: subprocess.Popen[bytes] | None = None
-        self._pauses = Backoff(0.5, 2.0, 10.0)
+        self._process: ChildProcess | None = None
+        self._pauses = Backoff(Retry(0.5, 2.0, 10.0))
         self._begun = self._due = 0.0
         self.starts = 0
 
@@ -55,7 +55,7 @@ class LinkChild:
             if now >= self._due:
                 self._launch(now)
             return
-        code = self._process.poll()
+        code = self._process.code
         if code is None and self._outlet.connected:
             return
         if code is None:
@@ -68,11 +68,7 @@ class LinkChild:
         """Let it finish what it has, and end."""
         self._outlet.disconnect()
         if self._process is not None:
-            try:
-                self._process.wait(_ENDING_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            self._process.wait(_ENDING_S)
         self._process = None
 
     def _launch(self, now: float) -> None:
@@ -88,7 +84,7 @@ class LinkChild:
             theirs.close()
         self.starts += 1
         self._begun = now
-        self._outlet.connect(Pipe(ours))
+        self._outlet.connect(FrameSocket(ours))
 
     def _gone(self, now: float) -> None:
         """One that ran for a while is started again at once, one that keeps falling later and later."""

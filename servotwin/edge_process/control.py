@@ -129,4 +129,4 @@ class Controlling:
             self.law.change(law, wanted, position)
 
     def _law(self, parameters: Parameters) -> LawParameters:
-        return self._edge.config.law(self._edge.agent.controller, parameters.tolerance)
+        return self._edge.config.law(self._edge.agent.controller, parameters.setting.tolerance)

@@ -12,7 +12,7 @@ from typing import Protocol
 from servotwin.control.controller import Controller
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import kept, restored
+from servotwin.edge.store import StoredParameters
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.frames import TicksFrame, Value
 from servotwin.edge_process.log import say
@@ -110,7 +110,7 @@ class Edge:
         """Too many samples are missing, or they are counted anew: a new boot, on the parameters in force."""
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
-        self.agent = self._begun(restored(kept(self.agent.parameters)))
+        self.agent = self._begun(StoredParameters.of(self.agent.parameters).parameters())
 
     def exchange(self) -> None:
         """Send a piece of what waits, and let the agent hear what has come."""
@@ -167,14 +167,14 @@ class Edge:
         settings = replace(self.config.agent, boot=boot)
         agent = Agent(settings, store=Carried(first, self._outlet), outlet=self._outlet)
         self._outlet.say(agent.hello())
-        say("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.tolerance)
+        say("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
         return agent
 
     def _told(self) -> TicksFrame:
         agent, p = self.agent, self.agent.parameters
         values: dict[str, Value] = {
             "version": p.version,
-            "tolerance_m": p.tolerance,
+            "tolerance_m": p.setting.tolerance,
             "gap_rad": p.gap,
             "fallback": p.fallback,
             "windows_cut": agent.windows_cut,

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.edge.cut import Cut
-from servotwin.edge.store import Kept
+from servotwin.edge.store import StoredParameters
 from servotwin.messages import InvalidMessage
 
 Value = float | int | str | bool | None
@@ -51,7 +51,7 @@ class SaveFrame(Struct, frozen=True, array_like=True, tag="save"):
     """Parameters that were proved at the machine: to be kept on disk."""
 
     serial: int
-    kept: Kept
+    parameters: StoredParameters
 
 
 class HandledFrame(Struct, frozen=True, array_like=True, tag="handled"):

@@ -10,7 +10,7 @@ import msgspec
 from servotwin.edge.cut import Cut
 from servotwin.edge.outlet import NOT_FINITE, WITHHELD
 from servotwin.edge.packing import is_finite, pack
-from servotwin.edge.store import FileStore, restored
+from servotwin.edge.store import FileParameterStore
 from servotwin.edge.window_filter import WindowFilter
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.frames import CutFrame, HandledFrame, LetterFrame, SaveFrame, TicksFrame, ToLink
@@ -42,7 +42,7 @@ class Keeper:
 
     def __init__(self, config: EdgeConfig, outbox: SqliteOutbox) -> None:
         self._config, self._outbox = config, outbox
-        self._store = FileStore(config.path(config.keeping.parameters))
+        self._store = FileParameterStore(config.path(config.keeping.parameters))
         self._unsaved: SaveFrame | None = None
         self._filter: WindowFilter | None = None
         self._boot = ""
@@ -131,7 +131,7 @@ class Keeper:
         if self._unsaved is None:
             return []
         try:
-            self._store.save(restored(self._unsaved.kept))
+            self._store.save(self._unsaved.parameters.parameters())
         except OSError:
             self.faults["parameters not written"] += 1
             return []

@@ -24,13 +24,13 @@ from servotwin.edge_process.config import EdgeConfig, token_of
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.keeping import Keeper
 from servotwin.edge_process.log import Troubles, say
-from servotwin.edge_process.pipe import Pipe
 from servotwin.edge_process.status import write_status
 from servotwin.edge_process.ticks import summary
 from servotwin.edge_process.twin_link import courier_of, listener_of, transport_of
 from servotwin.errors import InvalidInput
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Acknowledge, InvalidMessage, encode
+from servotwin.runtime.frames import FrameSocket
 
 NICE = 10
 TEND_S = 1.0
@@ -49,7 +49,7 @@ class LinkProcess:
     """
 
     def __init__(self, config: EdgeConfig, end: socket.socket) -> None:
-        self._config, self._end, self._pipe = config, end, Pipe(end)
+        self._config, self._end, self._pipe = config, end, FrameSocket(end)
         keeping = config.keeping
         self.outbox = SqliteOutbox(config.path(keeping.outbox), config.agent.servo, keeping.windows, keeping.bytes)
         self.outbox.settle()
@@ -97,7 +97,7 @@ class LinkProcess:
             self._stand()
             while self._outgoing:
                 self._pipe.post(self._outgoing.pop(0))
-            self._pipe.pump()
+            self._pipe.send()
             left = max(0.0, tended + TEND_S - time.monotonic())
             wanting = [self._end] if self._pipe.backlog else []
             readable, _, _ = select.select([self._end, self._woken], wanting, [], left)
@@ -110,7 +110,7 @@ class LinkProcess:
                 self._tend()
 
     def _receive(self) -> None:
-        for data in self._pipe.take():
+        for data in self._pipe.receive():
             try:
                 self._take(frames.to_link(data))
             except InvalidMessage:

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 
 from servotwin.edge.cut import Cut
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import kept
+from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import BackFrame, DoneFrame, HeardFrame, StandingFrame
-from servotwin.edge_process.pipe import Pipe
 from servotwin.messages import Acknowledge, InvalidMessage, Message, Window, decode, encode
+from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
 MOST = 64_000_000
@@ -42,7 +42,7 @@ class PipeOutlet:
     def __init__(self, owed: bool) -> None:
         self._owed = owed
         self.boot = ""
-        self._pipe: Pipe | None = None
+        self._pipe: FrameSocket | None = None
         self._serial = 0
         self._handled = 0
         self._kept: dict[int, bytes] = {}
@@ -87,7 +87,7 @@ class PipeOutlet:
         """Whether the link process has so much to take that windows may have to be given up soon."""
         return self._size > MOST // 2
 
-    def connect(self, pipe: Pipe) -> None:
+    def connect(self, pipe: FrameSocket) -> None:
         """A new link process: it is given everything that the last one may not have taken."""
         self.disconnect()
         self._pipe = pipe
@@ -121,7 +121,7 @@ class PipeOutlet:
 
     def save(self, parameters: Parameters) -> None:
         """Let these parameters be kept on disk."""
-        self._keep(frames.SaveFrame(self._next(), kept(parameters)))
+        self._keep(frames.SaveFrame(self._next(), StoredParameters.of(parameters)))
 
     def tell(self, frame: frames.TicksFrame) -> None:
         """Something that may be lost; left out when the link process is behind."""
@@ -133,11 +133,11 @@ class PipeOutlet:
         pipe = self._pipe
         if pipe is None or pipe.broken:
             return None
-        pipe.pump()
+        pipe.send()
         try:
-            came = pipe.take()
+            came = pipe.receive()
             return self._hear(came) if came else None
-        except InvalidMessage:
+        except (FrameError, InvalidMessage):
             pipe.broken = True
             return None
 

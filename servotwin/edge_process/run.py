@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from servotwin.edge.drive import Drive, DriveLost
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import FileStore
+from servotwin.edge.store import FileParameterStore
 from servotwin.edge.switch import Rules
 from servotwin.edge_process.alone import alone
 from servotwin.edge_process.boots import next_boot
@@ -97,7 +97,7 @@ def _run(config: EdgeConfig, path: Path) -> None:
 def first_parameters(path: Path) -> Parameters | None:
     """What an earlier start proved; a file that does not hold it is put aside, since the machine must run."""
     try:
-        return FileStore(path).load()
+        return FileParameterStore(path).load()
     except InvalidInput as error:
         say("last parameters not readable", error=str(error))
     except OSError as error:
@@ -114,11 +114,11 @@ def permitted(found: Parameters | None, agent: AgentSettings) -> Parameters | No
     """What an earlier start proved, where an update to it would be allowed today: the limits may be others by now."""
     if found is None or found.fallback:
         return found
-    centre, gains = Rules(agent.limits, agent.controller, agent.own).centre, found.gains
+    centre, gains = Rules(agent.limits, agent.controller, agent.own).centre, found.setting.gains
     good = gains is None or (centre is not None and agent.limits.allows_gains(gains, centre))
-    if good and agent.limits.allows_tolerance(found.tolerance):
+    if good and agent.limits.allows_tolerance(found.setting.tolerance):
         return found
-    say("last parameters not allowed any more", version=found.version, tolerance_m=found.tolerance)
+    say("last parameters not allowed any more", version=found.version, tolerance_m=found.setting.tolerance)
     return None
 
 

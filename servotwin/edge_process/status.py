@@ -9,14 +9,14 @@ from typing import Any
 
 import msgspec
 
+from servotwin.runtime.files import replace_file
+
 SCHEMA = "servotwin-edge-status/1"
 
 
 def write_status(path: Path, status: Mapping[str, Any]) -> None:
     """Replace the file as a whole; raises OSError. A status is old in a second: it is not flushed to the disk."""
-    beside = path.with_name(f"{path.name}.new")
-    beside.write_bytes(msgspec.json.format(msgspec.json.encode({"schema": SCHEMA, **status})) + b"\n")
-    beside.replace(path)
+    replace_file(path, msgspec.json.format(msgspec.json.encode({"schema": SCHEMA, **status})) + b"\n")
 
 
 def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:

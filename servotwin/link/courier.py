@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from math import inf
 
 from servotwin.link.outbox import Key
-from servotwin.link.session import Retry
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.link.transport import Backoff, Parcel, Refused, Transport, Unreachable
+from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import Refusal
+from servotwin.runtime.retry import Backoff, Retry
 
 Item = Key | bytes
 """A window's key or a letter's digest."""
@@ -139,4 +139,4 @@ class Courier:
         return Sent(wait)
 
     def _fresh(self) -> Backoff:
-        return Backoff(self.retry.first_s, self.retry.factor, self.retry.longest_s)
+        return Backoff(self.retry)

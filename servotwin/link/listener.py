@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from servotwin.link.seal import TO_EDGE, Sealed, key_of, opened, verifier_of
-from servotwin.link.session import Retry
-from servotwin.link.transport import Backoff, Refused, Transport, Unreachable
+from servotwin.link.transport import Refused, Transport, Unreachable
 from servotwin.messages import MAX_BYTES, Acknowledge, InvalidMessage, Request, Update, decode
+from servotwin.runtime.retry import Backoff, Retry
 
 
 class Told(NamedTuple):
@@ -54,7 +54,7 @@ class Listener:
     _pauses: Backoff = field(init=False)
 
     def __post_init__(self) -> None:
-        self._pauses = Backoff(self.retry.first_s, self.retry.factor, self.retry.longest_s)
+        self._pauses = Backoff(self.retry)
 
     def step(self) -> Told:
         """One poll; waits as long as the transport does."""

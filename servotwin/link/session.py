@@ -8,27 +8,9 @@ lost: so each window counts once, over any transport.
 from dataclasses import dataclass
 from math import inf
 
-from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Key, Outbox
 from servotwin.messages import Acknowledge, Window
-
-
-@dataclass(frozen=True, slots=True)
-class Retry:
-    """When to repeat: after `first_s`, then each pause `factor` times the last, up to `longest_s`.
-
-    `first_s` should exceed the round trip, or every window is sent twice.
-    """
-
-    first_s: float = 5.0
-    factor: float = 2.0
-    longest_s: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.first_s <= self.longest_s < inf:
-            raise InvalidInput(f"retry from {self.first_s!r} s to {self.longest_s!r} s: must be positive and in order")
-        if not 1.0 <= self.factor < inf:
-            raise InvalidInput(f"retry factor = {self.factor!r}: must be at least 1")
+from servotwin.runtime.retry import Retry
 
 
 @dataclass(slots=True)

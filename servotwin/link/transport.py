@@ -1,14 +1,11 @@
-"""What carries an edge's messages to the twin and the twin's back: the protocol, what can go wrong, how long to wait.
+"""What carries an edge's messages to the twin and the twin's back: the protocol, and what can go wrong.
 
 A transport knows bytes only. It may lose, delay and repeat; it says "delivered" only when the twin has said so.
 """
 
 import zlib
-from dataclasses import dataclass
-from math import inf
 from typing import NamedTuple, Protocol
 
-from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 
 DEFLATE = "deflate"
@@ -94,37 +91,3 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Let go of connections, at once; `deliver` and `listen` under way raise `Unreachable`."""
-
-
-@dataclass(slots=True)
-class Backoff:
-    """Pauses that grow from one failure to the next, each somewhere between half and the whole of its length.
-
-    Parameters
-    ----------
-    first_s, factor, longest_s : float
-        As `link.session.Retry` names them.
-    failures : int
-        In a row, so far.
-    """
-
-    first_s: float = 1.0
-    factor: float = 2.0
-    longest_s: float = 60.0
-    failures: int = 0
-
-    def __post_init__(self) -> None:
-        if not (0.0 < self.first_s <= self.longest_s < inf and 1.0 <= self.factor < inf):
-            raise InvalidInput(f"pauses from {self.first_s!r} s to {self.longest_s!r} s: must be positive and in order")
-
-    def failed(self, chance: float) -> float:
-        """s to wait after a failure; `chance` is uniform in 0 .. 1, so that edges do not come back all at once."""
-        pause = self.first_s
-        for _ in range(min(self.failures, 64)):
-            pause = min(pause * self.factor, self.longest_s)
-        self.failures += 1
-        return pause * (0.5 + 0.5 * chance)
-
-    def succeeded(self) -> None:
-        """The next failure is the first one again."""
-        self.failures = 0

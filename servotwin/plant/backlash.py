@@ -1,8 +1,8 @@
 """The gap of the lead screw as a play operator: the screw rests until the motor's side of the gap pushes it.
 
 theta_d is clamped to [theta_m - b, theta_m + b], b half the TOTAL gap. This is Eqs 16-18 read as the results need them:
-theta_b there is the total gap (erratum E2), nothing jumps at a reversal (E3), and a growing gap never moves the screw
-while a shrinking one pushes it (E4).
+theta_b there is the total gap (errata E2, E3 and E4): nothing jumps at a reversal, a growing gap
+never moves the screw, and a shrinking one pushes it.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def flow_of(servo: Servo, basis: Basis, play: Play, grip: Grip, voltage: Array) 
 
 
 def _screw_rate(basis: Basis, side: int) -> Array:
-    """theta_d' of the play operator: with the motor, less the half gap's own rate, in contact; zero in the gap (facts
+    """theta_d' of the play operator: with the motor, less the half gap's own rate, in contact; zero in the gap (errata
     E3, E4)."""
     if side == 0:
         return np.zeros(len(basis.names))

@@ -24,7 +24,7 @@ class Zone:
 
 
 def controller_zones(controller: Controller, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
-    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (facts E16), plus what is always added."""
+    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added."""
     always = basis.row("feedforward") + basis.row("offset")
     slope = error - basis.row("derivative")
     wanted = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope

@@ -118,8 +118,8 @@ def svg(figure: Figure, name: str) -> bytes:
 def save(figure: Figure, directory: Path, name: str) -> Path:
     """Write NAME.svg and NAME.png (200 dots per inch); returns the path of the SVG."""
     vector = directory / f"{name}.svg"
-    with files.written(vector) as temporary:
+    with files.atomic_output(vector) as temporary:
         temporary.write_bytes(svg(figure, name))
-    with files.written(directory / f"{name}.png") as temporary, look():
+    with files.atomic_output(directory / f"{name}.png") as temporary, look():
         figure.savefig(temporary, format="png", dpi=200)
     return vector

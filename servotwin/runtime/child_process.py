@@ -1,55 +1,151 @@
-"""A process that is kept running: started in a group of its own, read, ended, started again."""
+"""Child processes: started, watched, ended; and one that is kept running with its log.
+
+`python -m servotwin.runtime.child_process MODULE ARGUMENTS` runs a module that ends when its standard input does. The
+parent holds the other end of that pipe and never writes: when the parent is gone, however it went, the system closes
+the pipe. The module is then told to end as by SIGTERM, and its process group is killed where it does not.
+"""
 
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
+import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import IO
 
 from servotwin.errors import InvalidInput
 
-MOST, WITHIN_S = 5, 60.0
+MOST_ENDS, WITHIN_S = 5, 60.0
 """A process that ends by itself that often within that time is given up."""
+GRACE_S = 15.0
+"""Time that a module has to end after its parent has gone."""
+
+
+class ChildProcess:
+    """A process that was started.
+
+    Parameters
+    ----------
+    command : sequence of str
+    pass_fds : sequence of int
+        Descriptors that it inherits.
+    stdin, stdout, stderr : int or file, optional
+        As `subprocess.Popen` takes them; its standard input is empty by default.
+    env : mapping, optional
+        Its environment; None: this process's.
+    group : bool
+        Start it in a session and process group of its own, which `kill` ends as a whole.
+
+    Raises
+    ------
+    OSError
+        It cannot be started.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        pass_fds: Sequence[int] = (),
+        stdin: int | IO[bytes] = subprocess.DEVNULL,
+        stdout: int | IO[bytes] | None = None,
+        stderr: int | IO[bytes] | None = None,
+        env: Mapping[str, str] | None = None,
+        group: bool = False,
+    ) -> None:
+        self._group = group
+        self._process = subprocess.Popen(
+            list(command),
+            stdin=stdin,
+            stdout=stdout,
+            stderr=stderr,
+            env=env,
+            pass_fds=pass_fds,
+            start_new_session=group,
+        )
+
+    @property
+    def pid(self) -> int:
+        """Its process id, and that of its group where it has one."""
+        return self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code; None: it runs."""
+        return self._process.poll()
+
+    @property
+    def stdout(self) -> IO[bytes] | None:
+        """Its standard output, where that is a pipe."""
+        return self._process.stdout
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        if self.code is None:
+            self._process.terminate()
+
+    def kill(self) -> None:
+        """Send SIGKILL to it, and to its group; does not wait."""
+        if self._process.returncode is None:
+            with suppress(ProcessLookupError):
+                if self._group:
+                    os.killpg(self.pid, signal.SIGKILL)
+                else:
+                    self._process.kill()
+
+    def wait(self, seconds: float) -> int:
+        """Wait until it has ended, kill it after that time, and return its exit code."""
+        try:
+            return self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self._process.wait()
+
+    def close(self) -> None:
+        """Close this side of its pipes."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
 
 
 class Child:
-    """One process.
+    """A Python module that is kept running, with its log; it ends when this process does.
 
     Parameters
     ----------
     name : str
-        For people.
+        In messages for people.
     command : sequence of str
         A module and its arguments.
     log : Path
-        What it says is put at its end.
+        Its standard error is appended there.
     ready : str
-        How the line begins with which it says that it is; empty: it says nothing.
+        Beginning of the line that it prints when it is ready; empty: it prints none.
     lock : int
-        A descriptor that it keeps open.
+        A descriptor that it inherits.
 
     Attributes
     ----------
-    told : str or None
-        The rest of that line; None: it has not come yet.
+    address : str or None
+        The rest of the line that says it is ready; None: that line has not come yet.
     restarts : int
     """
 
     def __init__(self, name: str, command: Sequence[str], log: Path, ready: str, lock: int) -> None:
         self.name, self.command, self.log = name, tuple(command), log
-        self.told: str | None = None
+        self.address: str | None = None
         self.restarts = 0
         self._ready, self._lock = ready, lock
-        self._process: subprocess.Popen[bytes] | None = None
-        self._output: IO[bytes] | None = None
-        self._heard = b""
-        self._ends: deque[float] = deque(maxlen=MOST)
+        self._process: ChildProcess | None = None
+        self._received = b""
+        self._ends: deque[float] = deque(maxlen=MOST_ENDS)
 
     @property
     def pid(self) -> int | None:
@@ -58,82 +154,98 @@ class Child:
 
     @property
     def code(self) -> int | None:
-        """How it ended; None: it runs."""
-        return None if self._process is None else self._process.poll()
+        """Its exit code; None: it runs, or was not started."""
+        return None if self._process is None else self._process.code
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start it; its standard input is a pipe that closes with this process."""
         with self.log.open("ab") as log:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "servotwin.up.attended", *self.command],
+            self._process = ChildProcess(
+                [sys.executable, "-m", "servotwin.runtime.child_process", *self.command],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                start_new_session=True,
+                group=True,
                 pass_fds=(self._lock,),
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
-        self._heard = b""
+        self._received = b""
 
-    def hear(self) -> None:
-        """Read what it has printed."""
+    def read_output(self) -> None:
+        """Read the lines that it has printed since, and take the address from the one that says it is ready."""
         if self._process is None or self._process.stdout is None:
             return
         while data := self._process.stdout.read(65536):
-            self._heard = (self._heard + data)[-65536:]
-        *lines, self._heard = self._heard.split(b"\n")
+            self._received = (self._received + data)[-65536:]
+        *lines, self._received = self._received.split(b"\n")
         for line in lines:
             text = line.decode("utf-8", "replace")
             if self._ready and text.startswith(self._ready):
-                self.told = text.removeprefix(self._ready).strip()
+                self.address = text.removeprefix(self._ready).strip()
 
-    def again(self, now: float) -> None:
+    def restart(self, now: float) -> None:
         """Start it once more after it ended by itself.
 
         Raises
         ------
         InvalidInput
-            That happens too often.
+            It ended `MOST_ENDS` times within `WITHIN_S`.
         """
         self._ends.append(now)
-        if len(self._ends) == MOST and now - self._ends[0] < WITHIN_S:
-            raise self.failed(f"ended {MOST} times within {now - self._ends[0]:.0f} s")
+        if len(self._ends) == MOST_ENDS and now - self._ends[0] < WITHIN_S:
+            raise self.failure(f"ended {MOST_ENDS} times within {now - self._ends[0]:.0f} s")
         self.release()
         self.restarts += 1
-        self.begin()
+        self.start()
 
-    def failed(self, what: str) -> InvalidInput:
-        """What to raise where it is of no use, with its last words."""
-        words = last_line(self.log)
-        return InvalidInput(f"{self.name} {what}{f': {words}' if words else ''} (see {self.log})")
+    def failure(self, what: str) -> InvalidInput:
+        """Make the error to raise where it is of no use, with the last line of its log."""
+        line = last_line(self.log)
+        return InvalidInput(f"{self.name} {what}{f': {line}' if line else ''} (see {self.log})")
 
-    def ask(self) -> None:
-        """Tell it to end."""
-        if self._process is not None and self.code is None:
+    def terminate(self) -> None:
+        """Ask it to end."""
+        if self._process is not None:
             self._process.terminate()
 
     def kill(self) -> None:
         """End it and all its group at once."""
-        if self._process is not None and self._process.returncode is None:
-            with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait(GRACE_S)
 
     def release(self) -> None:
         """Close the pipes of one that has ended."""
         if self._process is not None:
-            for pipe in (self._process.stdin, self._process.stdout):
-                if pipe is not None:
-                    pipe.close()
+            self._process.close()
             self._process = None
 
 
 def last_line(log: Path) -> str:
-    """Of a file, if there is one, at most 300 characters."""
+    """Return the last line of a file, cut to 300 characters; empty where there is none."""
     with suppress(OSError), log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - 4096))
         lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
         return lines[-1][-300:] if lines else ""
     return ""
+
+
+def main(arguments: list[str]) -> None:
+    """Run a module as `python -m` would, until it ends or standard input does."""
+    Thread(target=_end_with_stdin, name="end with parent", daemon=True).start()
+    sys.argv = arguments
+    runpy.run_module(arguments[0], run_name="__main__", alter_sys=True)
+
+
+def _end_with_stdin() -> None:
+    while os.read(0, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os.killpg(0, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -5,15 +5,53 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
 
 
+def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | None = None) -> None:
+    """Write a file whole or not at all: a crash leaves the old one or the new one.
+
+    A neighbour with `.new` at its name's end is written first, so one process at a time writes a file.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder exists.
+    data : bytes
+    durable : bool
+        Return when the disk has it.
+    mode : int, optional
+        Its permissions; None: those of any new file.
+
+    Raises
+    ------
+    OSError
+    """
+    beside = path.with_name(f"{path.name}.new")
+    if mode is not None:
+        beside.unlink(missing_ok=True)  # whoever opened a neighbour that was readable would read the secret
+    try:
+        with open(beside, "wb", opener=partial(os.open, mode=0o666 if mode is None else mode)) as file:
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)
+            file.write(data)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
+        beside.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        raise
+
+
 @contextmanager
-def written(path: Path, mode: int | None = None) -> Iterator[Path]:
-    """A temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
+def atomic_output(path: Path, mode: int | None = None) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
 
     It gets the permissions `mode`; None: those of any new file.
 
@@ -37,8 +75,8 @@ def written(path: Path, mode: int | None = None) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text file atomically; returns its path."""
-    with written(path) as temporary:
+    """Write a text file atomically and return its path."""
+    with atomic_output(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 

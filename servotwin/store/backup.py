@@ -11,7 +11,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.runtime.files import written
+from servotwin.runtime.files import atomic_output
 from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.schema import REVISION, metadata
@@ -63,7 +63,7 @@ def backup(url: str, to: Path, progress: Progress | None = None) -> RowCounts:
         raise InvalidInput(f"store {source}: there is no such file; give that of a store")
     if to.exists() and to.samefile(source):
         raise InvalidInput(f"backup {to}: is the store itself; give another file")
-    with written(to, PRIVATE) as temporary:
+    with atomic_output(to, PRIVATE) as temporary:
         return _copied(source, temporary, progress)
 
 
@@ -82,7 +82,7 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
     if not backed_up.is_file():
         raise InvalidInput(f"backup {backed_up}: there is no such file")
     _check_free(place)
-    with written(place, PRIVATE) as temporary:
+    with atomic_output(place, PRIVATE) as temporary:
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
             store.execute("UPDATE twins SET posted = posted + ?", (SERIAL_MARGIN,))

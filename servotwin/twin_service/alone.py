@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.locks import lock_beside, locked
 from servotwin.store.engine import parse_address, sqlite_file
-from servotwin.twin_service.secret_file import PRIVATE
 
 
 @contextmanager
@@ -28,34 +26,24 @@ def alone(store: str) -> Iterator[None]:
     if file is None:
         yield
         return
-    with _beside(file) as descriptor:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            stack.enter_context(locked(lock_beside(file)))
+        except BlockingIOError:
             raise InvalidInput(
                 f"store {file}: another twin works on it; end that one first, or let several share a PostgreSQL"
             ) from None
+        except OSError as error:
+            raise InvalidInput(f"{lock_beside(file)}: cannot be made ({error.strerror})") from None
         yield
 
 
 @contextmanager
 def in_turn(file: Path) -> Iterator[None]:
     """Change a file after whoever else is changing it; raises InvalidInput where nothing can be made beside it."""
-    with _beside(file) as descriptor:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(lock_beside(file), wait=True))
+        except OSError as error:
+            raise InvalidInput(f"{lock_beside(file)}: cannot be made ({error.strerror})") from None
         yield
-
-
-@contextmanager
-def _beside(file: Path) -> Iterator[int]:
-    """The file that is locked: not `file`, which is replaced, or loses SQLite's own locks when it is closed."""
-    whole = file.resolve()
-    lock = whole.with_name(f"{whole.name}-lock")
-    try:
-        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, PRIVATE)
-    except OSError as error:
-        raise InvalidInput(f"{lock}: cannot be made ({error.strerror})") from None
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)

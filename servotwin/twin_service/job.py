@@ -1,15 +1,13 @@
-"""What goes to a worker and what comes back, in frames: a length in four bytes, then MessagePack; no pickles."""
+"""What goes to a worker and what comes back, in frames (`runtime.frames`) of MessagePack; no pickles."""
 
 from __future__ import annotations
 
-from struct import Struct as Layout
 from typing import NamedTuple
 
 import msgspec
 
+from servotwin.runtime.frames import frame
 from servotwin.store.records import Lease, WorkResult
-
-LENGTH = Layout("<I")
 
 
 class Start(NamedTuple):
@@ -60,5 +58,4 @@ done_of = msgspec.msgpack.Decoder(Done).decode
 
 def framed(message: Start | Job | Done) -> bytes:
     """The message's frame."""
-    body = _encoder.encode(message)
-    return LENGTH.pack(len(body)) + body
+    return frame(_encoder.encode(message))

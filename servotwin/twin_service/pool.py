@@ -10,9 +10,12 @@ import sys
 from collections.abc import AsyncIterator, Mapping, Sequence
 from functools import partial
 
+from servotwin.runtime.child_process import ChildProcess
+from servotwin.runtime.frames import receive_frame
+from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease
 from servotwin.twin_service import config, mqtt_config
-from servotwin.twin_service.job import LENGTH, Done, Job, Start, done_of, framed
+from servotwin.twin_service.job import Done, Job, Start, done_of, framed
 
 log = logging.getLogger(__name__)
 
@@ -40,23 +43,21 @@ class Worker:
 
     def __init__(self, start: Start, timeout: float, command: Sequence[str] = COMMAND) -> None:
         self._start, self._timeout, self._command = start, timeout, tuple(command)
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: ChildProcess | None = None
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
 
     @property
     def pid(self) -> int | None:
         """Of the process, while there is one."""
-        return None if self._process is None or self._process.returncode is not None else self._process.pid
+        return None if self._process is None or self._process.code is not None else self._process.pid
 
     async def begin(self) -> None:
         """Start the process and wait until it listens; raises WorkerLost."""
         ours, theirs = socket.socketpair()
         with theirs:
             number = theirs.fileno()
-            self._process = await asyncio.create_subprocess_exec(
-                *self._command, str(number), pass_fds=(number,), stdin=asyncio.subprocess.DEVNULL, env=_environment()
-            )
+            self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
         self._reader, self._writer = await asyncio.open_connection(sock=ours)
         self._send(framed(self._start))
         await self._frame(BEGIN_S)
@@ -71,20 +72,16 @@ class Worker:
         """Close the socket, and see the process gone."""
         if self._writer is not None:
             self._writer.close()
-        if self._process is None:
-            return
-        try:
-            await asyncio.wait_for(self._process.wait(), END_S)
-        except TimeoutError:
-            await self.kill()
+        if self._process is not None:
+            await asyncio.to_thread(self._process.wait, END_S)
 
     async def kill(self) -> None:
         """End it at once."""
         if self._writer is not None:
             self._writer.close()
-        if self._process is not None and self._process.returncode is None:
+        if self._process is not None:
             self._process.kill()
-            await self._process.wait()
+            await asyncio.to_thread(self._process.wait, END_S)
 
     def _send(self, frame: bytes) -> None:
         if self._writer is None or self._writer.is_closing():
@@ -95,8 +92,7 @@ class Worker:
         assert self._reader is not None
         try:
             async with asyncio.timeout(timeout):
-                length = LENGTH.unpack(await self._reader.readexactly(LENGTH.size))[0]
-                return await self._reader.readexactly(length)
+                return await receive_frame(self._reader)
         except TimeoutError:
             raise WorkerLost(f"the worker did not answer within {timeout:g} s") from None
         except (asyncio.IncompleteReadError, OSError):
@@ -157,7 +153,7 @@ class Pool:
         self.lost += 1
         self._workers.discard(worker)
         await worker.kill()
-        pause = 0.1
+        backoff = Backoff(Retry(0.1, 2.0, 30.0))
         while True:
             fresh = self._make()
             self._workers.add(fresh)
@@ -167,8 +163,7 @@ class Pool:
                 self._workers.discard(fresh)
                 await fresh.kill()
                 log.error("worker does not start", extra={"why": str(error)})
-                await asyncio.sleep(pause)
-                pause = min(2.0 * pause, 30.0)
+                await asyncio.sleep(backoff.failed())
                 continue
             self._idle.put_nowait(fresh)
             return

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import stat
-import tempfile
 from pathlib import Path
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.files import replace_file
 
 PRIVATE = 0o600
 
@@ -46,17 +45,6 @@ def write_private(path: Path, text: str) -> None:
         It cannot be written.
     """
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
+        replace_file(path, text.encode(), durable=True, mode=PRIVATE)
     except OSError as error:
         raise InvalidInput(f"{path}: cannot be written ({error.strerror or error})") from None
-    beside = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError as error:
-        raise InvalidInput(f"{path}: cannot be written ({error.strerror or error})") from None
-    finally:
-        beside.unlink(missing_ok=True)

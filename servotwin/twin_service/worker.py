@@ -13,10 +13,10 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
 
+from servotwin.runtime.frames import frame, read_frame
 from servotwin.store.records import Lease, WorkResult
-from servotwin.twin_service.job import LENGTH, Done, framed, job_of, start_of
+from servotwin.twin_service.job import Done, framed, job_of, start_of
 
 Work = Callable[[Lease, float], WorkResult]
 
@@ -30,7 +30,7 @@ def main(descriptor: int) -> None:
         if start is None:
             return
         work = _work_of(start)
-        line.sendall(LENGTH.pack(0))
+        line.sendall(frame(b""))
         while (body := read_frame(incoming)) is not None:
             job = job_of(body)
             for claim in job.claims:
@@ -45,16 +45,6 @@ def attempt(work: Work, claim: Lease, now: float) -> Done:
     except Exception as failure:
         outcome, error = None, f"{type(failure).__name__}: {failure}"
     return Done(outcome, error, time.perf_counter() - begun)
-
-
-def read_frame(incoming: BinaryIO) -> bytes | None:
-    """The next message; None where there is none any more."""
-    head = incoming.read(LENGTH.size)
-    if len(head) < LENGTH.size:
-        return None
-    length: int = LENGTH.unpack(head)[0]
-    body = incoming.read(length)
-    return body if len(body) == length else None
 
 
 def _work_of(start: bytes) -> Work:

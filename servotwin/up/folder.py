@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +16,9 @@ import msgspec
 from servotwin.drives.simulated.diary import MachineState, read_state
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
-from servotwin.link.session import Retry
 from servotwin.runtime.files import write_text
+from servotwin.runtime.locks import locked
+from servotwin.runtime.retry import Retry
 from servotwin.twin_service.tokens import Verifiers, write_tokens
 from servotwin.up import enrolment
 from servotwin.up.pacing import FASTEST
@@ -152,28 +152,22 @@ def _fill(path: Path) -> None:
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
     """The lock; what a killed start left behind keeps it until it has ended, which it does by itself."""
-    descriptor = os.open(path / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        end = time.monotonic() + ENDING_S
-        while not _taken(descriptor):
-            holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
-            if _alive(holder) or time.monotonic() > end:
-                raise InvalidInput(f"folder {path}: is in use by another servotwin up (process {holder or 'unknown'})")
-            time.sleep(0.1)
+    end = time.monotonic() + ENDING_S
+    with ExitStack() as stack:
+        while True:
+            try:
+                descriptor = stack.enter_context(locked(path / LOCK))
+                break
+            except BlockingIOError:
+                holder = (path / LOCK).read_bytes()[:32].decode("ascii", "replace").strip()
+                if _alive(holder) or time.monotonic() > end:
+                    told = f"is in use by another servotwin up (process {holder or 'unknown'})"
+                    raise InvalidInput(f"folder {path}: {told}") from None
+                time.sleep(0.1)
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield descriptor
         os.ftruncate(descriptor, 0)
-    finally:
-        os.close(descriptor)
-
-
-def _taken(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _alive(holder: str) -> bool:

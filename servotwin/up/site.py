@@ -42,7 +42,7 @@ class Site:
     @property
     def url(self) -> str:
         """Of the twin."""
-        return self.twin.told or ""
+        return self.twin.address or ""
 
     @property
     def children(self) -> list[Child]:
@@ -65,7 +65,7 @@ class Site:
         """
         first = [self.twin, *self.machines.values()]
         for child in first:
-            child.begin()
+            child.start()
         self._await(first)
         port = self.url.rpartition(":")[2]
         self.twin.command = (*self.twin.command[:-1], port)
@@ -75,7 +75,7 @@ class Site:
             through = f"http://127.0.0.1:{self.forwarder.port}" if servo.outages else self.url
             self._folder.connect(servo, through)
         for child in self.edges.values():
-            child.begin()
+            child.start()
 
     def tend(self, now: float) -> list[str]:
         """Start again what has ended by itself; returns what did.
@@ -87,10 +87,10 @@ class Site:
         """
         ended = []
         for child in self.children:
-            child.hear()
+            child.read_output()
             if child.code is not None:
                 ended.append(f"{child.name} ended by itself (code {child.code}) and was started again")
-                child.again(now)
+                child.restart(now)
         return ended
 
     def end(self) -> None:
@@ -114,13 +114,13 @@ class Site:
 
     def _await(self, children: list[Child]) -> None:
         end = time.monotonic() + READY_S
-        while any(child.told is None for child in children):
+        while any(child.address is None for child in children):
             for child in children:
-                child.hear()
-                if child.told is None and child.code is not None:
-                    raise child.failed(f"does not start (code {child.code})")
+                child.read_output()
+                if child.address is None and child.code is not None:
+                    raise child.failure(f"does not start (code {child.code})")
                 if time.monotonic() > end:
-                    raise child.failed(f"is not ready after {READY_S:.0f} s")
+                    raise child.failure(f"is not ready after {READY_S:.0f} s")
             if self._stopping():
                 raise Stopped
             time.sleep(PIECE_S)
@@ -128,7 +128,7 @@ class Site:
     def _end(self, children: Iterable[Child]) -> None:
         asked = list(children)
         for child in asked:
-            child.ask()
+            child.terminate()
         end = time.monotonic() + END_S
         while any(child.pid is not None and child.code is None for child in asked):
             if time.monotonic() > end or self._stopping() > 1:

@@ -1,4 +1,4 @@
-"""The tick: exactness, decision E16, limits, bumplessness, and the same bits interpreted and compiled."""
+"""The tick: exactness, dead zone (erratum E16), limits, bumplessness, and the same bits interpreted and compiled."""
 
 import random
 from array import array

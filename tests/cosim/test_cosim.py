@@ -11,13 +11,13 @@ from servotwin.cosim import Loop, cosimulate, quantisation
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.limits import Limits
 from servotwin.estimation.estimate import GapStatus
-from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.reproduction import measures
+from servotwin.runtime.retry import Retry
 from servotwin.simulation import Simulation, simulate
 from servotwin.twin.known import known_gap
 from servotwin.twin.settings import TwinSettings
@@ -54,7 +54,7 @@ def test_an_update_lands_three_seconds_after_the_reference_step(controller):
     kinds = [(type(m.message), m.sent, m.arrival) for m in loop.messages[:4]]
     assert kinds == [(Window, 1.0, 2.0), (Acknowledge, 2.0, 3.0), (Update, 2.0, 3.0), (Receipt, 3.0, 4.0)]
     expected = np.zeros(loop.scenario.samples)
-    expected[15000:40000], expected[40000:] = (update.tolerance for update in loop.updates)
+    expected[15000:40000], expected[40000:] = (update.setting.tolerance for update in loop.updates)
     assert np.array_equal(loop.run.tolerance, expected)
 
 
@@ -64,7 +64,7 @@ def test_the_estimate_is_near_the_truth_and_eq_21_follows_it(method, error_deg):
     for update, estimate in zip(loop.updates, loop.estimates, strict=True):
         assert abs(update.gap - GAP) < math.radians(error_deg)
         assert update.gap == estimate.gap
-        assert update.tolerance == PAPER.tolerance_for(estimate.gap, 1.0)
+        assert update.setting.tolerance == PAPER.tolerance_for(estimate.gap, 1.0)
     assert loop.updates[0].window == ("boot-1", 0)
     assert loop.updates[1].base_version == loop.updates[0].version
 
@@ -135,7 +135,9 @@ def test_no_fate_of_the_link_breaks_the_order(seed, controller):
     data_times = {update.version: update.data_time for update in loop.updates}
     assert [data_times[v] for v in versions] == sorted(data_times[v] for v in versions)
     assert sum(loop.accounts.values()) == 2
-    assert loop.run.tolerance[-1] == {u.version: u.tolerance for u in loop.updates}.get(max(versions, default=0), 0.0)
+    assert loop.run.tolerance[-1] == {u.version: u.setting.tolerance for u in loop.updates}.get(
+        max(versions, default=0), 0.0
+    )
 
 
 def test_a_lost_update_and_a_lost_acknowledgement_are_made_good():
@@ -222,7 +224,7 @@ def test_fig_15_with_the_papers_own_estimates():
     errors = [math.degrees(e.gap - float(loop.run.gap[round(e.time * 5000)])) for e in loop.estimates]
     assert all(estimate.ok for estimate in loop.estimates)
     assert max(map(abs, errors)) < 0.5
-    assert -0.35 < np.mean(errors[2:]) < -0.25  # facts E8: what the observer has not forgotten at 0.25 s
+    assert -0.35 < np.mean(errors[2:]) < -0.25  # erratum E8: what the observer has not forgotten at 0.25 s
     settled = [step.settled for step in steps_of(loop)]
     assert not settled[1]
     # The others hang on 0.001 deg of an estimate (erratum E17): over 20 amplitudes within 1 %, at most one more moves.

@@ -11,10 +11,10 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.limits import Limits
 from servotwin.estimation import paper
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.link.session import Retry
 from servotwin.link.simulated import Fate, LinkSettings
 from servotwin.messages import Update
 from servotwin.plant.servo import Servo
+from servotwin.runtime.retry import Retry
 from servotwin.twin.settings import TwinSettings
 
 RATE, DURATION, STEP = 50.0, 60.0, 3.0

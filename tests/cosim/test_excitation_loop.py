@@ -11,12 +11,12 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
-from servotwin.link.session import Retry
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import LongerWindow, Outcome, Probe, Request
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Samples, SignalLike, SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
+from servotwin.runtime.retry import Retry
 
 DEG = math.pi / 180.0
 CALM = Scenario.preset("calm").replace(gap=10.0 * DEG)

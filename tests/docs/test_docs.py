@@ -12,6 +12,7 @@ import pytest
 import servotwin as st
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge_process import config_file as gateway
+from servotwin.reproduction.report import errata
 from servotwin.twin_service.twin_file import read_twin
 
 ROOT = Path(__file__).parents[2]
@@ -61,6 +62,17 @@ def test_named_files_and_tests_exist(page):
     for name, function in FILE.findall(page.read_text()):
         assert (ROOT / name).is_file(), name
         assert not function or function in functions(ROOT / name), f"{name}::{function}"
+
+
+def test_every_erratum_that_is_referred_to_is_listed():
+    """One numbering under one name: `erratum E5` in code, scenarios, tests and pages is entry E5 of errata.toml."""
+    folders = ("servotwin", "tests", "benchmarks", "docs")
+    files = [
+        path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in {".py", ".toml", ".md"}
+    ]
+    named = {name for path in files for name in re.findall(r"\b(?:[Ee]rratum|[Ee]rrata) (E\d+)", path.read_text())}
+    assert len(named) > 10
+    assert named <= {entry["id"] for entry in errata()}
 
 
 def test_every_page_is_reached_from_the_index():

@@ -14,7 +14,6 @@ from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
-from servotwin.link.session import Retry
 from servotwin.messages import (
     Answer,
     Cause,
@@ -24,9 +23,11 @@ from servotwin.messages import (
     Outcome,
     Probe,
     Request,
+    Setting,
     Window,
     unpack_channel,
 )
+from servotwin.runtime.retry import Retry
 
 LIMITS = ProbeLimits(size=1e-3, interval_s=5.0, rest_s=0.5)
 MOVE = Probe(1e-3, 0.4)
@@ -111,7 +112,7 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
     assert answer(agent, request()).taken
-    fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, 0.0)
+    fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
     monkeypatch.setattr(Supervisor, "look", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
     assert fallback in sent

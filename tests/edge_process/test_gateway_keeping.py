@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import FileStore, kept
+from servotwin.edge.store import FileParameterStore, StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.boots import next_boot
 from servotwin.edge_process.keeping import Keeper
@@ -20,6 +20,7 @@ from servotwin.edge_process.log import Troubles
 from servotwin.edge_process.run import first_parameters
 from servotwin.edge_process.ticks import Counts, summary
 from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.messages import Setting
 
 
 @pytest.fixture
@@ -41,10 +42,10 @@ def test_a_cut_that_comes_again_is_kept_and_counted_once(keeper: Keeper, tmp_pat
 
 
 def test_proved_parameters_are_written_or_tried_again(keeper: Keeper, tmp_path: Path) -> None:
-    store = FileStore(tmp_path / "parameters.json")
+    store = FileParameterStore(tmp_path / "parameters.json")
     (tmp_path / "parameters.json.new").mkdir()
-    assert keeper.take(frames.SaveFrame(1, kept(Parameters(1, 1e-4)))) == []
-    assert keeper.take(frames.SaveFrame(2, kept(Parameters(2, 2e-4)))) == [1]
+    assert keeper.take(frames.SaveFrame(1, StoredParameters.of(Parameters(1, Setting(1e-4))))) == []
+    assert keeper.take(frames.SaveFrame(2, StoredParameters.of(Parameters(2, Setting(2e-4))))) == [1]
     assert keeper.faults["parameters not written"] == 2
     (tmp_path / "parameters.json.new").rmdir()
     assert keeper.tend() == [2]
@@ -71,7 +72,7 @@ def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> 
 def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:
     file = tmp_path / "parameters.json"
     assert first_parameters(file) is None
-    FileStore(file).save(Parameters(4, 1e-4))
+    FileParameterStore(file).save(Parameters(4, Setting(1e-4)))
     found = first_parameters(file)
     assert found is not None
     assert found.version == 4

@@ -25,6 +25,7 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import Stop, go_on, permitted
 from servotwin.edge_process.ticks import Counts
 from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.messages import Setting
 
 LAW = Controller(200.0, 0.0, 0.0, 0.1, sample_rate=100.0)
 SETTINGS = AgentSettings("axis-1", UNBOOTED, 100.0, 0.1, limits=Limits(maximum=1e-3), controller=LAW)
@@ -152,14 +153,14 @@ def test_whatever_ends_the_loop_the_drive_gets_the_safe_voltage(error: Exception
 
 def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
     gains = gains_of(LAW)
-    good = Parameters(3, 1e-3, gains=gains)
+    good = Parameters(3, Setting(1e-3, gains))
     assert permitted(good, SETTINGS) is good
     assert permitted(None, SETTINGS) is None
     assert permitted(replace(good, tolerance=1.1e-3), SETTINGS) is None
     assert permitted(good, replace(SETTINGS, limits=Limits(maximum=1e-4))) is None
     assert permitted(good, replace(SETTINGS, controller=None)) is None
     assert permitted(good, replace(SETTINGS, controller=LAW.replace(Kp=20.0))) is None
-    fallback = Parameters(4, 2e-3, fallback=True)
+    fallback = Parameters(4, Setting(2e-3), fallback=True)
     assert permitted(fallback, SETTINGS) is fallback
 
 

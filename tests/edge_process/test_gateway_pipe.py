@@ -1,31 +1,20 @@
-"""Between the control and the link process, without processes: frames, pipe, outlet."""
+"""Between the control and the link process, without processes: frames and outlet."""
 
-import socket
 from collections.abc import Iterator
 
 import pytest
 from gateway_parts import RATE, Far, cut, pumped
-from hypothesis import given
-from hypothesis import strategies as st
 
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
 from servotwin.edge_process.outlet import BEHIND, PipeOutlet
-from servotwin.edge_process.pipe import Pipe
 from servotwin.messages import (
     Acknowledge,
     Hello,
     InvalidMessage,
+    Setting,
     encode,
 )
-
-
-@pytest.fixture
-def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ours, theirs = socket.socketpair()
-    yield ours, theirs
-    ours.close()
-    theirs.close()
 
 
 @pytest.fixture
@@ -33,43 +22,6 @@ def far() -> Iterator[Far]:
     made = Far()
     yield made
     made.close()
-
-
-@given(st.lists(st.binary(max_size=200_000), max_size=5), st.integers(1, 50_000))
-def test_frames_cross_a_pipe_whole_and_in_order(sent: list[bytes], piece: int) -> None:
-    ours, theirs = socket.socketpair()
-    ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, piece)
-    near, far = Pipe(ours), Pipe(theirs)
-    for frame in sent:
-        near.post(frame)
-    came: list[bytes] = []
-    while near.backlog:
-        near.pump()
-        came += far.take()
-    for _ in range(3):
-        came += far.take()
-    assert came == sent
-    near.close()
-    far.close()
-
-
-def test_a_pipe_never_waits_and_knows_when_the_other_end_is_gone(ends: tuple[socket.socket, socket.socket]) -> None:
-    near = Pipe(ends[0])
-    assert near.take() == []
-    near.post(bytes(10_000_000))
-    for _ in range(1000):
-        near.pump()
-    assert near.backlog > 0
-    assert not near.broken
-    ends[1].close()
-    near.pump()
-    assert near.broken
-
-
-def test_a_frame_that_is_longer_than_any_is_refused(ends: tuple[socket.socket, socket.socket]) -> None:
-    ends[1].sendall(b"\xff\xff\xff\xff")
-    with pytest.raises(InvalidMessage, match="4294967295 bytes"):
-        Pipe(ends[0]).take()
 
 
 def test_a_cut_crosses_as_it_is() -> None:
@@ -88,8 +40,8 @@ def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Fa
     box.offer(cut(0), 0.0)
     assert box.waiting
     box.connect(far.near)
-    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, 0.0, ""))
-    box.save(Parameters(3, 1e-4))
+    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
+    box.save(Parameters(3, Setting(1e-4)))
     pumped(box)
     assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
     far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
@@ -146,6 +98,6 @@ def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:
     box.connect(far.near)
     far.pipe.post(b"rubbish")
     while far.pipe.backlog:
-        far.pipe.pump()
+        far.pipe.send()
     assert box.exchange() is None
     assert not box.connected

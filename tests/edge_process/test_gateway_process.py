@@ -24,9 +24,9 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.edge_process.status import read_status
-from servotwin.link.session import Retry
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Hello, Receipt, Refusal, Update, Window
+from servotwin.runtime.retry import Retry
 
 RATE = 500.0
 LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)

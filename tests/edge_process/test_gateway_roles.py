@@ -28,6 +28,7 @@ from servotwin.messages import (
     Probe,
     Receipt,
     Request,
+    Setting,
     Update,
     decode,
     encode,
@@ -135,7 +136,7 @@ def letters(far: Far, kind: type | tuple[type, ...]) -> list[object]:
 
 def update(version: int, tolerance: float, sequence: int = 0, boot: str = "b0") -> Update:
     known = (None, None, (None, None))
-    return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", tolerance, 1e6)
+    return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", Setting(tolerance), 1e6)
 
 
 def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> None:
@@ -299,7 +300,7 @@ def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> Non
     for _ in range(3):
         role.step()
     in_force = edge.agent.parameters
-    assert (in_force.version, in_force.tolerance) == (2, drive.voltages[0].tolerance)
+    assert (in_force.version, in_force.setting.tolerance) == (2, drive.voltages[0].tolerance)
     assert [p.version for p in drive.voltages] == [0]
     pumped(box)
     receipt, fallback = letters(far, (Receipt, Fallback))

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from servotwin.link.courier import Courier
 from servotwin.link.listener import Listener
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
-from servotwin.link.session import Retry
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import Acknowledge, Hello, Refusal, Update, Window, checksum, encode, pack_channel
+from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Update, Window, checksum, encode, pack_channel
+from servotwin.runtime.retry import Retry
 
 RETRY = Retry(1.0, 2.0, 8.0)
 KEY = key_of(verifier_of("secret"))
@@ -210,7 +210,7 @@ def test_nothing_comes_through_with_a_broken_seal(listener: Listener, script: Sc
 
 
 def test_a_message_that_is_none_or_not_for_an_edge_is_passed_over(listener: Listener, script: Script) -> None:
-    hello = encode(Hello("axis-1", "b0", 0.0, 1.0, 0, 0.0, ""))
+    hello = encode(Hello("axis-1", "b0", 0.0, 1.0, 0, Setting(0.0), ""))
     script.news = [sealed(1, b"rubbish"), sealed(2, hello), sealed(3)]
     assert [serial for serial, _ in listener.step().messages] == [3]
     assert listener.counts["not understood"] == 2
@@ -230,7 +230,7 @@ def test_any_bytes_are_survived(data: bytes) -> None:
 
 
 def test_an_update_is_handed_on_as_it_was(listener: Listener, script: Script) -> None:
-    update = Update("axis-1", 1, 0, ("b0", 0), 0.0, None, None, (None, None), "OK", 1e-4, 60.0)
+    update = Update("axis-1", 1, 0, ("b0", 0), 0.0, None, None, (None, None), "OK", Setting(1e-4), 60.0)
     script.news = [sealed(5, encode(update))]
     assert listener.step().messages == [(5, encode(update))]
 

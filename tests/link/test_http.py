@@ -12,11 +12,11 @@ from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
 from servotwin.link.http import HttpTransport
-from servotwin.link.transport import Backoff, Parcel, Refused, Unreachable, squeezed
-from servotwin.messages import Acknowledge, Hello, Refusal, Window, checksum, encode, pack_channel
+from servotwin.link.transport import Parcel, Refused, Unreachable, squeezed
+from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Window, checksum, encode, pack_channel
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
-HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, 0.0, "")
+HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")
 
 
 def window(sequence: int) -> Window:
@@ -244,13 +244,3 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     file.write_bytes(private + made.public_bytes(serialization.Encoding.PEM))
     return file
-
-
-def test_pauses_grow_and_begin_again() -> None:
-    backoff = Backoff(1.0, 2.0, 5.0)
-    assert [backoff.failed(1.0) for _ in range(5)] == [1.0, 2.0, 4.0, 5.0, 5.0]
-    assert backoff.failed(0.0) == 2.5
-    backoff.succeeded()
-    assert backoff.failed(1.0) == 1.0
-    with pytest.raises(InvalidInput):
-        Backoff(2.0, 1.0, 1.0)

@@ -15,10 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
-from servotwin.link.session import Retry, Sender
+from servotwin.link.session import Sender
 from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
 from servotwin.messages import Window, checksum, pack_channel
+from servotwin.runtime.retry import Retry
 
 
 def window(sequence: int, reason: str = "reference", samples: int = 50, boot: str = "b0") -> Window:

@@ -46,7 +46,7 @@ def jumps(theta_d: Array, half: float) -> Array:
 
 @pytest.mark.parametrize("samples", [5001, 10001, 20011])
 def test_the_literal_state_machine_jumps_by_the_full_width_at_reversals(samples: int) -> None:
-    """E3: the speed has turned round, the angle not yet, so Eq 18 closes the gap on its far side at once."""
+    """Erratum E3: the speed has turned round, the angle not yet, so Eq 18 closes the gap on its far side at once."""
     half = math.radians(10.0)
     theta_m, omega_m = fig_7(samples)
     exact, literal = play(theta_m, 2.0 * half, 0.0), state_machine(theta_m, omega_m, half, 0.0)
@@ -70,7 +70,7 @@ def test_the_state_machine_with_finite_difference_speed_is_the_play_operator(sam
 
 
 def test_the_total_gap_is_what_fig_7_calls_20_degrees() -> None:
-    """E2: the lost motion, from one contact to the other, is the whole gap."""
+    """Erratum E2: the lost motion, from one contact to the other, is the whole gap."""
     theta_m, _ = fig_7(50001)
     theta_d = play(theta_m, math.radians(20.0), 0.0)
     offset = theta_m - theta_d
@@ -93,7 +93,7 @@ def test_a_sine_in_closed_form(amplitude: float, share: float) -> None:
 
 
 def test_a_growing_gap_never_moves_the_screw_and_a_shrinking_one_pushes_it() -> None:
-    """E4: the motor rests in contact; the literal rule theta_d = theta_m - side theta_b would drag the screw back."""
+    """Erratum E4: the motor rests in contact; the literal rule would drag the screw back (theta_m - side theta_b)."""
     resting = np.full(101, 1.0)
     growing = np.linspace(0.2, 0.8, 101)
     np.testing.assert_array_equal(play(resting, growing, 0.0), np.full(101, 0.9))

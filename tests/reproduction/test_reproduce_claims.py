@@ -132,7 +132,7 @@ def test_the_bias_with_a_known_gap_is_the_known_one(runs):
     assert [round(step.amplitude * 1e3, 3) for step in found] == [0.009, 0.041] + [0.0] * 8
 
 
-def test_observer_claims_find_the_misprints(runs):
+def test_observer_claims_find_errata_e5_and_e6(runs):
     assert number(finding(runs, "observer-gains"), "fastest pole") == pytest.approx(-2.56e5, rel=1e-3)
     assert number(finding(runs, "observer-gains"), "slowest pole") == pytest.approx(-0.0125, rel=1e-3)
     assert finding(runs, "observer-matrix").verdict is Verdict.NOT_AS_STATED

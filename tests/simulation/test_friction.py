@@ -116,7 +116,7 @@ def test_the_closed_loop_agrees_with_scipy(
 
 @pytest.mark.parametrize("rate", RATES)
 def test_a_stuck_motor_pushes_the_screw_only_while_the_gap_shrinks(rate: float | None) -> None:
-    """The screw is the play's, clamped by a gap that breathes around a motor that never turns (facts E3, E4)."""
+    """The screw is the play's, clamped by a gap that breathes around a motor that never turns (errata E3, E4)."""
     widths = np.radians([10.0, 4.0, 10.0, 2.0, 6.0])
     ramps = [[a, 0.0, 3.0 * (b - a), -2.0 * (b - a)] for a, b in itertools.pairwise(widths)]
     gap = PiecewiseCubic([0.0, 1.0, 2.0, 3.0, 4.0], [*ramps, [widths[-1], 0.0, 0.0, 0.0]])

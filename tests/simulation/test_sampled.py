@@ -268,7 +268,7 @@ RESTING_LAW = PAPER.controller.replace(sample_rate=1e3)
 
 @pytest.mark.parametrize("controller", [PAPER.controller, RESTING_LAW])
 def test_a_gap_moves_a_screw_at_rest_only_by_closing(controller: Controller) -> None:
-    """E4: with the loop open and the motor at rest, the screw is where the narrowest gap so far has pushed it."""
+    """Erratum E4: loop open, motor at rest: the screw is where the narrowest gap so far has pushed it."""
     wide, start = 10.0 * DEGREE, 4.0 * DEGREE
     pieces = [[wide, 0.0, 0.0, 0.0], [wide, -wide, 0.0, 0.0], [0.4 * wide, wide, 0.0, 0.0], [0.5 * wide, 0, 0, 0]]
     gap = PiecewiseCubic([0.0, 0.1, 0.7, 1.2], pieces)

@@ -21,8 +21,8 @@ from mosquitto import free_port
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.edge_process.status import read_status
-from servotwin.link.session import Retry
 from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.runtime.retry import Retry
 from servotwin.up.enrolment import Enrolment, enroll
 
 RATE, WINDOW_S = 500.0, 0.8

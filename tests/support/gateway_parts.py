@@ -12,7 +12,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process import frames
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.pipe import Pipe
+from servotwin.runtime.frames import FrameSocket
 
 RATE = 100.0
 LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
@@ -30,17 +30,17 @@ class Far:
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
-        self.pipe = Pipe(theirs)
-        self.near = Pipe(ours)
+        self.pipe = FrameSocket(theirs)
+        self.near = FrameSocket(ours)
 
     def heard(self) -> list[frames.ToLink]:
-        return [frames.to_link(data) for data in self.pipe.take()]
+        return [frames.to_link(data) for data in self.pipe.receive()]
 
     def say(self, *said: frames.ToControl) -> None:
         for frame in said:
             self.pipe.post(frames.encode(frame))
         while self.pipe.backlog:
-            self.pipe.pump()
+            self.pipe.send()
 
     def close(self) -> None:
         self.pipe.close()

@@ -59,9 +59,12 @@ def write_numbers(found: StabilityMap, directory: Path) -> None:
     names, count = found.columns, len(found.axes)
     arrays = {name: np.array(values) for name, (_, values) in zip(names, found.axes, strict=False)}
     arrays |= {name: found.grid(measure) for name, measure in zip(names[count:], MEASURES, strict=True)}
-    with files.written(directory / "map.npz") as temporary:
+    with files.atomic_output(directory / "map.npz") as temporary:
         np.savez(temporary, allow_pickle=False, fingerprint=np.array(found.settings.fingerprint), **arrays)
-    with files.written(directory / "map.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with (
+        files.atomic_output(directory / "map.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         csv.writer(file).writerows([names, *_lines(found)])
 
 

@@ -56,7 +56,7 @@ class Store:
     def keep(self, number: int, measures: Measures) -> None:
         """Write one piece, whole or not at all."""
         values = {name: getattr(measures, name) for name in MEASURES}
-        with files.written(self._path(number)) as temporary:
+        with files.atomic_output(self._path(number)) as temporary:
             np.savez(temporary, allow_pickle=False, fingerprint=np.array(self.settings.fingerprint), **values)
 
     def kept(self, number: int) -> Measures | None:

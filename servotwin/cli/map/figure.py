@@ -56,7 +56,7 @@ def save(found: StabilityMap, directory: Path) -> Path:
     path = directory / "map.png"
     with style.look():
         figure = draw(found)
-        with files.written(path) as temporary:
+        with files.atomic_output(path) as temporary:
             figure.savefig(temporary, format="png", dpi=150)
     return path
 

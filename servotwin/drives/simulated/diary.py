@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.files import replace_file
 
 if TYPE_CHECKING:
     from servotwin.drives.simulated.pace import Pace
@@ -119,7 +120,7 @@ def read_state(path: str | os.PathLike[str]) -> MachineState | None:
 
 def write_state(path: Path, state: MachineState) -> None:
     """Replace what is kept, whole or not at all; raises OSError."""
-    _replace(path, msgspec.json.format(msgspec.json.encode(state)) + b"\n")
+    replace_file(path, msgspec.json.format(msgspec.json.encode(state)) + b"\n")
 
 
 def read_speed(path: Path) -> float | None:
@@ -133,10 +134,4 @@ def read_speed(path: Path) -> float | None:
 
 def write_speed(path: Path, speed: float) -> None:
     """Ask a machine for a speed; raises OSError."""
-    _replace(path, f"{speed!r}\n".encode())
-
-
-def _replace(path: Path, data: bytes) -> None:
-    beside = path.with_name(f"{path.name}.new")
-    beside.write_bytes(data)
-    beside.replace(path)
+    replace_file(path, f"{speed!r}\n".encode())

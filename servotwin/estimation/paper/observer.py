@@ -1,4 +1,4 @@
-"""The linear state observer of the paper's Appendix, for any number of masses, with its misprints corrected.
+"""The linear state observer of the paper's Appendix, for any number of masses, with errata E5 and E6 corrected.
 
 It rebuilds the last mass's position q3 from the screw's angle theta_d and the measured q3, whatever the state at the
 start of a window was: what it does not know of that state dies out like exp(-alpha t).

@@ -144,5 +144,5 @@ def spelled(name: str, value: object) -> Iterator[tuple[str, str]]:
 
 
 def _write(path: Path, table: TableFile) -> None:
-    with files.written(path) as temporary:
+    with files.atomic_output(path) as temporary:
         temporary.write_bytes(_encoder.encode(table))

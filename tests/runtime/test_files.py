@@ -14,7 +14,7 @@ def names(folder):
 
 
 def write_half(path, error):
-    with files.written(path) as temporary:
+    with files.atomic_output(path) as temporary:
         temporary.write_text("half")
         raise error
 
@@ -82,3 +82,24 @@ def test_a_directory_that_takes_no_file_is_refused_before_anything_is_computed(t
     monkeypatch.setattr(files.tempfile, "TemporaryFile", refuse)
     with pytest.raises(InvalidInput, match="may not be written to"):
         files.check_file(tmp_path / "run.csv", (".csv",))
+
+
+def test_a_replaced_file_is_private_from_the_first_byte(tmp_path):
+    path = tmp_path / "token"
+    (tmp_path / "token.new").write_text("")  # left behind, and readable
+    files.replace_file(path, b"secret", durable=True, mode=0o600)
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"secret", 0o600)
+
+
+def test_a_replacement_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "state.json"
+    files.replace_file(path, b"old")
+
+    def crash(_descriptor):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(files.os, "fsync", crash)
+    with pytest.raises(OSError, match="Input/output"):
+        files.replace_file(path, b"new", durable=True)
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["state.json"]

@@ -1,0 +1,58 @@
+"""Retries: when to try again, and pauses that grow from one failure to the next."""
+
+from dataclasses import dataclass, field
+from math import inf
+
+from servotwin.errors import InvalidInput
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """Pauses between tries: `first_s`, then each `factor` times the last, up to `longest_s`.
+
+    Where an answer takes a while, `first_s` should exceed the round trip, or everything is sent twice.
+    """
+
+    first_s: float = 5.0
+    factor: float = 2.0
+    longest_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.first_s <= self.longest_s < inf:
+            raise InvalidInput(f"retry from {self.first_s!r} s to {self.longest_s!r} s: must be positive and in order")
+        if not 1.0 <= self.factor < inf:
+            raise InvalidInput(f"retry factor = {self.factor!r}: must be at least 1")
+
+
+@dataclass(slots=True)
+class Backoff:
+    """Failures in a row, and the pause after each.
+
+    Parameters
+    ----------
+    retry : Retry
+    failures : int
+        In a row, so far.
+    """
+
+    retry: Retry = field(default_factory=Retry)
+    failures: int = 0
+
+    def failed(self, chance: float = 1.0) -> float:
+        """Count a failure and return the pause after it, s.
+
+        Parameters
+        ----------
+        chance : float
+            Uniform in 0 .. 1: the pause is cut to between half and the whole of its length, so that many clients do
+            not come back all at once.
+        """
+        pause = self.retry.first_s
+        for _ in range(min(self.failures, 64)):
+            pause = min(pause * self.retry.factor, self.retry.longest_s)
+        self.failures += 1
+        return pause * (0.5 + 0.5 * chance)
+
+    def succeeded(self) -> None:
+        """Begin again with the first pause."""
+        self.failures = 0
