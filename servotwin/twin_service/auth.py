@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import hmac
 import logging
-import os
 import re
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from servotwin.config.table import Table, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN, Refusal
-from servotwin.runtime.files import written
+from servotwin.runtime.files import replace_file
+from servotwin.runtime.locks import lock_beside, locked
 from servotwin.twin_service.limits import RateLimiter, RequestRejected
 
 log = logging.getLogger(__name__)
@@ -225,6 +226,17 @@ def write_tokens(path: Path, verifiers: Verifiers) -> None:
     write_private(path, _HEAD + "\n".join(parts))
 
 
+@contextmanager
+def tokens_locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a file of tokens, to read and replace it; raises InvalidInput where no lock can be made."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(lock_beside(path), wait=True))
+        except OSError as error:
+            raise InvalidInput(f"{lock_beside(path)}: cannot be made ({error.strerror})") from None
+        yield
+
+
 def _read_verifiers(table: Table) -> dict[str, bytes]:
     return {name: _read_verifier(table, name) for name in table.values}
 
@@ -269,7 +281,7 @@ def check_private(path: Path) -> None:
 
 def write_private(path: Path, text: str) -> None:
     """Write a file of mode 0600 atomically and durably; raises InvalidInput where that fails."""
-    with written(path, PRIVATE) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        replace_file(path, text.encode(), durable=True, mode=PRIVATE)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be written ({error.strerror or error})") from None

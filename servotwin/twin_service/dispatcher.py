@@ -16,9 +16,9 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import EvidenceRecord, Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.job import Done
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.worker import LeaseResult
 from servotwin.twin_service.worker_pool import WorkerLost, WorkerPool, WorkerProcess
 
 log = logging.getLogger(__name__)
@@ -232,17 +232,17 @@ class Dispatcher:
         await self._pool.replace(worker, why)
         self.wake()
 
-    async def _complete(self, lease: Lease, done: Done, now: float) -> WorkResult | None:
+    async def _complete(self, lease: Lease, done: LeaseResult, now: float) -> WorkResult | None:
         """Commit a worker's result; None: there is none, and the servo is to be released."""
         self._metrics.work.observe(done.seconds)
-        if done.outcome is None:
+        if done.result is None:
             self._fail(lease, done.error)
             return None
-        if not await self._committed(done.outcome):
+        if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
-        self._report(lease, done.outcome, done.seconds, now)
-        return done.outcome
+        self._report(lease, done.result, done.seconds, now)
+        return done.result
 
     async def _committed(self, result: WorkResult) -> bool:
         counts = self._metrics.results

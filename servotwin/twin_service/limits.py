@@ -157,9 +157,7 @@ class RateLimiter:
         if len(self._levels) > MAX_SERVOS:
             self._levels.popitem(last=False)
         if level < 1.0:
-            raise RequestRejected(
-                Refusal.TOO_MANY, f"more than {self._rate:g} messages per s of servo {servo!r}"
-            )
+            raise RequestRejected(Refusal.TOO_MANY, f"more than {self._rate:g} messages per s of servo {servo!r}")
 
 
 class _SampleTime(NamedTuple):
