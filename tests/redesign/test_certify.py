@@ -91,9 +91,9 @@ def test_equal_calls_draw_equal_members() -> None:
     [
         ({"k": 1.0}, "uncertainty k = 1.0"),
         ({"gap": (2.0, 1.0)}, "uncertainty gap = \\(2.0, 1.0\\) rad"),
-        ({"step": (0.0, 1e-3)}, "steps greater than 0"),
+        ({"step": (0.0, 1e-3)}, "must be two numbers, each a positive number"),
         ({"input_bias": (0.0, math.inf)}, "input_bias = \\(0.0, inf\\) V"),
-        ({"friction": (-1e-3, 0.0)}, "friction must be 0 or more"),
+        ({"friction": (-1e-3, 0.0)}, "must be two numbers, each a number, at least 0"),
     ],
 )
 def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:

@@ -1,11 +1,64 @@
-"""When a cut window is worth sending: thresholds and periods; with the structure's model, all that the edge needs."""
+"""Settings of the novelty filter: rules, and the structure's response at the sample rate."""
 
 from dataclasses import dataclass
-from math import inf, radians
+from importlib.util import find_spec
+from math import inf, isfinite, radians
+from typing import NamedTuple
 
-from servotwin.edge.novelty.model import NoveltyModel
 from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
+
+_NUMERIC = "numpy", "scipy", "numba"
+
+
+class ResponseMode(NamedTuple):
+    """Pole of the structure (one of a conjugate pair): exp(pole T), and the gain that reads the position off its state.
+
+    The position is the real part of gain times state.
+    """
+
+    decay: complex
+    gain: complex
+
+
+@dataclass(frozen=True, slots=True)
+class NoveltyModel:
+    """Response of the structure, screw angle to position of the last mass, at one sample rate.
+
+    Parameters
+    ----------
+    rate : float
+        Hz.
+    modes : tuple of ResponseMode
+    direct, static_gain : float
+        m/rad: position over angle at once, and at rest.
+    unseen : float
+        s: what the screw does so late in a window has not reached the last mass.
+    factor : int
+        Samples per sample that is judged.
+    """
+
+    rate: float
+    modes: tuple[ResponseMode, ...]
+    direct: float
+    static_gain: float
+    unseen: float
+    factor: int = 1
+
+    def __post_init__(self) -> None:
+        numbers = [part for mode in self.modes for value in mode for part in (value.real, value.imag)]
+        if not all(map(isfinite, (*numbers, self.direct, self.static_gain))):
+            raise InvalidInput("novelty model: modes and gains must be finite")
+        if not self.modes or max(abs(mode.decay) for mode in self.modes) >= 1.0:
+            raise InvalidInput("novelty model: needs modes, all of which decay")
+        if not (isfinite(self.rate) and self.rate > 0.0):
+            raise InvalidInput(f"novelty model sample rate = {self.rate!r} Hz: must be greater than 0")
+        if self.static_gain == 0.0:
+            raise InvalidInput("novelty model static gain = 0 m/rad: must be another number")
+        if not 0.0 <= self.unseen < 1e6:
+            raise InvalidInput(f"novelty model unseen = {self.unseen!r} s: must be at least 0")
+        if self.factor < 1:
+            raise InvalidInput(f"novelty model decimation = {self.factor!r} samples: must be at least 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,14 +162,25 @@ class NoveltySettings:
         """Time after a window at which one is cut though the reference rests, s."""
         return self.rules.look_s
 
-    def check_rate(self, sample_rate: float) -> None:
-        """Raise InvalidInput where the model is for another rate (Hz)."""
+    def check(self, sample_rate: float) -> None:
+        """Raise InvalidInput where the model is for another rate (Hz), or a numerical library is not installed."""
+        missing = [name for name in _NUMERIC if find_spec(name) is None]
+        if missing:
+            raise InvalidInput(
+                f"[novelty] needs {', '.join(missing)}: install servotwin with its dependencies, or leave the table out"
+            )
         if self.model.rate != sample_rate:
             rates = f"{self.model.rate!r} Hz for samples at {sample_rate!r} Hz"
             raise InvalidInput(f"agent novelty model = {rates}: must be equal")
 
     def start(self, saved: bytes | None = None) -> WindowFilter:
-        """Start the filter for a new boot; raises InvalidInput where `saved` is not a state of it."""
-        from servotwin.edge.novelty.judge import Novelty, loads
+        """Start the filter for a new boot.
 
-        return Novelty(self, None if saved is None else loads(saved))
+        Raises
+        ------
+        InvalidInput
+            `saved` is not a state of this filter.
+        """
+        from servotwin.novelty.detector import NoveltyDetector, loads
+
+        return NoveltyDetector(self, None if saved is None else loads(saved))

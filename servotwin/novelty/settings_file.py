@@ -8,8 +8,7 @@ from math import pi
 from typing import Any
 
 from servotwin.config.table import Reader, Table, given, part
-from servotwin.edge.novelty.model import Mode, NoveltyModel
-from servotwin.edge.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.novelty.settings import NoveltyModel, NoveltyRules, NoveltySettings, ResponseMode
 
 DEG = pi / 180.0
 _ANGLES = ("resolution", "worth", "margin", "travel", "settle", "outlier")
@@ -49,7 +48,7 @@ def model(table: Table) -> NoveltyModel:
         raise table.invalid("decay_real", f"as many numbers as gain_real has, {len(gain)}")
     return NoveltyModel(
         table.number("sample_rate_hz", positive=True),
-        tuple(Mode(*pair) for pair in zip(decay, gain, strict=True)),
+        tuple(ResponseMode(*pair) for pair in zip(decay, gain, strict=True)),
         table.number("direct_m_per_rad"),
         table.number("static_gain_m_per_rad"),
         table.number("unseen_s", minimum=0.0),

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from servotwin.edge.novelty.chart import Chart, begun, look, normal, relearning, summed
-from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.errors import InvalidInput
+from servotwin.novelty.chart import Chart, add_window, normal, restarted, summed, with_fewer_windows
+from servotwin.novelty.settings import NoveltyRules
 
 STD = math.radians(0.01)
 RULES = NoveltyRules(resolution=STD)
@@ -43,7 +43,7 @@ def after(gaps: np.ndarray, rules: NoveltyRules = RULES, std: float = STD, chart
     """Which windows were news."""
     chart, news = chart or Chart(), []
     for number, gap in enumerate(gaps.tolist()):
-        seen = look(chart, gap, std, rules)
+        seen = add_window(chart, gap, std, rules)
         chart = seen.chart
         if seen.sudden or seen.slow:
             news.append(number)
@@ -100,8 +100,8 @@ def test_recursive_residuals_are_independent_and_of_one_variance() -> None:
     for _ in range(400):
         chart, found = Chart(bends=(0.6744897501960817,) * 40), []
         for gap in rng.normal(1.0, STD, 12).tolist():
-            seen = look(chart, gap, STD, rules)
-            chart = begun(seen.chart, seen.chart.gap, seen.chart.weight)
+            seen = add_window(chart, gap, STD, rules)
+            chart = restarted(seen.chart, seen.chart.gap, seen.chart.weight)
             chart = Chart(chart.gap, chart.weight, bends=(0.6744897501960817,) * 40)
             found.append(seen.change)
         changes.append(found[1:])
@@ -120,12 +120,12 @@ def test_nothing_below_the_worth_is_news_and_its_sum_is() -> None:
 def test_an_update_leaves_a_few_windows_of_the_baseline() -> None:
     chart = Chart()
     for gap in np.random.default_rng(12).normal(0.2, STD, 100).tolist():
-        chart = look(chart, gap, STD, RULES).chart
-    again = relearning(chart, 5)
+        chart = add_window(chart, gap, STD, RULES).chart
+    again = with_fewer_windows(chart, 5)
     assert again.gap == chart.gap
     assert again.weight * chart.last[-1].variance == pytest.approx(5.0)
     assert (again.up, again.down, again.bends) == (0.0, 0.0, chart.bends)
-    assert look(again, chart.gap + 12.0 * STD, STD, RULES).sudden
+    assert add_window(again, chart.gap + 12.0 * STD, STD, RULES).sudden
 
 
 @pytest.mark.parametrize("freedom", [10.0, 18.0, 50.0])

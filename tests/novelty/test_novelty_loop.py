@@ -15,16 +15,16 @@ import servotwin as st
 from benchmarks.novelty.command import QUICK, charted, saved
 from benchmarks.novelty.loops import Case, account, summary
 from benchmarks.novelty.windows import CONDITIONS
-from servotwin.commissioning.novelty import model_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent, Outgoing
-from servotwin.edge.novelty.judge import FIRST, NEWS, PERIODIC
-from servotwin.edge.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.edge.outlet import WITHHELD
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.messages import Window
+from servotwin.novelty.detector import FIRST, NEWS, PERIODIC
+from servotwin.novelty.score import model_of
+from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.servo import Servo
 
 GAP = math.radians(10.0)

@@ -1,4 +1,4 @@
-"""The change of the gap, window by window: a baseline that learns itself, and a two-sided cumulative sum on top.
+"""Control chart of the gap, window by window: a learnt baseline and a two-sided cumulative sum.
 
 The baseline is the weighted mean of all windows since it began; a window is compared with those before it, and then
 learnt. Such recursive residuals are independent with one variance, however few windows the baseline stands on, so the
@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 from msgspec import Struct, structs
 
-from servotwin.edge.novelty.settings import NoveltyRules
+from servotwin.novelty.settings import NoveltyRules
 
 _QUARTILE = 0.6744897501960817  # of a standard normal: the median of its size
 _PRIOR, _MOST = 5, 120  # second differences that the stated spread counts as; that are kept
 _TRUSTED, _EACH = 10.0, 0.2  # degrees of freedom of the stated spread, and of one second difference in a median
 
 
-class Seen(Struct, frozen=True, array_like=True):
+class ChartPoint(Struct, frozen=True, array_like=True):
     """A window's gap (rad) and its own variance (rad^2)."""
 
     gap: float
@@ -28,7 +28,7 @@ class Seen(Struct, frozen=True, array_like=True):
 
 
 class Chart(Struct, frozen=True):
-    """What was learnt.
+    """Baseline, cumulative sums and scatter.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Chart(Struct, frozen=True):
         rad, the baseline where it began.
     up, down : float
         Cumulative sums, standard deviations.
-    last : tuple of Seen
+    last : tuple of ChartPoint
         The last two windows, whatever the baseline.
     bends : tuple of float
         Sizes of the last second differences, standard deviations.
@@ -49,7 +49,7 @@ class Chart(Struct, frozen=True):
     anchor: float = 0.0
     up: float = 0.0
     down: float = 0.0
-    last: tuple[Seen, ...] = ()
+    last: tuple[ChartPoint, ...] = ()
     bends: tuple[float, ...] = ()
 
     @property
@@ -63,7 +63,7 @@ class Chart(Struct, frozen=True):
         return _TRUSTED + _EACH * len(self.bends)
 
 
-class Looked(NamedTuple):
+class ChartResult(NamedTuple):
     """The chart with a window learnt, the window's standardised change, and whether it is news by either limit.
 
     Where it is, the baseline has begun anew with it.
@@ -75,7 +75,7 @@ class Looked(NamedTuple):
     slow: bool
 
 
-def look(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> Looked:
+def add_window(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> ChartResult:
     """Compare a window (gap and standard deviation, rad) with the baseline, then learn it."""
     own = std * std + rules.resolution * rules.resolution
     variance = max(own * chart.factor * chart.factor, rules.resolution * rules.resolution)
@@ -83,11 +83,11 @@ def look(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> Looked:
     if chart.weight > 0.0:
         change = normal((gap - chart.gap) / sqrt(variance + 1.0 / chart.weight), chart.freedom)
         up, down = summed(chart.up, chart.down, change, rules.allowance)
-    after = structs.replace(_bent(chart, Seen(gap, own)), up=up, down=down)
+    after = structs.replace(_bent(chart, ChartPoint(gap, own)), up=up, down=down)
     sudden, slow = abs(change) > rules.score_limit, max(up, down) > rules.cusum_limit
     if (sudden or slow) and abs(gap - chart.anchor) >= rules.worth:
-        return Looked(begun(after, gap, 1.0 / variance), change, sudden, slow)
-    return Looked(_learnt(after, gap, variance), change, sudden=False, slow=False)
+        return ChartResult(restarted(after, gap, 1.0 / variance), change, sudden, slow)
+    return ChartResult(_learnt(after, gap, variance), change, sudden=False, slow=False)
 
 
 def summed(up: float, down: float, change: float, allowance: float) -> tuple[float, float]:
@@ -95,7 +95,7 @@ def summed(up: float, down: float, change: float, allowance: float) -> tuple[flo
     return max(0.0, up + change - allowance), max(0.0, down - change - allowance)
 
 
-def _bent(chart: Chart, new: Seen) -> Chart:
+def _bent(chart: Chart, new: ChartPoint) -> Chart:
     """With one more second difference."""
     last = (*chart.last, new)[-3:]
     if len(last) < 3:
@@ -113,15 +113,15 @@ def _learnt(chart: Chart, gap: float, variance: float) -> Chart:
     return structs.replace(chart, gap=mean, weight=weight, anchor=chart.anchor if chart.weight > 0.0 else mean)
 
 
-def begun(chart: Chart, gap: float = 0.0, weight: float = 0.0) -> Chart:
+def restarted(chart: Chart, gap: float = 0.0, weight: float = 0.0) -> Chart:
     """Another baseline; what was learnt of the spread stays, sums begin anew."""
     return structs.replace(chart, gap=gap, weight=weight, anchor=gap, up=0.0, down=0.0)
 
 
-def relearning(chart: Chart, windows: int) -> Chart:
+def with_fewer_windows(chart: Chart, windows: int) -> Chart:
     """The same baseline, to count as no more than so many windows like the last: the next ones decide about it."""
     most = windows / chart.last[-1].variance if chart.last else chart.weight
-    return begun(chart, chart.gap, min(chart.weight, most))
+    return restarted(chart, chart.gap, min(chart.weight, most))
 
 
 def normal(student: float, freedom: float) -> float:
