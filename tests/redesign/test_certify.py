@@ -19,7 +19,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import STILL, Trial, assess
+from servotwin.redesign.certified.assess import STILL, Trial, assess, nearness
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
@@ -103,6 +103,16 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
         Uncertainty().replace(kk=0.1)
 
 
+def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
+    """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
+    held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)
+    found = certify(held, Uncertainty(gap=gaps(0, 5)), SMALL, SHORT)
+    assert isinstance(found, Refusal)
+    assert "no gain crossover" in found.reason
+    assert found.best is not None
+    assert (found.best.crossover, found.best.phase_margin) == (0.0, math.pi)
+
+
 # --- measures
 
 
@@ -129,6 +139,11 @@ def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
         last = error[-round(SHORT.last * SHORT.rate) :]
         assert found.ripple[p, c] == pytest.approx(0.5 * np.ptp(last), rel=1e-6, abs=1e-13)
         assert found.tail[p, c] == pytest.approx(np.abs(last).max(), rel=1e-6, abs=1e-13)
+        beyond = max(last.mean() - error.min(), 0.0) / (step + 2.0 * abs(last.mean()))
+        assert found.overshoot[p, c] == pytest.approx(beyond, rel=1e-6, abs=1e-12)
+        near = nearness(setting, members.input_bias, members.step.max())[p, c]
+        arrived = 1 + np.max(np.flatnonzero(np.abs(error) > near), initial=-1)
+        assert found.settling[p, c] == pytest.approx(arrived / SHORT.rate, abs=1e-12)
         assert found.cost[p, c] == pytest.approx(np.abs(error).mean() * SHORT.duration / step, rel=1e-6)
         assert found.effort[p, c] == pytest.approx(
             np.sqrt(np.mean(run.voltage[-last.size :] ** 2)), rel=1e-6, abs=1e-12

@@ -85,7 +85,8 @@ class Certificate:
     within : float
         m: that error, where it is largest.
     Ms, crossover, phase_margin : float
-        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad.
+        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain
+        is below one at every frequency has the crossover 0 and the margin pi.
     saturated : bool
         Whether the voltage limit was met by a member.
     looked_at : int
