@@ -8,25 +8,25 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias, Unpack
 
 import numpy as np
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps, read, values_of
-from servotwin.control.controller import Controller
+from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
+from servotwin.plant import loop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
-from servotwin.plant.motor import motor_matrices
-from servotwin.plant.sampled import sampled_poles
-from servotwin.plant.signals import Array
-from servotwin.plant.structure import Chain, chain
+from servotwin.plant.motor import Motor
+from servotwin.plant.signals import Array, check_gap
+from servotwin.plant.structure import Chain, Structure, chain
+from servotwin.runtime.notebook import html_table
 
 PerMass: TypeAlias = float | tuple[float, ...]
 _PLANT = (
@@ -47,8 +47,27 @@ class Control(NamedTuple):
     closed_loop: Any
 
 
+class ServoChanges(ControllerChanges, total=False):
+    """The keywords of `Servo.replace`: the fields of `Servo` and of its `Controller`, each of them optional."""
+
+    m: PerMass
+    k: PerMass
+    c: PerMass
+    J: float
+    p: float
+    L: float
+    R: float
+    k_T: float
+    k_B: float
+    controller: Controller
+    n: int
+    k_d: float
+    encoder_resolution: float
+    position_resolution: float
+
+
 @settings("servo")
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Servo:
     """A position servo: DC motor, lead screw, chain of n masses, sensors and its default controller.
 
@@ -115,9 +134,20 @@ class Servo:
             if name != "n":
                 object.__setattr__(self, name, tuple(map(float, value)) if isinstance(value, tuple) else float(value))
 
+    def __repr__(self) -> str:
+        """Preset or model version, masses, screw and controller in one line."""
+        name = next((repr(name) for name in PRESETS if _preset_version(name) == self.version), "other")
+        screw = "rigid" if self.rigid else f"k_d={self.k_d:g} N/m"
+        return f"<Servo {name}, model {self.version}: {self.n} masses, {screw} screw, {self.controller!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        rows = {one.name: f"{getattr(self, one.name)} {one.unit}" for one in items_of(type(self))}
+        return html_table(f"Servo, model {self.version}", rows)
+
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
-        """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 say how they differ)."""
+        """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 says how they differ)."""
         if name not in PRESETS:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
@@ -159,14 +189,26 @@ class Servo:
         """The servo as TOML that `load` reads back to an equal servo."""
         return dumps(values_of(self, only=(*_PLANT, "controller")))
 
-    def replace(self, **changes: Any) -> Servo:
-        """A copy with some values changed; the controller's own names (Kp, Ki, Kd, Tf, voltage_limit, ...) go to it."""
+    def replace(self, **changes: Unpack[ServoChanges]) -> Servo:
+        """A copy with some values changed, validated again.
+
+        Parameters
+        ----------
+        **changes
+            Any fields of the servo or of its controller, by name: ``servo.replace(k=9e3, Ki=500.0)``.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown, or a value is out of its range.
+        """
         _refuse_unknown(changes)
-        for_controller = {key: changes.pop(key) for key in _CONTROLLER_FIELDS if key in changes}
-        changed = dataclasses.replace(self, **changes)
+        for_plant = {key: value for key, value in changes.items() if key not in _CONTROLLER_FIELDS}
+        for_controller = {key: value for key, value in changes.items() if key in _CONTROLLER_FIELDS}
+        changed = dataclasses.replace(self, **for_plant)  # type: ignore[arg-type]
         if not for_controller:
             return changed
-        return dataclasses.replace(changed, controller=changed.controller.replace(**for_controller))
+        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **for_controller))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
@@ -174,11 +216,12 @@ class Servo:
         Raises
         ------
         InvalidInput
-            The gap or k_dz is negative or not finite.
+            The gap or k_dz is negative or not finite, or the gap is above one turn.
         """
         for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
             if not (math.isfinite(value) and value >= 0.0):
                 raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
+        check_gap(gap)
         return k_dz * self.p * gap
 
     @property
@@ -198,7 +241,7 @@ class Servo:
 
     @property
     def rigid(self) -> bool:
-        """Whether the first mass follows the screw (k_d infinite)."""
+        """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
     @property
@@ -214,35 +257,38 @@ class Servo:
         """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
         return self._matrices[1]
 
+    @property
+    def _motor(self) -> Motor:
+        return Motor(self.J, self.L, self.R, self.k_T, self.k_B)
+
+    @property
+    def _structure(self) -> Structure:
+        return Structure(self.masses, self.stiffnesses, self.dampings, self.k_d)
+
     @cached_property
     def _matrices(self) -> tuple[Chain, tuple[Array, Array, Array]]:
         """Structure and motor, computed once: an automaton asks for them dozens of times."""
-        structure = chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
-        return structure, motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
+        return chain(self.masses, self.stiffnesses, self.dampings, self.k_d), self._motor.matrices()
 
     def G1(self) -> LinearSystem:
         """Voltage to the unloaded motor's angle (Eq 8)."""
-        return linear.motor(self)
+        return loop.motor_system(self._motor)
 
     def G2(self) -> LinearSystem:
         """Angle of the screw to the position of the last mass (Eq 13)."""
-        return linear.structure(self)
+        return loop.structure_system(self._structure, self.p)
 
     def plant(self) -> LinearSystem:
         """Voltage to the position of the last mass without a gap; G1 G2 with a rigid screw."""
-        return linear.plant(self)
+        return loop.plant_system(self._motor, self._structure, self.p)
 
     def loop(self, controller: Controller | None = None) -> LinearSystem:
         """L = C_PIDF G1 G2 and, where the controller has one, the loop filter; in continuous time, without a gap."""
-        law = controller or self.controller
-        forward = linear.series(linear.pidf(law), linear.plant(self))
-        return linear.series(forward, linear.loop_filter(law))
+        return loop.open_loop(self.plant(), controller or self.controller)
 
     def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
         """Reference to the position of the last mass (Eq 15), in continuous time, without a gap."""
-        law = controller or self.controller
-        forward = linear.series(linear.pidf(law), linear.plant(self))
-        return linear.feedback(forward, linear.loop_filter(law))
+        return loop.closed_loop(self.plant(), controller or self.controller)
 
     def margins(self, controller: Controller | None = None) -> Margins:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
@@ -257,7 +303,7 @@ class Servo:
             With the fastest growing pole.
         """
         law = controller or self.controller
-        worst = _worst_pole(self, law)
+        worst = loop.slowest_pole(self.plant(), law)
         if not worst.real < 0.0:
             rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
             gains = f"Kp = {law.Kp:g} V/m, Ki = {law.Ki:g} V/(m s), Kd = {law.Kd:g} V s/m, Tf = {law.Tf:g} s{rate}"
@@ -268,17 +314,13 @@ class Servo:
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
-        systems = (self.G1(), self.G2(), linear.pidf(self.controller), self.loop(), self.closed_loop())
+        systems = (self.G1(), self.G2(), loop.pidf(self.controller), self.loop(), self.closed_loop())
         return Control(*(system.to_control() for system in systems))
 
 
-def _worst_pole(servo: Servo, controller: Controller) -> complex:
-    """The pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
-    if controller.sample_rate is None:
-        poles = servo.closed_loop(controller).poles()
-        return complex(poles[np.argmax(poles.real)])
-    poles = sampled_poles(servo, controller)
-    return complex(np.log(poles[np.argmax(np.abs(poles))]) * controller.sample_rate)
+@cache
+def _preset_version(name: str) -> str:
+    return Servo.preset(name).version
 
 
 def _spread(value: PerMass, n: int) -> Array:

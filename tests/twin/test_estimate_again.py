@@ -104,7 +104,7 @@ def test_a_setting_that_does_not_matter_is_named_all_the_same():
     assert replay(window, body, context, other)[1:] == (True, ("settings.validity 60.0 then, 61.0 now",), ())
 
 
-@pytest.mark.parametrize("part", ["numpy", "scipy", "numba", "python", "servotwin", "source identify", "processor"])
+@pytest.mark.parametrize("part", ["numpy", "scipy", "numba", "python", "servotwin", "source estimation", "processor"])
 def test_another_version_is_named(part):
     window, body, context = estimated("fig15")[0][0]
     then = {**parts_of(context), part: "0.0.1"}

@@ -22,8 +22,7 @@ from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.lookups import VerificationRequest, decode_request
 from servotwin.twin.models import ModelRegistry, ServoModel
-from servotwin.twin.settings import TwinSettings
-from servotwin.twin.triage_settings import TriageSettings
+from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
 DEG = math.pi / 180.0
@@ -144,7 +143,7 @@ def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: M
         outcome = queue.give(asked)
     assert kinds(outcome) == ["proof", "withdrawn"]
     assert "settles on 3.0 %" in outcome.evidence[0].status
-    assert f"the proof of version {update.version} failed" in outcome.evidence[1].status
+    assert f"the verification of version {update.version} failed" in outcome.evidence[1].status
     assert not outcome.outgoing  # the edge takes nothing that stands on no newer window
     following = queue.window(1, update.version)
     back = sent(following)
@@ -155,7 +154,7 @@ def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: M
     assert back.setting.gains == gains_of(law)
     assert not following.enqueue
     said = {row.kind: row.status for row in following.evidence}
-    assert "the proof of version" in said["glance"]
+    assert "the verification of version" in said["glance"]
     assert said["redesign"].endswith("are asked; the fallback set is sent")
 
 
@@ -185,7 +184,7 @@ def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry,
     before = queue.state
     outcome = queue.give(asked._replace(body=msgspec.msgpack.encode(other)))
     assert kinds(outcome) == ["proof"]
-    assert outcome.evidence[0].status == "not proved: another setting is in force by now"
+    assert outcome.evidence[0].status == "not verified: another setting is in force by now"
     assert queue.state == before
 
 
@@ -216,7 +215,7 @@ def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, asked = begun(fleet)
     before = queue.state
     outcome = queue.give(asked._replace(body=b"\x93"))
-    assert outcome.evidence[0].status.startswith("failed: InvalidInput: the proof that is asked for is not understood")
+    assert outcome.evidence[0].status.startswith("failed: InvalidInput: the verification request is not understood")
     assert queue.state == before
 
 
