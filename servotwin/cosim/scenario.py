@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Any
 
 from servotwin.commissioning.guarding import Guarding, guarding, start_of
-from servotwin.commissioning.novelty import model_of
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.cosim import scenario_file
 from servotwin.cosim.scenario_file import Recording
 from servotwin.edge.limits import Limits
-from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN, Setting
+from servotwin.novelty.score import model_of
+from servotwin.novelty.settings import NoveltySettings
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
