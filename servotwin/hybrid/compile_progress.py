@@ -11,7 +11,6 @@ import multiprocessing
 import sys
 import threading
 import time
-from typing import Any
 
 from numba.core.event import Event, Listener, register
 
