@@ -11,13 +11,14 @@ import multiprocessing
 import sys
 import threading
 import time
+from typing import Any
 
 from numba.core.event import Event, Listener, register
 
 _TEXT = "servotwin: compiling kernels (once on this machine, half a minute or more)"
 
 
-class CompileProgress(Listener):  # type: ignore[misc]
+class CompileProgress(Listener):
     """Listener to numba's compilations of servotwin's functions; a cached function causes none."""
 
     def __init__(self) -> None:
@@ -35,7 +36,7 @@ class CompileProgress(Listener):  # type: ignore[misc]
             self._functions += 1
             self._show()
 
-    def on_end(self, event: Event) -> None:
+    def on_end(self, event: Event) -> None:  # noqa: ARG002
         """Erase the line when nothing is being compiled any more."""
         with self._lock:
             if self._depth == 0:
@@ -69,4 +70,5 @@ def _is_terminal() -> bool:
 
 def show_compilation() -> None:
     """Show the progress of compilations from now on."""
-    register("numba:compile", CompileProgress())
+    listen: Any = register  # untyped
+    listen("numba:compile", CompileProgress())
