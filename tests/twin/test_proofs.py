@@ -14,7 +14,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -91,7 +91,7 @@ def kinds(outcome: WorkResult) -> list[str]:
 
 def failing(monkeypatch) -> None:
     def refuted(_policy, _region, _setting):
-        return Refusal("the setting settles on 3.0 % of the members, and 99 % are asked")
+        return NotVerified("the setting settles on 3.0 % of the members, and 99 % are asked")
 
     monkeypatch.setattr(CertifiedPolicy, "confirm", refuted)
 
