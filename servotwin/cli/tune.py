@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.analysis.tuning.setpoint import overshoot
-from servotwin.analysis.tuning.tune import Tuning, judged
+from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.controller import Controller
 from servotwin.design import tune, tuned_system
 from servotwin.plant.margins import Margins
@@ -59,9 +59,9 @@ def tell(request: Request, as_json: bool) -> None:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
         return
     console = Console()
-    present = judged(tuned_system(servo), servo.controller, delay)
+    present = evaluate(tuned_system(servo), servo.controller, delay)
     _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
-    angles = tuning.factors
+    angles = tuning.candidates
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
     console.print(f"{tuning.stable} of {tuning.candidates} candidates are stable", style="dim", highlight=False)
@@ -79,8 +79,8 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
         "Ki": law.Ki,
         "Kd": law.Kd,
         "Tf": law.Tf,
-        "K": tuning.factors.K,
-        "angles_deg": {name: math.degrees(getattr(tuning.factors, name)) for name in ("phz", "be", "al")},
+        "K": tuning.candidates.K,
+        "angles_deg": {name: math.degrees(getattr(tuning.candidates, name)) for name in ("phz", "be", "al")},
         "crossovers": [
             {"omega": x.omega, "phase_margin_deg": math.degrees(x.phase_margin)} for x in found.gain_crossovers
         ],

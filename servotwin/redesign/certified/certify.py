@@ -228,7 +228,8 @@ def _shortcoming(tried: Certificate, demands: Demands) -> str:
     if tried.crossover == 0.0:
         return "has no gain crossover: its loop gain is below one at every frequency"
     if tried.settled < demands.settled:
-        return f"settles on {100.0 * tried.settled:.1f} % of the simulated machines, and {100.0 * demands.settled:g} % are demanded"
+        share, least = 100.0 * tried.settled, 100.0 * demands.settled
+        return f"settles on {share:.1f} % of the simulated machines, and {least:g} % are demanded"
     if tried.tail > _ROUNDED * demands.tail:
         return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * demands.tail:.3g} mm are allowed"
     if tried.overshoot > demands.overshoot:
