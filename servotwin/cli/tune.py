@@ -61,7 +61,7 @@ def tell(request: Request, as_json: bool) -> None:
     console = Console()
     present = evaluate(tuned_system(servo), servo.controller, delay)
     _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
-    angles = tuning.candidates
+    angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
     console.print(f"{tuning.stable} of {tuning.candidates} candidates are stable", style="dim", highlight=False)
@@ -79,8 +79,8 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
         "Ki": law.Ki,
         "Kd": law.Kd,
         "Tf": law.Tf,
-        "K": tuning.candidates.K,
-        "angles_deg": {name: math.degrees(getattr(tuning.candidates, name)) for name in ("phz", "be", "al")},
+        "K": tuning.factors.K,
+        "angles_deg": {name: math.degrees(getattr(tuning.factors, name)) for name in ("phz", "be", "al")},
         "crossovers": [
             {"omega": x.omega, "phase_margin_deg": math.degrees(x.phase_margin)} for x in found.gain_crossovers
         ],

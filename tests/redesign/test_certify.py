@@ -315,9 +315,9 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
     wide = rule.redesign(Evidence(estimated(10.0)))
     unit = SERVO.tolerance_for(gap_range(estimated(10.0))[1])
-    assert wide.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
+    assert wide.setting.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
     noisy = rule.redesign(Evidence(estimated(0.1), at_rest(0.0, noise=1e-3)))
-    assert noisy.tolerance == pytest.approx(3e-3)
+    assert noisy.setting.tolerance == pytest.approx(3e-3)
     assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 

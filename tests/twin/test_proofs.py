@@ -166,9 +166,9 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet,
     back = sent(queue.window(1, update.version))
     queue.applied(back)
     looked_up, made = [], []
-    plain, exact = TablePolicy.prove, CertifiedPolicy.prove
-    monkeypatch.setattr(TablePolicy, "prove", lambda *given: looked_up.append(1) or plain(*given))
-    monkeypatch.setattr(CertifiedPolicy, "prove", lambda *given: made.append(1) or exact(*given))
+    plain, exact = TablePolicy.verify, CertifiedPolicy.verify
+    monkeypatch.setattr(TablePolicy, "verify", lambda *given: looked_up.append(1) or plain(*given))
+    monkeypatch.setattr(CertifiedPolicy, "verify", lambda *given: made.append(1) or exact(*given))
     outcome = queue.window(2, back.version, reason="asked for")
     assert "redesign" in kinds(outcome)
     assert (len(looked_up), len(made)) == (0, 1)

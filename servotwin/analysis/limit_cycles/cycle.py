@@ -144,8 +144,8 @@ def _searched(loop: ScaledLoop) -> CycleResult:
 def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
     """Parts of one run, each twice as long, with two half peak-to-peaks of the second half of each.
 
-    The first is the larger of the position's and the motor's travel: while the motor crosses the gap the position rests,
-    but not for good. The second is the position's.
+    The first is the larger of the position's and the motor's travel: while the motor crosses the gap the position
+    rests, but not for good. The second is the position's.
     """
     state, mode = loop.state, loop.mode
     for look in range(_LOOKS):
