@@ -359,3 +359,18 @@ def test_on_the_model_a_millimetre_step_is_quick_and_hardly_overshoots(degrees: 
     off = run.position / 1e-3 - 1.0
     assert off.max() <= 0.1
     assert run.time[np.flatnonzero(np.abs(off) > 0.02)[-1]] <= 2.0
+
+
+@pytest.mark.parametrize("horizon", [20.0, 200.0])
+def test_wear_until_the_horizon_widens_the_range_of_gaps(horizon: float) -> None:
+    """A setting is to hold until the horizon, while the gap grows at the fastest rate that the trend allows."""
+    trend = Trend.start()
+    for time in range(6):
+        trend = trend.update(replace(estimated(4.0 + 0.01 * time), time=10.0 * time))
+    assert trend.rate_interval[1] > 0.0
+    last = replace(estimated(4.05), time=50.0)
+    policy = CertifiedPolicy(SERVO, Uncertainty(gap=gaps(0.0, 4.06)), horizon=horizon)
+    high = gap_range(last)[1] + horizon * trend.rate_interval[1]
+    for one, most in ((replace(policy, horizon=horizon), high), (replace(policy, horizon=0.0), gap_range(last)[1])):
+        reason = one.redesign(Evidence(last, trend=trend)).reason
+        assert f"to {math.degrees(most):.3g} deg" in reason
