@@ -27,9 +27,9 @@ from servotwin.messages import Cause, Outcome, Reason, Refusal
 from servotwin.store.records import Backlog
 from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import ALARMS
-from servotwin.twin_service.pool import Pool
-from servotwin.twin_service.system import System
+from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
+from servotwin.twin_service.worker_pool import WorkerPool
 
 ROOT = Path(__file__).parents[2]
 OPERATOR = ROOT / "docs/operator"
@@ -113,21 +113,21 @@ def test_every_answer_and_every_cause_is_explained(title: str, names: Any) -> No
 
 
 @pytest.fixture
-def system(tmp_path: Path) -> Iterator[System]:
+def system(tmp_path: Path) -> Iterator[TwinService]:
     """A service that has not begun, with a broker, so that it has every metric."""
     twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n', tokens=False))
     store = open_store(twin.service.store)
-    made = System(twin, store, pool=Pool(0, twin.start, 1.0))
+    made = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
     try:
-        _ = made.app
+        made.http_app()
         yield made
     finally:
         made.commits.close()
-        made.shelf.close()
+        made.executor.close()
         store.close()
 
 
-def test_every_metric_is_explained(system: System) -> None:
+def test_every_metric_is_explained(system: TwinService) -> None:
     told = set(re.findall(r"^# TYPE (\S+)", system.metrics.text(), re.MULTILINE))
     explained = named("Metrics of the twin")
     assert {name for name in explained if name.startswith("servotwin_")} == told
@@ -138,7 +138,7 @@ def test_every_metric_is_explained(system: System) -> None:
     assert set(everywhere) - told <= {"servotwin_version"}
 
 
-def test_every_field_of_health_is_explained(system: System) -> None:
+def test_every_field_of_health_is_explained(system: TwinService) -> None:
     assert set(named("Health of the twin")) == {*system.health(), "waiting"}
     assert all(f"`{name}`" in section("Health of the twin") for name in Backlog._fields)
 

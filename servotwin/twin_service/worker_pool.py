@@ -1,4 +1,4 @@
-"""Worker processes: asked over sockets, replaced when they die or hang."""
+"""Pool of worker processes, which get jobs over sockets and are replaced when they die or hang."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from servotwin.runtime.frames import receive_frame
 from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease
 from servotwin.twin_service import config, mqtt_config
-from servotwin.twin_service.job import Done, Job, Start, done_of, framed
+from servotwin.twin_service.worker import LeaseResult, WorkerJob, WorkerStart, decode_result, encode_frame
 
 log = logging.getLogger(__name__)
 
-BEGIN_S = 120.0
-"""s that a worker may take until it listens: it imports and compiles."""
-END_S = 5.0
-COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
+_START_S = 120.0
+"""s that a worker may take until it is ready: it imports and compiles."""
+_STOP_S = 5.0
+_COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
 
 
 class WorkerLost(Exception):
-    """A worker died or hung; what it was asked for may be asked again."""
+    """A worker died or hung; its job may be repeated."""
 
 
-class Worker:
-    """One process.
+class WorkerProcess:
+    """One worker.
 
     Parameters
     ----------
-    start : Start
+    start : WorkerStart
     timeout : float
-        s that it may take over one claim.
+        s that it may take for one lease.
     command : sequence of str
-        What is run, with the number of a descriptor behind it.
+        Command line; the number of the socket's descriptor is appended.
     """
 
-    def __init__(self, start: Start, timeout: float, command: Sequence[str] = COMMAND) -> None:
+    def __init__(self, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
         self._start, self._timeout, self._command = start, timeout, tuple(command)
         self._process: ChildProcess | None = None
         self._reader: asyncio.StreamReader | None = None
@@ -49,46 +49,46 @@ class Worker:
 
     @property
     def pid(self) -> int | None:
-        """Of the process, while there is one."""
+        """Process id, while the process runs."""
         return None if self._process is None or self._process.code is not None else self._process.pid
 
-    async def begin(self) -> None:
-        """Start the process and wait until it listens; raises WorkerLost."""
+    async def start(self) -> None:
+        """Start the process and wait until it is ready; raises WorkerLost."""
         ours, theirs = socket.socketpair()
         with theirs:
             number = theirs.fileno()
             self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
         self._reader, self._writer = await asyncio.open_connection(sock=ours)
-        self._send(framed(self._start))
-        await self._frame(BEGIN_S)
+        self._send(encode_frame(self._start))
+        await self._receive(_START_S)
 
-    async def work(self, claims: Sequence[Lease], now: float) -> AsyncIterator[Done]:
-        """What becomes of each claim, one after the other; raises WorkerLost."""
-        self._send(framed(Job(tuple(claims), now)))
-        for _ in claims:
-            yield done_of(await self._frame(self._timeout))
+    async def work(self, leases: Sequence[Lease], now: float) -> AsyncIterator[LeaseResult]:
+        """Process leases; yields their results in order. Raises WorkerLost."""
+        self._send(encode_frame(WorkerJob(tuple(leases), now)))
+        for _ in leases:
+            yield decode_result(await self._receive(self._timeout))
 
-    async def end(self) -> None:
-        """Close the socket, and see the process gone."""
+    async def stop(self) -> None:
+        """Close the socket and wait for the end of the process."""
         if self._writer is not None:
             self._writer.close()
         if self._process is not None:
-            await asyncio.to_thread(self._process.wait, END_S)
+            await asyncio.to_thread(self._process.wait, _STOP_S)
 
     async def kill(self) -> None:
-        """End it at once."""
+        """Kill the process."""
         if self._writer is not None:
             self._writer.close()
         if self._process is not None:
             self._process.kill()
-            await asyncio.to_thread(self._process.wait, END_S)
+            await asyncio.to_thread(self._process.wait, _STOP_S)
 
     def _send(self, frame: bytes) -> None:
         if self._writer is None or self._writer.is_closing():
             raise WorkerLost("the worker is gone")
         self._writer.write(frame)
 
-    async def _frame(self, timeout: float) -> bytes:
+    async def _receive(self, timeout: float) -> bytes:
         assert self._reader is not None
         try:
             async with asyncio.timeout(timeout):
@@ -99,56 +99,61 @@ class Worker:
             raise WorkerLost("the worker ended") from None
 
 
-class Pool:
-    """Some workers, each lent to one task at a time.
+class WorkerPool:
+    """Workers, each used by one task at a time.
 
     Parameters
     ----------
     size : int
-    start : Start
+    start : WorkerStart
     timeout : float
-        s for one claim.
+        s for one lease.
     command : sequence of str
+
+    Attributes
+    ----------
+    lost : int
+        Number of workers that were replaced.
     """
 
-    def __init__(self, size: int, start: Start, timeout: float, command: Sequence[str] = COMMAND) -> None:
+    def __init__(self, size: int, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
         self.size, self.lost = size, 0
-        self._make = partial(Worker, start, timeout, command)
-        self._workers: set[Worker] = set()
-        self._idle: asyncio.Queue[Worker] = asyncio.Queue()
+        self._make = partial(WorkerProcess, start, timeout, command)
+        self._workers: set[WorkerProcess] = set()
+        self._idle: asyncio.Queue[WorkerProcess] = asyncio.Queue()
 
     @property
     def alive(self) -> int:
-        """Workers whose process runs."""
+        """Number of workers whose process runs."""
         return sum(worker.pid is not None for worker in self._workers)
 
-    async def begin(self) -> None:
+    async def start(self) -> None:
         """Start all workers.
 
         Raises
         ------
         WorkerLost
-            One could not be started; none is left.
+            A worker did not start; the others were stopped.
         """
         self._workers = {self._make() for _ in range(self.size)}
         try:
-            await asyncio.gather(*(worker.begin() for worker in self._workers))
+            await asyncio.gather(*(worker.start() for worker in self._workers))
         except WorkerLost:
-            await self.end()
+            await self.stop()
             raise
         for worker in self._workers:
             self._idle.put_nowait(worker)
 
-    async def lend(self) -> Worker:
-        """A worker that has nothing to do, as soon as there is one."""
+    async def acquire(self) -> WorkerProcess:
+        """Wait for an idle worker."""
         return await self._idle.get()
 
-    def take_back(self, worker: Worker) -> None:
-        """It has done what it was lent for."""
+    def release(self, worker: WorkerProcess) -> None:
+        """Return a worker to the pool."""
         self._idle.put_nowait(worker)
 
-    async def replace(self, worker: Worker, why: str) -> None:
-        """Put another one into the place of a worker that is of no more use."""
+    async def replace(self, worker: WorkerProcess, why: str) -> None:
+        """Kill a worker and start another one in its place."""
         log.warning("worker replaced", extra={"pid": worker.pid, "why": why})
         self.lost += 1
         self._workers.discard(worker)
@@ -158,7 +163,7 @@ class Pool:
             fresh = self._make()
             self._workers.add(fresh)
             try:
-                await fresh.begin()
+                await fresh.start()
             except (WorkerLost, OSError) as error:
                 self._workers.discard(fresh)
                 await fresh.kill()
@@ -168,14 +173,14 @@ class Pool:
             self._idle.put_nowait(fresh)
             return
 
-    async def end(self) -> None:
-        """End all workers."""
-        await asyncio.gather(*(worker.end() for worker in self._workers))
+    async def stop(self) -> None:
+        """Stop all workers."""
+        await asyncio.gather(*(worker.stop() for worker in self._workers))
         self._workers.clear()
 
 
 def _environment() -> Mapping[str, str]:
-    """The service's, without what no worker has to know."""
-    secret = config.PASSWORD, mqtt_config.PASSWORD
-    mine = {key: value for key, value in os.environ.items() if key not in secret}
-    return {**mine, "OPENBLAS_NUM_THREADS": "1"}
+    """Environment of a worker: the service's without its passwords."""
+    secrets = config.PASSWORD, mqtt_config.PASSWORD
+    passed = {key: value for key, value in os.environ.items() if key not in secrets}
+    return {**passed, "OPENBLAS_NUM_THREADS": "1"}
