@@ -30,7 +30,7 @@ def figure(vector: bytes, title: str, caption: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = False) -> str:
-    """Make a table of plain texts; `stack` turns each row into a card on a narrow screen, otherwise the table scrolls."""
+    """Make a table of plain texts; `stack` turns rows into cards on a narrow screen, otherwise the table scrolls."""
     cells = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     lines = "".join(_row(head, row) for row in rows)
     kind = ' class="stack"' if stack else ""
