@@ -16,7 +16,7 @@ from benchmarks.model import Model, model_of
 from benchmarks.workloads import Noisy, Sweep, Wear
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import compiled
-from servotwin.plant.linear import held
+from servotwin.plant.linear import zero_order_hold
 
 NAME = "numba hold"
 
@@ -50,8 +50,8 @@ class Inputs(NamedTuple):
 def hold_of(model: Model, rate: float, loop_filter_hz: float | None = None) -> Hold:
     """The loop discretised at a rate, Hz."""
     step = 1.0 / rate
-    motor = np.column_stack(held(model.motor_A, model.motor_B, step))
-    chain = np.column_stack(held(model.chain_A, model.chain_B, step))
+    motor = np.column_stack(zero_order_hold(model.motor_A, model.motor_B, step))
+    chain = np.column_stack(zero_order_hold(model.chain_A, model.chain_B, step))
     loop_step = 1.0 if loop_filter_hz is None else -math.expm1(-2.0 * math.pi * loop_filter_hz * step)
     lag_step = -math.expm1(-step / model.Tf)
     return Hold(motor, chain, model.position, step, model.Kp, model.Ki * step, model.N, lag_step, loop_step)

@@ -117,8 +117,8 @@ def band(settings: TwinSettings | None = None) -> Band:
     """What is certified for the whole stated range."""
     fallback = scenario(case(0), 0, settings).agent_settings().supervision.fallback
     assert fallback is not None
-    assert fallback.band is not None
-    return fallback.band
+    assert fallback.setting.band is not None
+    return fallback.setting.band
 
 
 def endured(seed: int, kind: Kind, settings: TwinSettings | None = None, rubs: bool = False) -> Outcome:

@@ -11,12 +11,12 @@ from functools import partial
 
 from msgspec import structs
 
+from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.window import Window as NumericWindow
-from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Update, Window
-from servotwin.twin.in_force import InForce
+from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, Window
 from servotwin.twin.policies import policy_of
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
@@ -49,7 +49,7 @@ def deceived(scenario: Scenario, gap: float) -> Twin:
         interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
         return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="told")
 
-    start = InForce(scenario.start_law, scenario.start_tolerance)
+    start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
     policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
     return Twin(scenario.name, estimate, policy, MemoryStore(), scenario.twin, observer, start)
 
@@ -128,7 +128,7 @@ class HostileTwin:
         setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
         version, identity = self._next(), (window.boot, window.sequence)
         end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
-        known = (None, None, none, "OK", tolerance, end, setting, UNBOUNDED)
+        known = (None, None, none, "OK", Setting(tolerance, setting, UNBOUNDED), end)
         update = Update(window.servo, version, self.in_force, identity, window.start, *known)
         self.said.append(update)
         return [Acknowledge(window.servo, window.boot, window.sequence), update]

@@ -14,7 +14,7 @@ import msgspec
 
 from benchmarks.fleet.stock import BOOT, COMMISSIONED, RATE, Known, Place, commissioned
 from servotwin.config.table import parse_toml
-from servotwin.messages import Hello, encode
+from servotwin.messages import Hello, Setting, encode
 from servotwin.redesign.certified.lookup import Grid
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.store.records import Incoming, MessageKind, WorkResult
@@ -167,7 +167,7 @@ def _named(state: TwinState, servo: str, glances: int) -> bytes:
 
 
 def _hello(servo: str, now: float) -> Incoming:
-    body = encode(Hello(servo, BOOT, COMMISSIONED, RATE, 0, 0.0, "axis"))
+    body = encode(Hello(servo, BOOT, COMMISSIONED, RATE, 0, Setting(0.0), "axis"))
     digest = blake2b(body, digest_size=16).digest()
     return Incoming(servo, MessageKind.LETTER, digest.hex(), body, "", digest, now)
 

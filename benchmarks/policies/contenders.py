@@ -11,8 +11,8 @@ from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
+from servotwin.redesign.design import Design
 from servotwin.redesign.policy import PaperPolicy
-from servotwin.redesign.setting import Setting
 
 POLICIES = ("no dead zone", "paper", "margin", "hysteresis", "certified")
 _NOT_BOUND = 100.0
@@ -21,7 +21,7 @@ _NOT_BOUND = 100.0
 @cache
 def contender(name: str, model: Servo, known: Uncertainty) -> Told:
     """A policy by name, with the model and what is stated of it."""
-    own = Setting(model.controller)
+    own = Design(model.controller)
     if name == "no dead zone":
         return Told(None, own)
     if name == "paper":
@@ -34,7 +34,7 @@ def contender(name: str, model: Servo, known: Uncertainty) -> Told:
     return Told(certified, certified.fallback().setting)
 
 
-def constants(model: Servo, known: Uncertainty) -> dict[str, Setting]:
+def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     """Constant settings by name: what `certified` chooses from, without its bound on Ms, and the paper's gains with
     dead zones for gaps of 10, 30 and 60 deg."""
     policy = CertifiedPolicy(model, known)
@@ -45,5 +45,5 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Setting]:
         found[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
     for share in (1.0 / 6.0, 0.5, 1.0):
         width = model.tolerance_for(share * known.gap[1], 1.5)
-        found[f"own gains, dead zone {width * 1e3:.3g} mm"] = Setting(own, width)
+        found[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
     return found

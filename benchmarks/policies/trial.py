@@ -10,15 +10,16 @@ import numpy as np
 
 from benchmarks.policies.machines import NOISE, Machine
 from servotwin.control.controller import Controller
+from servotwin.control.gains import with_gains
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
 from servotwin.redesign.certified.assess import NEAR
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Policy
-from servotwin.redesign.setting import Setting
 from servotwin.simulation import Run, Simulation
 
 REST, DURATION, LAST = 10.0, 60.0, 10.0
@@ -75,11 +76,11 @@ class Told:
     ----------
     policy : Policy or None
         None: the start stays.
-    start : Setting
+    start : Design
     """
 
     policy: Policy | None
-    start: Setting
+    start: Design
 
 
 def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Scores:
@@ -93,7 +94,7 @@ def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Score
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
         seen = disturbance(window, model)
-        evidence = Evidence(_estimate(believed), seen, None, setting.controller, setting.tolerance, told_for)
+        evidence = Evidence(_estimate(believed), seen, None, setting.setting(), told_for)
         now = _redesigned(told, evidence, setting)
         told_for = believed
         if now != setting:
@@ -104,7 +105,7 @@ def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Score
     return scores(simulation.run(), machine.step, setting, model)
 
 
-def scores(run: Run, step: float, setting: Setting, model: Servo) -> Scores:
+def scores(run: Run, step: float, setting: Design, model: Servo) -> Scores:
     """Measures of a run with one step, from there on, and the setting at its end."""
     law, own = setting.controller, model.controller
     error = (run.reference - run.position)[round(REST * run.sample_rate) :]
@@ -125,14 +126,14 @@ def scores(run: Run, step: float, setting: Setting, model: Servo) -> Scores:
     )
 
 
-def _redesigned(told: Told, evidence: Evidence, before: Setting) -> Setting:
+def _redesigned(told: Told, evidence: Evidence, before: Design) -> Design:
     """The setting after a policy was asked."""
     if told.policy is None:
         return before
     made = told.policy.redesign(evidence)
-    if made.tolerance is None:
+    if made.setting is None:
         return before
-    return Setting(made.controller or before.controller, made.tolerance)
+    return Design(with_gains(before.controller, made.setting.gains), made.setting.tolerance)
 
 
 def _estimate(gap: float) -> GapEstimate:
@@ -140,7 +141,7 @@ def _estimate(gap: float) -> GapEstimate:
     return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, 0.0)
 
 
-def _simulation(machine: Machine, block: str, setting: Setting, rng: np.random.Generator) -> Simulation:
+def _simulation(machine: Machine, block: str, setting: Design, rng: np.random.Generator) -> Simulation:
     return Simulation(
         machine.servo,
         REST + DURATION,

@@ -171,7 +171,9 @@ def _reasons(one: Told) -> Sequence[str]:
 def _sent(update: Told) -> str:
     """What an update sets, and what it was proved on."""
     body = update["body"] or {}
-    tolerance, gains, proof = body.get("tolerance"), body.get("controller"), body.get("proof")
+    setting = body.get("setting") or {}
+    tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
+    gains, proof = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
     parts = [] if tolerance is None else [f"dead zone {tolerance * 1e6:.4g} um" if tolerance else "no dead zone"]
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))

@@ -156,7 +156,7 @@ def cells(row: Verdict) -> tuple[str, ...]:
 
 def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
     """An update as texts, in the order of `SENT`; gains in the servo's own."""
-    law, proof, own = update.controller, update.proof, servo.controller
+    law, proof, own = update.setting.gains, update.verification, servo.controller
     if law is None or proof is None:
         return (f"{update.data_time:.0f}", *("-" for _ in SENT[1:]))
     gains = f"x {law.Kp / own.Kp:.2f}", f"x {law.Ki / own.Ki:.2f}", f"{law.feedforward * MM:+.2f}"

@@ -13,7 +13,8 @@ from rich.table import Table
 from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Specification, Tuning, judged, tune
 from servotwin.control.controller import Controller
-from servotwin.plant.linear import loop_filter, series
+from servotwin.plant.linear import series
+from servotwin.plant.loop import loop_filter
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 

@@ -14,7 +14,7 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
-from servotwin.messages import Gains
+from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
@@ -59,7 +59,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     policy = certified(servo, settings)
     proved = policy.fallback()
     gains, band = gains_of(proved.setting.controller), band_of(proved, noise)
-    supervision = Supervision(FallbackSet(proved.setting.tolerance, gains, band, policy.horizon))
+    supervision = Supervision(FallbackSet(Setting(proved.setting.tolerance, gains, band), policy.horizon))
     sent = policy_of(servo, settings)
     return Guarding(
         supervision, *(hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else certified_box(policy))
@@ -68,7 +68,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
 
 def start_of(fallback: FallbackSet) -> Parameters:
     """The fallback set from the first sample on; an update may replace it at once."""
-    return Parameters(tolerance=fallback.tolerance, gains=fallback.gains, band=fallback.band, fallback=True)
+    return Parameters(setting=fallback.setting, fallback=True)
 
 
 def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:

@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
@@ -25,13 +26,12 @@ from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import SimulatedLink
-from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, decode, encode
+from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Setting, Update, decode, encode
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
 from servotwin.simulation.splice import shifted
 from servotwin.twin.estimating import Estimator
-from servotwin.twin.in_force import InForce
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
 
@@ -126,7 +126,7 @@ class Cosimulation:
         self.outbox = MemoryOutbox()
         self.agent = Agent(scenario.agent_settings(), self.outbox)
         self.store = MemoryStore()
-        start = InForce(scenario.start_law, scenario.start_tolerance)
+        start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
         self.twin = twin or Twin.of(scenario.name, scenario.model, self.store, scenario.twin, estimator, start)
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
@@ -238,9 +238,9 @@ class Cosimulation:
             return
         self._in_force = wanted
         if controller is None:
-            self.machine.set_tolerance(wanted.tolerance)
+            self.machine.set_tolerance(wanted.setting.tolerance)
         else:
-            self.machine.set_controller(controller, wanted.tolerance)
+            self.machine.set_controller(controller, wanted.setting.tolerance)
 
     def _at_twin(self, data: bytes) -> None:
         """Bytes arrive at the twin; one that is switched off lets them lie."""

@@ -26,7 +26,7 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
-from servotwin.messages import NAME_PATTERN
+from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
@@ -187,17 +187,17 @@ class Scenario:
             fallback = guarded.supervision.fallback if guarded is not None and own else None
             return Parameters() if fallback is None else start_of(fallback)
         k_dz = 1.0 if self.twin.k_dz is None else self.twin.k_dz
-        return Parameters(tolerance=self.servo.tolerance_for(self.twin.initial_gap, k_dz))
+        return Parameters(setting=Setting(self.servo.tolerance_for(self.twin.initial_gap, k_dz)))
 
     @property
     def start_law(self) -> Controller:
         """The controller before the first update."""
-        return with_gains(self.law, self.start.gains)
+        return with_gains(self.law, self.start.setting.gains)
 
     @property
     def start_tolerance(self) -> float:
         """Dead-zone half-width before the first update, m."""
-        return self.start.tolerance
+        return self.start.setting.tolerance
 
     @property
     def samples(self) -> int:

@@ -18,17 +18,17 @@ from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.cut import TIMED, Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
-from servotwin.edge.outlet import Outlet, LocalOutlet
+from servotwin.edge.outlet import LocalOutlet, Outlet
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import Store
+from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Update
+from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
 
 
 class Outgoing(NamedTuple):
@@ -58,7 +58,7 @@ class Agent:
     settings : AgentSettings
     outbox : Outbox, optional
         In memory by default.
-    store : Store, optional
+    store : ParameterStore, optional
         Of the last parameters that were proved; without one each boot begins as configured.
     outlet : Outlet, optional
         Where cut windows go; by default they are packed here and kept in `outbox`.
@@ -68,7 +68,7 @@ class Agent:
         self,
         settings: AgentSettings,
         outbox: Outbox | None = None,
-        store: Store | None = None,
+        store: ParameterStore | None = None,
         outlet: Outlet | None = None,
     ) -> None:
         self.settings = settings
@@ -94,7 +94,7 @@ class Agent:
     def controller(self) -> Controller | None:
         """The controller with the gains in force; None where updates set the tolerance only."""
         configured = self.settings.controller
-        return None if configured is None else with_gains(configured, self.parameters.gains)
+        return None if configured is None else with_gains(configured, self.parameters.setting.gains)
 
     @property
     def probe(self) -> ProbingMove | None:
@@ -169,24 +169,24 @@ class Agent:
         return []
 
     def outlet_changed(self) -> None:
-        """What waits at the outlet has changed by itself: an earlier boot left something, or nothing is sent."""
+        """Take note that the outlet's unacknowledged windows have changed by themselves."""
         if self.outlet.unacknowledged:
             self._supervisor.asked(self.time)
         else:
             self._supervisor.answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
-    def put_back(self, former: Parameters) -> list[Outgoing]:
+    def restore(self, former: Parameters) -> list[Outgoing]:
         """The drive does not take what is in force, and runs on those; returns what is to be sent now."""
-        said = self._supervisor.put_back(former)
+        said = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
         return [Outgoing(self.samples, each) for each in said]
 
     def hello(self) -> Hello:
         """Who this is and what is in force: to be sent after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller
-        gains = None if law is None else gains_of(law)
-        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, p.tolerance, s.model_version, gains)
+        setting = Setting(p.setting.tolerance, None if law is None else gains_of(law))
+        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """Where in a block the next thing may happen: its end, the deadline, just after a change of the reference."""

@@ -11,6 +11,8 @@ applied is `servotwin.edge.switch`'s business.
 
 from dataclasses import dataclass
 
+from msgspec.structs import replace
+
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.messages import Gains, Reason, Receipt, Update
@@ -37,18 +39,10 @@ def repeats(update: Update, current: Parameters, here: Instant) -> bool:
 
 
 def applied(update: Update, current: Parameters, sample: int) -> Parameters:
-    """What is in force from `sample` on; an update without gains leaves them."""
-    gains = current.gains if update.controller is None else update.controller
-    return Parameters(
-        update.version,
-        update.tolerance,
-        update.data_time,
-        update.window,
-        sample,
-        gains=gains,
-        band=update.band,
-        gap=update.gap,
-    )
+    """Parameters in force from `sample` on; an update without gains leaves them."""
+    gains = current.setting.gains if update.setting.gains is None else update.setting.gains
+    setting = replace(update.setting, gains=gains)
+    return Parameters(update.version, setting, update.data_time, update.window, sample, gap=update.gap)
 
 
 def judge(update: Update, current: Parameters, limits: Limits, here: Instant, own: Gains | None = None) -> Reason:
@@ -66,6 +60,7 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
     """
     samples = here.sample - current.sample
     since = samples / here.rate
+    old, new = current.setting.tolerance, update.setting.tolerance
     checks = (
         (update.servo == here.servo, Reason.WRONG_SERVO),
         (update.window[0] == here.boot, Reason.OTHER_BOOT),
@@ -74,21 +69,21 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
         (update.base_version == current.version, Reason.BASE_MISMATCH),
         (update.data_time <= here.time, Reason.FUTURE_DATA),
         (here.time < update.not_after and here.time - update.data_time <= limits.lifetime_s, Reason.EXPIRED),
-        (limits.allows_tolerance(update.tolerance), Reason.OUT_OF_BOUNDS),
-        (limits.allows_tolerance_step(current.tolerance, update.tolerance, since), Reason.STEP_TOO_LARGE),
+        (limits.allows_tolerance(new), Reason.OUT_OF_BOUNDS),
+        (limits.allows_tolerance_step(old, new, since), Reason.STEP_TOO_LARGE),
         (current.window is None or samples >= limits.interval_s * here.rate, Reason.TOO_SOON),
         (here.sample >= current.not_before, Reason.AFTER_FALLBACK),
     )
     reason = next((reason for passed, reason in checks if not passed), Reason.APPLIED)
-    if reason is not Reason.APPLIED or update.controller is None:
+    if reason is not Reason.APPLIED or update.setting.gains is None:
         return reason
-    return Reason.NO_GAINS if own is None else _judge_gains(update.controller, current, limits, own, since)
+    return Reason.NO_GAINS if own is None else _judge_gains(update.setting.gains, current, limits, own, since)
 
 
 def _judge_gains(gains: Gains, current: Parameters, limits: Limits, own: Gains, since: float) -> Reason:
     if not limits.allows_gains(gains, own):
         return Reason.GAINS_OUT_OF_BOUNDS
-    if not limits.allows_gains_step(current.gains or own, gains, own, since):
+    if not limits.allows_gains_step(current.setting.gains or own, gains, own, since):
         return Reason.GAINS_STEP_TOO_LARGE
     return Reason.APPLIED
 

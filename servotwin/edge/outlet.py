@@ -4,6 +4,7 @@ The edge process hands them to a link process instead, so that neither packing n
 windows into an outbox by `WindowWriter`, and repeat them by one `servotwin.link.session.Session`.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -19,6 +20,9 @@ from servotwin.messages import Acknowledge, InvalidMessage, Window
 NOT_FINITE = "sample not finite"
 FILTERED = "nothing new"
 """Reasons of windows that are not sent."""
+
+UNFILTERED = "window not judged"
+"""Fault of a window whose filter failed."""
 
 _FILTER_STATE = "novelty"  # its name in outboxes on disk since the first filter
 
@@ -56,10 +60,12 @@ class WindowWriter:
     settings : AgentSettings
         Of that boot; its window filter goes on from the state that an earlier boot left in the outbox.
     outbox : Outbox
+    faults : Counter, optional
+        Counts the windows whose filter failed, which are then sent; None: such an error is raised.
     """
 
-    def __init__(self, settings: AgentSettings, outbox: Outbox) -> None:
-        self._settings, self._outbox = settings, outbox
+    def __init__(self, settings: AgentSettings, outbox: Outbox, faults: Counter[str] | None = None) -> None:
+        self._settings, self._outbox, self._faults = settings, outbox, faults
         self._filter: WindowFilter | None = None
         if settings.window_filter is not None:
             try:
@@ -68,28 +74,30 @@ class WindowWriter:
                 self._filter = settings.window_filter.start()
 
     def write(self, cut: Cut) -> None:
-        """Put a window into the outbox, or count why it is not sent; one that is not finite meets no filter."""
-        if self._filter is None or not is_finite(cut):
-            self._pack(cut)
-            return
-        wanted = self._filter(cut)
-        self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
+        """Put a window into the outbox, or count why it is not sent."""
+        wanted = self._filtered(cut) if is_finite(cut) else cut
         if wanted is None:
             self._outbox.count_dropped(FILTERED)
-        else:
-            self._pack(wanted)
-
-    def write_unfiltered(self, cut: Cut) -> None:
-        """Put a window into the outbox whose filter has failed."""
-        self._pack(cut)
-
-    def _pack(self, cut: Cut) -> None:
+            return
         try:
-            window = pack(cut, self._settings)
+            window = pack(wanted, self._settings)
         except InvalidMessage:
             self._outbox.count_dropped(NOT_FINITE)
         else:
             self._outbox.put(window)
+
+    def _filtered(self, cut: Cut) -> Cut | None:
+        if self._filter is None:
+            return cut
+        try:
+            wanted = self._filter(cut)
+        except Exception:
+            if self._faults is None:
+                raise
+            self._faults[UNFILTERED] += 1
+            return cut
+        self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
+        return wanted
 
 
 class LocalOutlet:

@@ -118,7 +118,7 @@ class AgentSettings:
         if self.window_filter is not None:
             self.window_filter.check_rate(self.sample_rate)
         fallback = self.supervision.fallback
-        if self.controller is None and fallback is not None and fallback.gains is not None:
+        if self.controller is None and fallback is not None and fallback.setting.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
 
     def _check_longest(self) -> None:

@@ -11,7 +11,7 @@ from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
-from servotwin.messages import Band, Gains
+from servotwin.messages import Band, Gains, Setting
 
 MM = 1e-3
 GainsReader = Callable[[Table], Gains | None]
@@ -99,11 +99,9 @@ def _fallback(table: Table, gains: GainsReader) -> FallbackSet:
     tolerance = length(table, "tolerance", 0.0)
     found_band = band(table.table("band")) if "band" in table.values else None
     found = FallbackSet(
-        tolerance,
-        gains(table),
-        found_band,
+        Setting(tolerance, gains(table), found_band),
         table.number("silence_s", inf, positive=True, infinite=True),
-        table.number("refuse_s", FallbackSet(0.0).refuse_s, minimum=0.0),
+        table.number("refuse_s", FallbackSet(Setting(0.0)).refuse_s, minimum=0.0),
     )
     table.done()
     return found

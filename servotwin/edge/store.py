@@ -1,4 +1,4 @@
-"""The last parameters that were proved at the machine: kept, so that a restart does not begin at the beginning."""
+"""The last parameters that the loop kept its band under: stored, so that a restart goes on from them."""
 
 import os
 from pathlib import Path
@@ -9,57 +9,54 @@ from msgspec import Struct
 
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Band, Gains
+from servotwin.messages import Setting
+from servotwin.messages.legacy import upgrade
 from servotwin.runtime.files import replace_file
 
 
-class Store(Protocol):
-    """Keeps one set of parameters."""
+class ParameterStore(Protocol):
+    """Stores one set of parameters."""
 
     def save(self, parameters: Parameters) -> None:
-        """Keep these instead of what was kept; return when they are safe."""
+        """Replace the stored parameters; return when the new ones are safe."""
 
     def load(self) -> Parameters | None:
-        """What is kept, as parameters of a new boot; None: nothing was ever kept."""
+        """The stored parameters, as those of a new boot; None: nothing was ever stored."""
 
 
-class Kept(Struct, frozen=True, tag="kept/1"):
-    """What outlives a boot; sample times do not."""
+class StoredParameters(Struct, frozen=True, tag="parameters/2"):
+    """The part of the parameters that outlives a boot; sample times do not."""
 
     version: int
-    tolerance: float
-    gains: Gains | None
-    band: Band | None
+    setting: Setting
     fallback: bool
 
+    @classmethod
+    def of(cls, parameters: Parameters) -> "StoredParameters":
+        """The part of these parameters that outlives a boot."""
+        return cls(parameters.version, parameters.setting, parameters.fallback)
 
-def kept(parameters: Parameters) -> Kept:
-    """The part that outlives a boot."""
-    p = parameters
-    return Kept(p.version, p.tolerance, p.gains, p.band, p.fallback)
-
-
-def restored(saved: Kept) -> Parameters:
-    """As parameters that stand on no data of this boot."""
-    return Parameters(saved.version, saved.tolerance, gains=saved.gains, band=saved.band, fallback=saved.fallback)
+    def parameters(self) -> Parameters:
+        """The same as parameters that stand on no data of this boot."""
+        return Parameters(self.version, self.setting, fallback=self.fallback)
 
 
-class MemoryStore:
+class MemoryParameterStore:
     """In memory, for simulation and tests."""
 
     def __init__(self) -> None:
-        self._kept: Kept | None = None
+        self._stored: StoredParameters | None = None
 
     def save(self, parameters: Parameters) -> None:
-        """Keep these."""
-        self._kept = kept(parameters)
+        """Replace the stored parameters."""
+        self._stored = StoredParameters.of(parameters)
 
     def load(self) -> Parameters | None:
-        """What is kept."""
-        return None if self._kept is None else restored(self._kept)
+        """The stored parameters."""
+        return None if self._stored is None else self._stored.parameters()
 
 
-class FileStore:
+class FileParameterStore:
     """In one file, replaced as a whole: a crash leaves the old one or the new one.
 
     Parameters
@@ -73,10 +70,10 @@ class FileStore:
 
     def save(self, parameters: Parameters) -> None:
         """Replace the file; return when the disk has it. Raises OSError."""
-        replace_file(self._path, msgspec.json.encode(kept(parameters)), durable=True)
+        replace_file(self._path, msgspec.json.encode(StoredParameters.of(parameters)), durable=True)
 
     def load(self) -> Parameters | None:
-        """What the file holds.
+        """The parameters in the file, in this version's form or the one before.
 
         Raises
         ------
@@ -88,6 +85,6 @@ class FileStore:
         except FileNotFoundError:
             return None
         try:
-            return restored(msgspec.json.decode(data, type=Kept))
+            return msgspec.convert(upgrade(msgspec.json.decode(data)), StoredParameters).parameters()
         except (msgspec.MsgspecError, ValueError) as error:
             raise InvalidInput(f"{self._path}: does not hold the edge's last parameters: {error}") from None

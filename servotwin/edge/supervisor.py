@@ -7,13 +7,15 @@ the same whether samples come one by one or in blocks.
 from dataclasses import replace
 from math import ceil, inf
 
+import msgspec
+
 from servotwin.control.gains import gains_of
 from servotwin.edge import switch
 from servotwin.edge.guard import Instant
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Recorder
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import Store
+from servotwin.edge.store import ParameterStore
 from servotwin.edge.switch import Rules, Step, Switch
 from servotwin.edge.verdict import Verdict
 from servotwin.edge.watch import Watch
@@ -30,11 +32,11 @@ class Supervisor:
     settings : AgentSettings
     recorder : Recorder
         Where the agent puts its samples.
-    store : Store, optional
+    store : ParameterStore, optional
         What it holds goes before the configured parameters.
     """
 
-    def __init__(self, settings: AgentSettings, recorder: Recorder, store: Store | None = None) -> None:
+    def __init__(self, settings: AgentSettings, recorder: Recorder, store: ParameterStore | None = None) -> None:
         self._settings, self._recorder, self._store = settings, recorder, store
         self._rules = Rules(settings.limits, settings.controller, settings.own)
         self._state = Switch(self._first_parameters())
@@ -64,9 +66,9 @@ class Supervisor:
         """Take an update from the twin."""
         return self._take(switch.offer(self._state, update, self._rules, self._here, self._error))
 
-    def put_back(self, former: Parameters) -> Said:
+    def restore(self, former: Parameters) -> Said:
         """The drive runs on those, as it does not take what is in force."""
-        return self._take(switch.put_back(self._state, former, self._here))
+        return self._take(switch.restore(self._state, former, self._here))
 
     def asked(self, now: float) -> None:
         """A window is on its way to the twin."""
@@ -107,16 +109,17 @@ class Supervisor:
         """As kept by the last boot, otherwise as configured."""
         kept = None if self._store is None else self._store.load()
         first = self._settings.parameters if kept is None else kept
-        if first.gains is None and self._settings.controller is not None:
-            return replace(first, gains=gains_of(self._settings.controller))
+        if first.setting.gains is None and self._settings.controller is not None:
+            setting = msgspec.structs.replace(first.setting, gains=gains_of(self._settings.controller))
+            return replace(first, setting=setting)
         return first
 
     def _new_watch(self) -> Watch | None:
         s = self._settings
         if self._fallback is None or s.supervision.watch is None:
             return None
-        watch = Watch(s.supervision.watch, s.sample_rate, s.reference, self._fallback.band)
-        watch.restart(self.parameters.band, 0)
+        watch = Watch(s.supervision.watch, s.sample_rate, s.reference, self._fallback.setting.band)
+        watch.restart(self.parameters.setting.band, 0)
         return watch
 
     def _take(self, step: Step) -> Said:
@@ -125,7 +128,7 @@ class Supervisor:
         if self._state.current is not before.current:
             self._saved = False
             if self._watch is not None:
-                self._watch.restart(self.parameters.band, self.parameters.sample)
+                self._watch.restart(self.parameters.setting.band, self.parameters.sample)
             self._keep()
         return step.said
 

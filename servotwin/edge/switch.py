@@ -16,13 +16,15 @@ every update that stands on data from before. After a second fallback, updates a
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import msgspec
+
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant, applied, judge, receipt, repeats
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.verdict import FallbackSet, Verdict
-from servotwin.messages import Cause, Fallback, Gains, Reason, Receipt, Update
+from servotwin.messages import Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 
 MOST_DOUBLINGS = 6
 REFUSED_S = 10.0
@@ -116,15 +118,15 @@ def settle(state: Switch, rules: Rules, here: Instant, error: float | None) -> S
 
 def fall_back(state: Switch, fallback: FallbackSet, verdict: Verdict, here: Instant) -> Step:
     """The fallback set at the next sample, whatever the error is; what waits is refused."""
-    gains = fallback.gains or state.current.gains
-    new = Parameters(0, fallback.tolerance, here.time, gains=gains, band=fallback.band, fallback=True)
-    return _leave(state, new, fallback.gains, verdict, fallback.refuse_s, here)
+    setting = msgspec.structs.replace(fallback.setting, gains=fallback.setting.gains or state.current.setting.gains)
+    new = Parameters(0, setting, here.time, fallback=True)
+    return _leave(state, new, fallback.setting.gains, verdict, fallback.refuse_s, here)
 
 
-def put_back(state: Switch, former: Parameters, here: Instant) -> Step:
+def restore(state: Switch, former: Parameters, here: Instant) -> Step:
     """What the drive runs on, as it does not take what is in force; what waits is refused."""
     new = replace(former, data_time=here.time, window=None)
-    return _leave(state, new, former.gains, Verdict(Cause.DRIVE, 0.0, 0.0), REFUSED_S, here)
+    return _leave(state, new, former.setting.gains, Verdict(Cause.DRIVE, 0.0, 0.0), REFUSED_S, here)
 
 
 def _leave(
@@ -135,7 +137,9 @@ def _leave(
     version = 1 + max(old.version, 0 if waiting is None else waiting.update.version)
     not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, MOST_DOUBLINGS) * here.rate)
     new = replace(new, version=version, sample=here.sample, not_before=not_before)
-    told = Fallback(here.servo, here.boot, here.sample, *verdict, old.version, version, new.tolerance, gains)
+    told = Fallback(
+        here.servo, here.boot, here.sample, *verdict, old.version, version, Setting(new.setting.tolerance, gains)
+    )
     refused = () if waiting is None else (receipt(waiting.update, Reason.AFTER_FALLBACK, here.sample, new, here),)
     return Step(Switch(new, None, state.fallbacks + 1), (*refused, told))
 
@@ -160,8 +164,8 @@ def is_safe(old: Parameters, new: Parameters, controller: Controller | None, err
 
 def _thresholds(parameters: Parameters, controller: Controller | None) -> tuple[float, float]:
     if controller is None:
-        return parameters.tolerance, parameters.tolerance
-    return with_gains(controller, parameters.gains).thresholds(parameters.tolerance)
+        return parameters.setting.tolerance, parameters.setting.tolerance
+    return with_gains(controller, parameters.setting.gains).thresholds(parameters.setting.tolerance)
 
 
 def _judge_beside(update: Update, state: Switch, rules: Rules, here: Instant) -> Reason:

@@ -5,7 +5,7 @@ from math import inf
 from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
-from servotwin.messages import Band, Cause, Gains
+from servotwin.messages import Band, Cause, Setting
 
 
 class Verdict(NamedTuple):
@@ -35,16 +35,12 @@ def judged_by(predicted: Band | None, certified: Band | None) -> Band | None:
 
 @dataclass(frozen=True, slots=True)
 class FallbackSet:
-    """Parameters that hold for every gap in the servo's stated range.
+    """Setting that serves every gap in the servo's stated range, and when the edge falls back to it.
 
     Parameters
     ----------
-    tolerance : float
-        m; 0: no dead zone.
-    gains : Gains, optional
-        None: the gains stay.
-    band : Band, optional
-        What the loop stays within under them: certified for the servo. No update may do worse in error and settling,
+    setting : Setting
+        Gains None: the gains stay. The band is certified for the servo: no update may do worse in error and settling,
         whatever it predicts.
     silence_s : float
         The twin may leave a window unanswered this long before the edge falls back; inf: for ever.
@@ -52,15 +48,13 @@ class FallbackSet:
         Updates are refused this long after the first fallback, twice as long after each further one.
     """
 
-    tolerance: float
-    gains: Gains | None = None
-    band: Band | None = None
+    setting: Setting
     silence_s: float = inf
     refuse_s: float = 10.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.tolerance < inf:
-            raise InvalidInput(f"fallback tolerance = {self.tolerance!r} m: must be finite and at least 0")
+        if not self.setting.has_valid_tolerance():
+            raise InvalidInput(f"fallback tolerance = {self.setting.tolerance!r} m: must be finite and at least 0")
         if not self.silence_s > 0.0:
             raise InvalidInput(f"fallback silence_s = {self.silence_s!r} s: must be greater than 0")
         if not 0.0 <= self.refuse_s < inf:

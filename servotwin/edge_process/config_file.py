@@ -17,7 +17,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
 from servotwin.edge_process.config_writer import edge_toml
-from servotwin.messages import Gains
+from servotwin.messages import Gains, Setting
 from servotwin.runtime.retry import Retry
 
 __all__ = ["edge_toml", "load", "read"]
@@ -140,8 +140,10 @@ def _start(table: Table, controller: Controller | None) -> Parameters:
     """In force before the first update."""
     some = gains_given(table)
     return Parameters(
-        tolerance=edgefile.length(table, "tolerance", 0.0),
-        gains=read_gains(table, controller) if some and controller is not None else None,
-        band=part(table, "band", edgefile.band) if "band" in table.values else None,
+        setting=Setting(
+            edgefile.length(table, "tolerance", 0.0),
+            gains=read_gains(table, controller) if some and controller is not None else None,
+            band=part(table, "band", edgefile.band) if "band" in table.values else None,
+        ),
         fallback=table.boolean("fallback", False),
     )

@@ -79,9 +79,9 @@ def _all(described: Any, names: Mapping[str, str] | None = None) -> Values:
 
 
 def _start(parameters: Parameters) -> Values:
-    values: Values = {"tolerance_m": parameters.tolerance, "fallback": parameters.fallback}
-    values |= {} if parameters.gains is None else written_gains(parameters.gains)
-    return values | _band(parameters.band)
+    values: Values = {"tolerance_m": parameters.setting.tolerance, "fallback": parameters.fallback}
+    values |= {} if parameters.setting.gains is None else written_gains(parameters.setting.gains)
+    return values | _band(parameters.setting.band)
 
 
 def _band(band: Band | None) -> Values:
@@ -104,7 +104,7 @@ def _supervision(supervision: Supervision) -> Values:
 
 def _fallback(fallback: FallbackSet) -> Values:
     names = ("silence_s", "refuse_s")
-    values: Values = {"tolerance_m": fallback.tolerance, **{name: getattr(fallback, name) for name in names}}
-    own: Gains | None = fallback.gains
+    values: Values = {"tolerance_m": fallback.setting.tolerance, **{name: getattr(fallback, name) for name in names}}
+    own: Gains | None = fallback.setting.gains
     values |= {"gains_stay": True} if own is None else written_gains(own)
-    return values | _band(fallback.band)
+    return values | _band(fallback.setting.band)

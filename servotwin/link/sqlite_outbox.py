@@ -1,8 +1,8 @@
 """An outbox on disk: windows and letters that outlive the process, and what else the link has to remember.
 
 The disk may be full, read-only or broken; the outbox goes on. What it knows is in memory first (an index, and the few
-rows that the disk does not have yet), and every change is written in one transaction before it counts as done; a change that
-cannot be written is tried again. Every statement may be repeated, so that nothing depends on how far one got.
+rows that the disk does not have yet), and every change is written in one transaction before it counts as done; a change
+that cannot be written is tried again. Every statement may be repeated, so that nothing depends on how far one got.
 """
 
 from __future__ import annotations
@@ -259,7 +259,10 @@ class SqliteOutbox:
         found = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
-        self._index = {**{key: entry for key, entry in found.items() if ("window", key) not in self._unwritten}, **self._index}
+        self._index = {
+            **{key: entry for key, entry in found.items() if ("window", key) not in self._unwritten},
+            **self._index,
+        }
         self._letters = {**{each: None for each in letters if ("letter", each) not in self._unwritten}, **self._letters}
         self._counts = Counter(counts) | self._counts
         self._notes = dict(connection.execute("SELECT name, value FROM notes").fetchall()) | self._notes

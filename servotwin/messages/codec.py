@@ -6,6 +6,7 @@ import msgspec
 
 from servotwin.messages.channels import checksum
 from servotwin.messages.checks import InvalidMessage, require
+from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Request
 from servotwin.messages.updates import Fallback, Receipt, Update
@@ -25,6 +26,7 @@ class _Tagged(msgspec.Struct):
     type: str
 
 
+_UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError, OverflowError)
 _SCHEMAS = frozenset(kind.__struct_config__.tag for kind in get_args(Message))
 _encoder = msgspec.msgpack.Encoder()
 _decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
@@ -71,15 +73,13 @@ def _guarded(
         return decoder.decode(data)
     except InvalidMessage:
         raise
-    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-        raise InvalidMessage(f"message not understood: {error}", _refusal_of(decoder, data)) from None
-
-
-def _refusal_of(decoder: object, data: bytes) -> Refusal:
-    """Whether a message that was not understood is of a schema that this version does not know."""
-    read = msgspec.json.decode if decoder is _json_decoder else msgspec.msgpack.decode
-    try:
-        tag = read(data, type=_Tagged).type
-    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
-        return Refusal.NOT_UNDERSTOOD
-    return Refusal.NOT_UNDERSTOOD if tag in _SCHEMAS else Refusal.UNKNOWN_SCHEMA
+    except _UNREADABLE as error:
+        read = msgspec.json.decode if decoder is _json_decoder else msgspec.msgpack.decode
+        try:
+            tag = read(data, type=_Tagged).type
+            if tag in LEGACY_TAGS and len(data) <= MAX_LEGACY_BYTES:
+                return msgspec.convert(upgrade(read(data)), decoder.type)
+        except _UNREADABLE as again:
+            raise InvalidMessage(f"message not understood: {again}") from None
+        refusal = Refusal.NOT_UNDERSTOOD if tag in _SCHEMAS else Refusal.UNKNOWN_SCHEMA
+        raise InvalidMessage(f"message not understood: {error}", refusal) from None

@@ -7,6 +7,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text, all_finite, require
+from servotwin.messages.setting import Setting
 
 
 class Reason(StrEnum):
@@ -41,62 +42,8 @@ class Cause(StrEnum):
     DRIVE = "the drive does not take the parameters"
 
 
-class Gains(Struct, frozen=True):
-    """What of a controller an update may set; limits and rates stay the edge's.
-
-    Attributes
-    ----------
-    Kp, Ki, Kd, Tf : float
-        V/m, V/(m s), V s/m, s.
-    enter, leave : float
-        Thresholds of the dead zone, in tolerances.
-    feedforward : float
-        V.
-    """
-
-    Kp: float
-    Ki: float
-    Kd: float
-    Tf: float
-    enter: float = 1.0
-    leave: float = 1.0
-    feedforward: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            require(isfinite(getattr(self, name)), f"gains {name} {getattr(self, name)} is not finite")
-        require(self.Tf > 0.0, f"gains Tf {self.Tf} s is not positive")
-        require(0.0 <= self.enter <= self.leave, f"gains enter {self.enter}, leave {self.leave}: not in order")
-
-
-class Band(Struct, frozen=True):
-    """What the loop is predicted to stay within while its reference rests.
-
-    Attributes
-    ----------
-    error : float
-        Largest tracking error, m.
-    error_rms : float
-        m.
-    effort : float
-        Root mean square of the voltage, V.
-    settling : float
-        s after a change of the reference from which on the band holds.
-    """
-
-    error: float
-    error_rms: float
-    effort: float
-    settling: float
-
-    def __post_init__(self) -> None:
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
-            require(isfinite(value) and value >= 0.0, f"band {name} {value} is not allowed")
-
-
-class Proof(Struct, frozen=True):
-    """What a setting showed in simulation before it was sent; numbers that another twin finds again.
+class Verification(Struct, frozen=True):
+    """Result of simulating a setting before it is sent; another twin computes the same numbers.
 
     Attributes
     ----------
@@ -124,11 +71,11 @@ class Proof(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
-            require(isfinite(getattr(self, name)), f"proof {name} {getattr(self, name)} is not finite")
-        require(0.0 <= self.settled <= 1.0, f"proof settled {self.settled} is no share")
+            require(isfinite(getattr(self, name)), f"verification {name} {getattr(self, name)} is not finite")
+        require(0.0 <= self.settled <= 1.0, f"verification settled {self.settled} is no share")
 
 
-class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
+class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
     """New parameters for the edge, and what they stand on.
 
     Attributes
@@ -143,16 +90,12 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
         The estimate, rad; None where unknown or unbounded.
     status : str
         The estimate's status.
-    tolerance : float
-        Dead-zone half-width, m; 0: no dead zone.
+    setting : Setting
+        Dead zone, gains and predicted band; gains None: the gains stay.
     not_after : float
         Sample time of the edge from which on it must not be applied, s.
-    controller : Gains, optional
-        None: the gains stay.
-    band : Band, optional
-        What the loop is predicted to stay within; None: nothing is predicted.
-    proof : Proof, optional
-        What the setting showed in simulation; None: nothing was proved.
+    verification : Verification, optional
+        Result of simulating the setting; None: it was not verified.
     """
 
     servo: Name
@@ -164,18 +107,15 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/1"):
     std: float | None
     interval: tuple[float | None, float | None]
     status: Text
-    tolerance: float
+    setting: Setting
     not_after: float
-    controller: Gains | None = None
-    band: Band | None = None
-    proof: Proof | None = None
+    verification: Verification | None = None
 
     def __post_init__(self) -> None:
         require(isfinite(self.data_time), f"update data_time {self.data_time} s is not finite")
         require(isfinite(self.not_after), f"update not_after {self.not_after} s is not finite")
-        require(
-            isfinite(self.tolerance) and self.tolerance >= 0.0, f"update tolerance {self.tolerance} m is not allowed"
-        )
+        tolerance = self.setting.tolerance
+        require(self.setting.has_valid_tolerance(), f"update tolerance {tolerance} m is not allowed")
         known = (x for x in (self.gap, self.std, *self.interval) if x is not None)
         require(all_finite(known), "update gap, std and interval must be finite, or None where unknown or unbounded")
 
@@ -205,7 +145,7 @@ class Receipt(Struct, frozen=True, tag="receipt/1"):
     boot: Name
 
 
-class Fallback(Struct, frozen=True, tag="fallback/1"):
+class Fallback(Struct, frozen=True, tag="fallback/2"):
     """The edge left the parameters in force for its own fallback set, on its own evidence.
 
     Attributes
@@ -219,10 +159,8 @@ class Fallback(Struct, frozen=True, tag="fallback/1"):
         The version that was in force.
     parameter_version : int
         The fallback set's: what the twin has to base its next update on.
-    tolerance : float
-        Of the fallback set, m.
-    controller : Gains, optional
-        Of the fallback set; None: the gains stayed.
+    setting : Setting
+        The fallback set; gains None: the gains stayed.
     """
 
     servo: Name
@@ -233,11 +171,10 @@ class Fallback(Struct, frozen=True, tag="fallback/1"):
     allowed: float
     replaced: Count
     parameter_version: Count
-    tolerance: float
-    controller: Gains | None = None
+    setting: Setting
 
     def __post_init__(self) -> None:
         require(
-            all_finite((self.measured, self.allowed, self.tolerance)),
+            all_finite((self.measured, self.allowed, self.setting.tolerance)),
             "fallback measured, allowed and tolerance must be finite",
         )

@@ -7,7 +7,7 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.channels import Channel
 from servotwin.messages.checks import Count, Name, Text, all_finite, require
-from servotwin.messages.updates import Gains
+from servotwin.messages.setting import Setting
 
 
 class Window(Struct, frozen=True, tag="window/1"):
@@ -71,7 +71,7 @@ class Window(Struct, frozen=True, tag="window/1"):
         return next((channel for channel in self.channels if channel.name == name), None)
 
 
-class Hello(Struct, frozen=True, omit_defaults=True, tag="hello/1"):
+class Hello(Struct, frozen=True, tag="hello/2"):
     """The edge introduces itself after a start or a reconnection.
 
     Attributes
@@ -82,12 +82,10 @@ class Hello(Struct, frozen=True, omit_defaults=True, tag="hello/1"):
         Hz.
     parameter_version : int
         In force.
-    tolerance : float
-        In force, m.
+    setting : Setting
+        In force; after a restart, the one that the loop kept its band under last. Gains None: updates set none there.
     model_version : str
         Which description of the servo it runs on.
-    controller : Gains, optional
-        In force: after a restart, those that were proved last at the machine. None: updates set none there.
     """
 
     servo: Name
@@ -95,12 +93,13 @@ class Hello(Struct, frozen=True, omit_defaults=True, tag="hello/1"):
     time: float
     rate: float
     parameter_version: Count
-    tolerance: float
+    setting: Setting
     model_version: Text
-    controller: Gains | None = None
 
     def __post_init__(self) -> None:
-        require(all_finite((self.time, self.rate, self.tolerance)), "hello time, rate and tolerance must be finite")
+        require(
+            all_finite((self.time, self.rate, self.setting.tolerance)), "hello time, rate and tolerance must be finite"
+        )
 
 
 class Acknowledge(Struct, frozen=True, tag="ack/1"):

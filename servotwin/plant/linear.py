@@ -1,29 +1,48 @@
-"""Linear single-input single-output systems, held twice: as state space for time, as polynomials for frequency.
+"""Linear single-input single-output systems, in two forms: state space for time, polynomials for frequency.
 
 Both forms are built side by side from physical parameters, so neither suffers from a conversion.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.motor import ANGLE, SPEED, motor_transfer
-from servotwin.plant.polynomials import minus, plus, times
 from servotwin.plant.signals import Array
-from servotwin.plant.structure import Chain, transfer
-
-if TYPE_CHECKING:
-    from servotwin.control.controller import Controller
-    from servotwin.plant.servo import Servo
 
 Complex = NDArray[np.complex128]
+# Rounding error of a fraction of polynomials, relative, beyond which the response is computed from the matrices: the
+# power basis loses about a factor of six per mass of a chain.
+_ROUNDED = 1e-9
+
+
+def times(first: Array, second: Array) -> Array:
+    """Product of two polynomials with ascending coefficients."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(poly.polymul(first, second), dtype=float)
+
+
+def plus(first: Array, second: Array) -> Array:
+    """Sum of two polynomials."""
+    return np.asarray(poly.polyadd(first, second), dtype=float)
+
+
+def minus(first: Array, second: Array) -> Array:
+    """Difference of two polynomials."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(poly.polysub(first, second), dtype=float)
+
+
+def product(factors: Iterable[Array]) -> Array:
+    """Product of any number of polynomials."""
+    return reduce(times, factors, np.array([1.0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,22 +64,73 @@ class LinearSystem:
     denominator: Array
 
     def response(self, omega: ArrayLike) -> Complex:
-        """G(j omega) for omega in rad/s."""
+        """G(j omega) for omega in rad/s; from the matrices where rounding spoils the polynomials."""
         s = 1j * np.asarray(omega, dtype=float)
-        return np.asarray(poly.polyval(s, self.numerator) / poly.polyval(s, self.denominator))
+        with np.errstate(all="ignore"):
+            above, below = poly.polyval(s, self.numerator), poly.polyval(s, self.denominator)
+            values = np.asarray(above / below, dtype=complex)
+            sizes = [poly.polyval(np.abs(s), np.abs(p)) for p in (self.numerator, self.denominator)]
+            error = np.finfo(float).eps * (sizes[0] / np.abs(above) + sizes[1] / np.abs(below))
+        spoilt = ~(error < _ROUNDED) & ((s != 0.0) | (not self._has_polynomials))
+        if spoilt.any():
+            values = values.copy()
+            values[spoilt] = self._response_of_states(s[spoilt])
+        return values
+
+    @cached_property
+    def _has_polynomials(self) -> bool:
+        """False where a chain is so long that its coefficients overflow."""
+        return bool(np.isfinite(self.numerator).all() and np.isfinite(self.denominator).all())
+
+    @np.errstate(all="ignore")
+    def _response_of_states(self, s: Complex) -> Complex:
+        """C (s - A)^-1 B + D for (K,) s, by back substitution in the Schur form."""
+        triangular, entries, exits = self._schur
+        states = np.zeros((triangular.shape[0], s.size), dtype=complex)
+        for i in range(len(states) - 1, -1, -1):
+            states[i] = (entries[i] + triangular[i, i + 1 :] @ states[i + 1 :]) / (s - triangular[i, i])
+        return np.asarray(exits @ states + self.D)
+
+    @cached_property
+    def _schur(self) -> tuple[Complex, Complex, Complex]:
+        """A balanced and made triangular, with B and C in its states."""
+        from scipy.linalg import matrix_balance, schur, solve
+
+        balanced, scaling = matrix_balance(self.A)
+        triangular, unitary = schur(balanced, output="complex")
+        return triangular, unitary.conj().T @ solve(scaling, self.B), (self.C @ scaling) @ unitary
+
+    def zeros(self) -> Complex:
+        """(K,) zeros, 1/s, the roots of the numerator; none where it overflows."""
+        if not self._has_polynomials:
+            return np.zeros(0, dtype=complex)
+        kept = np.flatnonzero(self.numerator)
+        return np.asarray(poly.polyroots(self.numerator[: kept[-1] + 1] if kept.size else [1.0]), dtype=complex)
+
+    def asymptotic_crossovers(self) -> Array:
+        """(K,) rad/s at which the asymptotes of abs(G) at low and at high frequency are one."""
+        if not self._has_polynomials:
+            return np.zeros(0)
+        above, below = np.flatnonzero(self.numerator), np.flatnonzero(self.denominator)
+        found = []
+        for end in (0, -1) if above.size else ():
+            order = int(below[end] - above[end])
+            if order != 0:
+                found.append(abs(self.numerator[above[end]] / self.denominator[below[end]]) ** (1.0 / order))
+        return np.array([each for each in found if 0.0 < each < np.inf])
 
     def poles(self) -> Complex:
         """(N,) eigenvalues of A, 1/s."""
         return np.asarray(np.linalg.eigvals(self.A), dtype=complex)
 
     def is_stable(self) -> bool:
-        """Whether every pole lies left of the imaginary axis."""
+        """True when every pole lies left of the imaginary axis."""
         return self.A.size == 0 or bool(np.max(self.poles().real) < 0.0)
 
     def step(self, time: ArrayLike) -> Array:
         """(n,) response at equally spaced times (s, from 0) to a unit step, exact by a matrix exponential (Fig 5a)."""
         time = np.asarray(time, dtype=float)
-        advance, drive = held(self.A, self.B, float(time[1] - time[0]))
+        advance, drive = zero_order_hold(self.A, self.B, float(time[1] - time[0]))
         states = np.zeros((time.size, self.B.size))
         for i in range(1, time.size):
             states[i] = advance @ states[i - 1] + drive
@@ -81,7 +151,7 @@ class LinearSystem:
         return control.ss(self.A, self.B[:, None], self.C[None, :], [[self.D]])
 
 
-def held(A: Array, B: Array, step: float) -> tuple[Array, Array]:
+def zero_order_hold(A: Array, B: Array, step: float) -> tuple[Array, Array]:
     """(A_d, B_d) of x' = A x + B u over `step` seconds of constant u (zero-order hold), by a matrix exponential."""
     from scipy.linalg import expm
 
@@ -150,68 +220,13 @@ def feedback(forward: LinearSystem, back: LinearSystem) -> LinearSystem:
     return LinearSystem(A, B, C, 0.0, times(forward.numerator, back.denominator), denominator)
 
 
-def motor(servo: Servo) -> LinearSystem:
-    """G1, voltage to the unloaded motor's angle (Eq 8)."""
-    A, B, _ = servo.motor()
-    numbers = (servo.J, servo.L, servo.R, servo.k_T, servo.k_B)
-    return LinearSystem(A, B, np.eye(3)[ANGLE], 0.0, *motor_transfer(*numbers))
-
-
-def structure(servo: Servo) -> LinearSystem:
-    """G2, angle of the screw to the position of the last mass (Eq 13 for n = 3).
-
-    The input's derivative is absorbed by the state: z = x - B_velocity d.
-    """
-    links = servo.chain()
-    B = servo.p * (links.B_position + links.A @ links.B_velocity)
-    numerator, denominator, _ = transfer(servo.masses, servo.stiffnesses, servo.dampings, servo.k_d)
-    return LinearSystem(links.A, B, links.C_last, 0.0, servo.p * numerator, denominator)
-
-
-def plant(servo: Servo) -> LinearSystem:
-    """Voltage to the position of the last mass without a gap: G1 G2; with finite k_d the load acts on the motor."""
-    if servo.rigid:
-        return series(motor(servo), structure(servo))
-    return _loaded(servo, servo.chain())
-
-
-def _loaded(servo: Servo, links: Chain) -> LinearSystem:
-    """Motor and chain coupled: the screw's force F turns the motor back with the torque p F."""
-    A_m, B_m, E = servo.motor()
-    size = links.B_position.size
-    A = np.zeros((3 + size, 3 + size))
-    A[:3, :3], A[3:, 3:] = A_m, links.A
-    A[3:, ANGLE] = servo.p * links.B_position
-    A[SPEED, 3:] = -servo.p * E[SPEED] * links.reaction
-    A[SPEED, ANGLE] = -servo.p * E[SPEED] * links.reaction_position * servo.p
-    B = np.concatenate([B_m, np.zeros(size)])
-    C = np.concatenate([np.zeros(3), links.C_last])
-    return LinearSystem(A, B, C, 0.0, *_loaded_transfer(servo))
-
-
-def _loaded_transfer(servo: Servo) -> tuple[Array, Array]:
-    """(L s + R)(J s^2 theta + p F) = k_T (u - k_B s theta), F = k_d p theta (1 - k_d inner / whole)."""
-    numerator, whole, inner = transfer(servo.masses, servo.stiffnesses, servo.dampings, servo.k_d)
-    electric = np.array([servo.R, servo.L])
-    reaction = servo.p**2 * servo.k_d * minus(whole, servo.k_d * inner)
-    mechanical = plus(times(np.array([0.0, 0.0, servo.J]), whole), reaction)
-    back_emf = times(np.array([0.0, servo.k_T * servo.k_B]), whole)
-    return servo.k_T * servo.p * numerator, plus(times(electric, mechanical), back_emf)
-
-
-def pidf(controller: Controller) -> LinearSystem:
-    """C_PIDF = Kp + Ki/s + Kd s/(Tf s + 1) (Eq 14); terms whose gain is zero have no state."""
-    system = gain(controller.Kp)
-    if controller.Ki != 0.0:
-        system = parallel(system, integrator(controller.Ki))
-    if controller.Kd != 0.0:
-        rate = controller.Kd / controller.Tf
-        system = parallel(system, parallel(gain(rate), lag(-rate, controller.Tf)))
-    return system
-
-
-def loop_filter(controller: Controller) -> LinearSystem:
-    """The first-order low-pass on the measurement (section 4.3), or 1 where there is none."""
-    if controller.loop_filter_hz is None:
-        return gain(1.0)
-    return lag(1.0, 1.0 / (2.0 * math.pi * controller.loop_filter_hz))
+def realised(numerator: Array, denominator: Array) -> LinearSystem:
+    """A proper fraction of polynomials, ascending powers of s, in controllable form."""
+    order = denominator.size - 1
+    above = np.append(numerator, np.zeros(denominator.size - numerator.size))
+    direct = float(above[-1] / denominator[-1])
+    rest = (above - direct * denominator)[:-1] / denominator[-1]
+    A = np.eye(order, k=1)
+    A[-1:] = -denominator[:-1] / denominator[-1]
+    B = np.eye(order)[-1] if order else np.zeros(0)
+    return LinearSystem(A, B, rest, direct, numerator, denominator)

@@ -1,6 +1,8 @@
-"""Crossovers, margins, sensitivity peak and bandwidth of a loop.
+"""Crossovers, margins, sensitivity peak and bandwidth of a loop, from its frequency response.
 
-All are located as roots of polynomials on the imaginary axis and polished; nothing is looked up on a frequency grid.
+The response is searched on frequencies that resolve every pole and zero; every crossing and peak is then refined to
+rounding. A model, a model with a delay and measured data go the same way. Roots of polynomials are not used: those of a
+chain of many masses, or of a stiff one, are too ill-conditioned.
 """
 
 from __future__ import annotations
@@ -10,18 +12,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import polynomial as poly
 
-from servotwin.plant.linear import LinearSystem
-from servotwin.plant.polynomials import minus, mirrored, on_axis, plus, positive_roots, squared_modulus, times
+from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.signals import Array
 
-_PEAK_ACCURACY = 1e-10
+_PER_DECADE = 60
+# Frequencies about each pole and zero, in its half widths.
+_ABOUT_RESONANCE = np.array([-8.0, -4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0, 8.0])
+# Least half width of a pole or zero as a part of its modulus: an undamped one has none of its own.
+_NARROWEST = 1e-6
+# Distance from zero, in the units of the searched function, within which an extreme between two frequencies may cross
+# it unseen: the frequencies resolve every resonance, so extremes are off by far less.
+_NEAR = 0.2
+_DISTINCT = 1e-8
+_ROUNDING = 4.0 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
 class GainCrossover:
-    """Where abs(L) = 1: `omega` in rad/s, and the phase margin there in rad, within (-pi, pi]."""
+    """A frequency with abs(L) = 1: `omega` in rad/s, and the phase margin there in rad, within (-pi, pi]."""
 
     omega: float
     phase_margin: float
@@ -29,7 +38,7 @@ class GainCrossover:
 
 @dataclass(frozen=True)
 class PhaseCrossover:
-    """Where L is real and negative: `omega` in rad/s, and the gain margin there, 1 / abs(L)."""
+    """A frequency at which L is real and negative: `omega` in rad/s, and the gain margin there, 1 / abs(L)."""
 
     omega: float
     gain_margin: float
@@ -37,18 +46,19 @@ class PhaseCrossover:
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from instability.
+    """Distance of a loop from instability.
 
     Attributes
     ----------
     gain_crossovers, phase_crossovers : tuple
         All of them, by frequency.
     Ms, Ms_omega : float
-        Largest abs(1 / (1 + L)) and where, rad/s; (inf, nan) for an unstable closed loop.
+        Largest abs(1 / (1 + L)) and its frequency, rad/s (inf where it is only approached); (inf, nan) for an unstable
+        closed loop.
     bandwidth : float
-        rad/s, where the closed loop first falls 3 dB below its gain at rest; inf where it never does.
+        rad/s at which the closed loop first falls 3 dB below its gain at rest; inf where it never does.
     stable : bool
-        Of the closed loop, from its poles; without it margins mean little.
+        Stability of the closed loop; without it margins mean little.
     """
 
     gain_crossovers: tuple[GainCrossover, ...]
@@ -61,112 +71,181 @@ class Margins:
 
 def margins(loop: LinearSystem, closed_loop: LinearSystem) -> Margins:
     """All margins of L and of the closed loop made from it."""
-    stable = closed_loop.is_stable()
-    Ms_omega, Ms = peak(loop.denominator, plus(loop.denominator, loop.numerator)) if stable else (math.nan, math.inf)
-    return Margins(gain_crossovers(loop), phase_crossovers(loop), Ms, Ms_omega, bandwidth(closed_loop), stable)
+    return margins_of_response(
+        loop.response,
+        search_frequencies(loop, closed_loop),
+        stable=closed_loop.is_stable(),
+        closed_loop=closed_loop.response,
+        at_rest=float(np.abs(closed_loop.response(0.0))),
+        at_infinity=loop.D,
+    )
+
+
+def margins_of_response(
+    loop: Callable[[Array], Complex],
+    omega: Array,
+    stable: bool,
+    closed_loop: Callable[[Array], Complex] | None = None,
+    at_rest: float | None = None,
+    at_infinity: float = 0.0,
+) -> Margins:
+    """All margins of a loop that is known by its response.
+
+    Parameters
+    ----------
+    loop : callable
+        L(j omega) for (N,) frequencies in rad/s.
+    omega : (N,) array
+        rad/s, ascending: frequencies that resolve the response.
+    stable : bool
+        Stability of the closed loop.
+    closed_loop : callable, optional
+        Response of the closed loop; L / (1 + L) by default.
+    at_rest : float, optional
+        Gain of the closed loop at rest; that at the lowest frequency by default.
+    at_infinity : float
+        L at infinite frequency.
+    """
+
+    def closed(w: Array) -> Complex:
+        if closed_loop is not None:
+            return closed_loop(w)
+        value = loop(w)
+        return np.asarray(value / (1.0 + value))
+
+    rest = float(np.abs(closed(omega[:1]))[0]) if at_rest is None else at_rest
+    falls = crossings(lambda w: _log_modulus(closed(w)) - math.log(rest / math.sqrt(2.0)), omega)
+    Ms_omega, Ms = math.nan, math.inf
+    if stable:
+        limit = 1.0 / abs(1.0 + at_infinity)
+        Ms_omega, Ms = max(_peak(lambda w: 1.0 / np.abs(1.0 + loop(w)), omega), (math.inf, limit), key=lambda p: p[1])
+    return Margins(
+        gain_crossovers=_gain_crossovers(loop, omega),
+        phase_crossovers=_phase_crossovers(loop, omega),
+        Ms=Ms,
+        Ms_omega=Ms_omega,
+        bandwidth=falls[0] if falls else math.inf,
+        stable=stable,
+    )
 
 
 def gain_crossovers(loop: LinearSystem) -> tuple[GainCrossover, ...]:
     """All frequencies with abs(L) = 1, by frequency."""
-    found = level_crossings(loop.numerator, loop.denominator, 1.0)
-    return tuple(GainCrossover(float(w), _margin(complex(loop.response(w)))) for w in found)
-
-
-def phase_crossovers(loop: LinearSystem) -> tuple[PhaseCrossover, ...]:
-    """All frequencies at which L is real and negative, by frequency."""
-    numerator, denominator = loop.numerator, loop.denominator
-    starts = np.sqrt(positive_roots(on_axis(times(numerator, mirrored(denominator)))[1]))
-
-    def error(w: float) -> tuple[float, float]:
-        s = 1j * w
-        value = -poly.polyval(s, numerator) / poly.polyval(s, denominator)
-        return math.atan2(value.imag, value.real), _log_slope(numerator, denominator, s).real
-
-    found = [w for start in starts if (w := _polished(error, float(start))) is not None]
-    values = [(float(w), float(np.abs(loop.response(w)))) for w in _distinct(found) if loop.response(w).real < 0.0]
-    return tuple(PhaseCrossover(w, 1.0 / value) for w, value in values)
+    return _gain_crossovers(loop.response, search_frequencies(loop))
 
 
 def bandwidth(closed_loop: LinearSystem) -> float:
     """rad/s at which abs(T) first falls 3 dB below abs(T(0)); inf where it never does."""
-    at_rest = float(np.abs(closed_loop.response(0.0)))
-    found = level_crossings(closed_loop.numerator, closed_loop.denominator, at_rest / math.sqrt(2.0))
-    return float(found[0]) if found.size else math.inf
+    level = math.log(float(np.abs(closed_loop.response(0.0))) / math.sqrt(2.0))
+    falls = crossings(lambda w: _log_modulus(closed_loop.response(w)) - level, search_frequencies(closed_loop))
+    return falls[0] if falls else math.inf
 
 
-def level_crossings(numerator: Array, denominator: Array, level: float) -> Array:
-    """(K,) rad/s, ascending: every w > 0 with abs(N(j w) / D(j w)) = level.
+def peak(system: LinearSystem) -> tuple[float, float]:
+    """(omega, value) of the largest abs(G) on the imaginary axis; omega = inf where it is only approached."""
+    found = _peak(lambda w: np.abs(system.response(w)), search_frequencies(system))
+    return max(found, (math.inf, abs(system.D)), key=lambda p: p[1])
 
-    They are the positive roots of abs(N)^2 - level^2 abs(D)^2 in w^2, polished by Newton's method on log abs(N / D).
+
+def search_frequencies(*systems: LinearSystem) -> Array:
+    """(N,) rad/s, ascending: frequencies that resolve every pole and zero and reach beyond the outermost crossings."""
+    corners = np.concatenate([np.concatenate([system.poles(), system.zeros()]) for system in systems])
+    corners = corners[np.isfinite(corners) & (np.abs(corners) > 0.0)]
+    # A loop may cross over far beyond all its corners, where it is its asymptote.
+    sizes = np.concatenate([np.abs(corners), *(system.asymptotic_crossovers() for system in systems)])
+    low, high = (1e-2 * float(sizes.min()), 1e2 * float(sizes.max())) if sizes.size else (1e-2, 1e2)
+    grid = np.geomspace(low, high, int(_PER_DECADE * math.log10(high / low)) + 2)
+    width = np.maximum(np.abs(corners.real), _NARROWEST * np.abs(corners))
+    about = (np.abs(corners.imag) + width * _ABOUT_RESONANCE[:, None]).ravel()
+    omega = np.unique(np.concatenate([grid, sizes, about[(about > low) & (about < high)]]))
+    # Between frequencies that are equal but for rounding a slope has no sign.
+    return np.asarray(omega[np.append(True, np.diff(omega) > _DISTINCT * omega[1:])])
+
+
+def crossings(value: Callable[[Array], Array], omega: Array) -> list[float]:
+    """Zeros of a real function of frequency between the first and last of `omega`, ascending, to rounding.
+
+    Parameters
+    ----------
+    value : callable
+        Function of (N,) frequencies in rad/s, of the order of one.
+    omega : (N,) array
+        rad/s, ascending: frequencies between which the function has at most one extreme.
     """
-    difference = minus(squared_modulus(numerator), level**2 * squared_modulus(denominator))
-
-    def error(w: float) -> tuple[float, float]:
-        s = 1j * w
-        value = abs(poly.polyval(s, numerator) / poly.polyval(s, denominator))
-        return math.log(value / level), -_log_slope(numerator, denominator, s).imag
-
-    starts = np.sqrt(positive_roots(difference))
-    return _distinct([w for start in starts if (w := _polished(error, float(start))) is not None])
+    omega, values = _with_extremes(value, omega)
+    above = values >= 0.0
+    places = np.flatnonzero((above[:-1] != above[1:]) & np.isfinite(values[:-1]) & np.isfinite(values[1:]))
+    return [_zero_between(value, float(omega[i]), float(omega[i + 1])) for i in places]
 
 
-def peak(numerator: Array, denominator: Array) -> tuple[float, float]:
-    """(omega, value) of the largest abs(N / D) on the imaginary axis, to 1e-10; omega = inf where only approached.
+def _zero_between(value: Callable[[Array], Array], low: float, high: float) -> float:
+    from scipy.optimize import brentq
 
-    Between two crossings of a level the function lies above it: raise the level to the value in the middle until
-    nothing crosses it any more (Bruinsma and Steinbuch's two steps).
-    """
+    def at(w: float) -> float:
+        return float(value(np.array([w]))[0])
 
-    def value(w: Array) -> Array:
-        return np.abs(poly.polyval(1j * w, numerator) / poly.polyval(1j * w, denominator))
-
-    omega, level = math.inf, _at_infinity(numerator, denominator)
-    candidates = np.append(0.0, np.abs(poly.polyroots(denominator)))
-    while candidates.size:
-        found = value(candidates)
-        best = int(np.argmax(found))
-        if found[best] > level:
-            omega, level = float(candidates[best]), float(found[best])
-        crossings = level_crossings(numerator, denominator, level * (1.0 + _PEAK_ACCURACY))
-        candidates = np.sqrt(crossings[:-1] * crossings[1:])
-        candidates = candidates[value(candidates) > level * (1.0 + _PEAK_ACCURACY)]
-    return omega, level
+    if (at(low) >= 0.0) == (at(high) >= 0.0):  # evaluated one by one, values about zero may round to the other sign
+        return min(low, high, key=lambda w: abs(at(w)))
+    return float(brentq(at, low, high, xtol=_ROUNDING * low, rtol=_ROUNDING))
 
 
-def _at_infinity(numerator: Array, denominator: Array) -> float:
-    """abs(N / D) for w to infinity, of a proper fraction."""
-    return abs(float(numerator[-1] / denominator[-1])) if numerator.size == denominator.size else 0.0
+def _with_extremes(value: Callable[[Array], Array], omega: Array) -> tuple[Array, Array]:
+    """Frequencies and values, with the extremes between frequencies that come close to zero without crossing it."""
+    values = value(omega)
+    middle = values[1:-1]
+    with np.errstate(invalid="ignore"):
+        side = np.where(middle >= 0.0, 1.0, -1.0)
+        away = (side * middle <= side * values[:-2]) & (side * middle <= side * values[2:])
+        strict = (side * middle < side * values[:-2]) | (side * middle < side * values[2:])
+        close = away & strict & (np.abs(middle) < _NEAR) & (middle != 0.0)
+    places = np.flatnonzero(close) + 1
+    extremes = np.array([_extreme(value, -side[i - 1], omega[i - 1], omega[i + 1])[0] for i in places])
+    everywhere = np.append(omega, extremes)
+    order = np.argsort(everywhere, kind="stable")
+    return everywhere[order], np.append(values, value(extremes) if extremes.size else extremes)[order]
 
 
-def _margin(value: complex) -> float:
-    """Phase of -L, rad."""
-    return math.atan2(-value.imag, -value.real)
+def _extreme(value: Callable[[Array], Array], sign: float, low: float, high: float) -> tuple[float, float]:
+    """(omega, value) of the largest sign * value between two frequencies."""
+    from scipy.optimize import minimize_scalar
 
-
-def _log_slope(numerator: Array, denominator: Array, s: complex) -> complex:
-    """G'(s) / G(s)."""
-    return complex(
-        poly.polyval(s, poly.polyder(numerator)) / poly.polyval(s, numerator)
-        - poly.polyval(s, poly.polyder(denominator)) / poly.polyval(s, denominator)
+    found = minimize_scalar(
+        lambda w: -sign * float(value(np.array([w]))[0]),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-9 * (high - low)},
     )
+    return float(found.x), -sign * float(found.fun)
 
 
-def _polished(error: Callable[[float], tuple[float, float]], start: float) -> float | None:
-    """The root near a start by Newton's method, or None when there is none within a hundredth."""
-    w = start
-    for _ in range(30):
-        value, slope = error(w)
-        step = value / slope if slope != 0.0 else 0.0
-        w -= step
-        if not abs(w - start) <= 0.01 * start:
-            return None
-        if abs(step) <= 4e-16 * w:
-            break
-    return w if abs(error(w)[0]) < 1e-9 else None
+def _peak(value: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
+    """(omega, value) of the largest value: of all local peaks that are close to the highest seen, refined."""
+    values = value(omega)
+    best = int(np.argmax(values))
+    peaks = [(float(omega[best]), float(values[best]))]
+    for i in np.flatnonzero(values >= (1.0 - _NEAR) * values[best]).tolist():
+        low, high = max(i - 1, 0), min(i + 1, omega.size - 1)
+        if values[i] >= values[low] and values[i] >= values[high] and values[i] > min(values[low], values[high]):
+            peaks.append(_extreme(value, 1.0, float(omega[low]), float(omega[high])))
+    return max(peaks, key=lambda p: p[1])
 
 
-def _distinct(found: list[float]) -> Array:
-    """Ascending, equal ones (to 1e-9) once."""
-    ordered = np.sort(np.asarray(found, dtype=float))
-    fresh = np.append(True, np.diff(ordered) > 1e-9 * ordered[1:]) if ordered.size else np.zeros(0, dtype=bool)
-    return np.asarray(ordered[fresh])
+def _gain_crossovers(loop: Callable[[Array], Complex], omega: Array) -> tuple[GainCrossover, ...]:
+    found = crossings(lambda w: _log_modulus(loop(w)), omega)
+    values = [complex(loop(np.array([w]))[0]) for w in found]
+    return tuple(GainCrossover(w, math.atan2(-v.imag, -v.real)) for w, v in zip(found, values, strict=True))
+
+
+def _phase_crossovers(loop: Callable[[Array], Complex], omega: Array) -> tuple[PhaseCrossover, ...]:
+    found = crossings(lambda w: direction(loop(w)).imag, omega)
+    values = [complex(loop(np.array([w]))[0]) for w in found]
+    return tuple(PhaseCrossover(w, 1.0 / abs(v)) for w, v in zip(found, values, strict=True) if v.real < 0.0)
+
+
+def direction(values: Complex) -> Complex:
+    """Each value divided by its modulus."""
+    return np.asarray(values / np.abs(values))
+
+
+def _log_modulus(values: Complex) -> Array:
+    return np.log(np.abs(values))

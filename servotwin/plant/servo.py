@@ -20,13 +20,12 @@ from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_
 from servotwin.config.toml import dumps, read, values_of
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
+from servotwin.plant import loop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
-from servotwin.plant.motor import motor_matrices
-from servotwin.plant.sampled import sampled_poles
+from servotwin.plant.motor import Motor
 from servotwin.plant.signals import Array
-from servotwin.plant.structure import Chain, chain
+from servotwin.plant.structure import Chain, Structure, chain
 
 PerMass: TypeAlias = float | tuple[float, ...]
 _PLANT = (
@@ -117,7 +116,7 @@ class Servo:
 
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
-        """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 say how they differ)."""
+        """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 says how they differ)."""
         if name not in PRESETS:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
@@ -198,7 +197,7 @@ class Servo:
 
     @property
     def rigid(self) -> bool:
-        """Whether the first mass follows the screw (k_d infinite)."""
+        """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
     @property
@@ -214,35 +213,38 @@ class Servo:
         """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
         return self._matrices[1]
 
+    @property
+    def _motor(self) -> Motor:
+        return Motor(self.J, self.L, self.R, self.k_T, self.k_B)
+
+    @property
+    def _structure(self) -> Structure:
+        return Structure(self.masses, self.stiffnesses, self.dampings, self.k_d)
+
     @cached_property
     def _matrices(self) -> tuple[Chain, tuple[Array, Array, Array]]:
         """Structure and motor, computed once: an automaton asks for them dozens of times."""
-        structure = chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
-        return structure, motor_matrices(self.J, self.L, self.R, self.k_T, self.k_B)
+        return chain(self.masses, self.stiffnesses, self.dampings, self.k_d), self._motor.matrices()
 
     def G1(self) -> LinearSystem:
         """Voltage to the unloaded motor's angle (Eq 8)."""
-        return linear.motor(self)
+        return loop.motor_system(self._motor)
 
     def G2(self) -> LinearSystem:
         """Angle of the screw to the position of the last mass (Eq 13)."""
-        return linear.structure(self)
+        return loop.structure_system(self._structure, self.p)
 
     def plant(self) -> LinearSystem:
         """Voltage to the position of the last mass without a gap; G1 G2 with a rigid screw."""
-        return linear.plant(self)
+        return loop.plant_system(self._motor, self._structure, self.p)
 
     def loop(self, controller: Controller | None = None) -> LinearSystem:
         """L = C_PIDF G1 G2 and, where the controller has one, the loop filter; in continuous time, without a gap."""
-        law = controller or self.controller
-        forward = linear.series(linear.pidf(law), linear.plant(self))
-        return linear.series(forward, linear.loop_filter(law))
+        return loop.open_loop(self.plant(), controller or self.controller)
 
     def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
         """Reference to the position of the last mass (Eq 15), in continuous time, without a gap."""
-        law = controller or self.controller
-        forward = linear.series(linear.pidf(law), linear.plant(self))
-        return linear.feedback(forward, linear.loop_filter(law))
+        return loop.closed_loop(self.plant(), controller or self.controller)
 
     def margins(self, controller: Controller | None = None) -> Margins:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
@@ -257,7 +259,7 @@ class Servo:
             With the fastest growing pole.
         """
         law = controller or self.controller
-        worst = _worst_pole(self, law)
+        worst = loop.slowest_pole(self.plant(), law)
         if not worst.real < 0.0:
             rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
             gains = f"Kp = {law.Kp:g} V/m, Ki = {law.Ki:g} V/(m s), Kd = {law.Kd:g} V s/m, Tf = {law.Tf:g} s{rate}"
@@ -268,17 +270,8 @@ class Servo:
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
-        systems = (self.G1(), self.G2(), linear.pidf(self.controller), self.loop(), self.closed_loop())
+        systems = (self.G1(), self.G2(), loop.pidf(self.controller), self.loop(), self.closed_loop())
         return Control(*(system.to_control() for system in systems))
-
-
-def _worst_pole(servo: Servo, controller: Controller) -> complex:
-    """The pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
-    if controller.sample_rate is None:
-        poles = servo.closed_loop(controller).poles()
-        return complex(poles[np.argmax(poles.real)])
-    poles = sampled_poles(servo, controller)
-    return complex(np.log(poles[np.argmax(np.abs(poles))]) * controller.sample_rate)
 
 
 def _spread(value: PerMass, n: int) -> Array:

@@ -8,11 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.plant.polynomials import minus, product, times
+from servotwin.plant.linear import minus, product, times
 from servotwin.plant.signals import Array
+
+
+class Structure(NamedTuple):
+    """Parameters of the chain: (n,) masses (kg), stiffnesses (N/m), dampings (N s/m), stiffness of the screw (N/m)."""
+
+    m: Array
+    k: Array
+    c: Array
+    k_d: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +109,7 @@ def _first_order(m: Array, stiffness: Array, damping: Array) -> Array:
     return np.vstack([upper, np.hstack([-stiffness, -damping]) / m[:, None]])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a chain of a hundred masses overflows: see LinearSystem.response
 def transfer(m: Array, k: Array, c: Array, k_d: float = math.inf) -> tuple[Array, Array, Array]:
     """Polynomials in s, ascending: (numerator of q_n / d, denominator, the same determinant without mass 1).
 

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.uncertainty import Range
 from servotwin.redesign.evidence import Evidence
@@ -63,12 +65,12 @@ class MarginPolicy:
         noise = evidence.disturbance.noise
         least = self.k_noise * noise if math.isfinite(noise) else 0.0
         if high == 0.0:
-            return Redesign(least, estimate.gap, "")
+            return Redesign(Setting(least), estimate.gap, "")
         lost = self.servo.p * high
         k_dz = settling_map(self.servo).least(self.step[0] / lost, self.step[1] / lost)
         if not math.isfinite(k_dz):
             return Redesign(None, math.nan, "no dead zone on the map settles for every step of the stated size")
-        return Redesign(max(k_dz * lost, least), estimate.gap, "")
+        return Redesign(Setting(max(k_dz * lost, least)), estimate.gap, "")
 
 
 @dataclass(frozen=True)
@@ -93,4 +95,4 @@ class HysteresisPolicy:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
         law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
-        return Redesign(self.servo.tolerance_for(estimate.gap), estimate.gap, "", law)
+        return Redesign(Setting(self.servo.tolerance_for(estimate.gap), gains_of(law)), estimate.gap, "")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from servotwin.control.controller import Controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
+from servotwin.messages import Gains, Setting
 
 UNASKED = nothing_known(float("nan"), "nobody looked")
 
@@ -24,10 +24,8 @@ class Evidence:
         Input bias and noise in the same window.
     trend : Trend or None
         Gap and wear from all windows that counted, this one included.
-    controller : Controller or None
-        In force at the edge as last told; None: set by somebody else than this twin.
-    tolerance : float or None
-        Half-width of the dead zone in force, m; None: not known.
+    setting : Setting or None
+        In force at the edge, as it last said; None: not known. Gains None: set by somebody else than this twin.
     tuned_for : float or None
         rad, gap of the last redesign; None before the first.
     why_not : str
@@ -37,10 +35,14 @@ class Evidence:
     estimate: GapEstimate
     disturbance: Disturbance = UNASKED
     trend: Trend | None = None
-    controller: Controller | None = None
-    tolerance: float | None = None
+    setting: Setting | None = None
     tuned_for: float | None = None
     why_not: str = ""
+
+    @property
+    def gains(self) -> Gains | None:
+        """Gains in force; None: not known."""
+        return None if self.setting is None else self.setting.gains
 
     @property
     def unusable(self) -> str:

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.messages import Band
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.region import Region
@@ -21,28 +20,21 @@ class Redesign:
 
     Attributes
     ----------
-    tolerance : float or None
-        Half-width of the dead zone, m; None: leave the controller as it is.
+    setting : Setting or None
+        Dead zone, gains and predicted band; gains None: the gains stay. None: leave the controller as it is.
     gap : float
-        Total gap, rad, that the tolerance was made for; NaN without one.
+        Total gap, rad, that the setting was made for; NaN without one.
     reason : str
         Why the controller is left as it is; empty otherwise.
-    controller : Controller, optional
-        Whose gains are to be set, with the thresholds of the dead zone and the feedforward; its limits and rates stay
-        the edge's. None: the gains stay.
-    band : Band, optional
-        What the loop is predicted to stay within.
     certificate : Certificate, optional
         What the setting showed in simulation.
     owed : Region, optional
         What the setting is still to be proved for; None: nothing is. The certificate is of a wider one then.
     """
 
-    tolerance: float | None
+    setting: Setting | None
     gap: float
     reason: str
-    controller: Controller | None = None
-    band: Band | None = None
     certificate: Certificate | None = None
     owed: Region | None = None
 
@@ -101,4 +93,4 @@ class PaperPolicy:
             return Redesign(None, math.nan, evidence.unusable)
         kept = self.smoothing if evidence.tuned_for is not None else 0.0
         gap = (1.0 - kept) * evidence.estimate.gap + kept * (evidence.tuned_for or 0.0)
-        return Redesign(self.servo.tolerance_for(gap, self.k_dz), gap, "")
+        return Redesign(Setting(self.servo.tolerance_for(gap, self.k_dz)), gap, "")

@@ -229,7 +229,7 @@ def _window_bytes(loop: Loop) -> tuple[int, ...]:
 def setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
     """List every setting that was in force, in order; an update without gains leaves those in force before it."""
     start = loop.scenario.start
-    found = [SettingChange(0.0, SettingOrigin.START, start.tolerance, gains_of(loop.scenario.start_law))]
+    found = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
     for begin, origin, tolerance, gains in sorted(_later_settings(loop), key=lambda change: change[0]):
         found.append(SettingChange(begin, origin, tolerance, gains or found[-1].gains))
     return tuple(found)
@@ -240,9 +240,9 @@ def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, m
     sent = {update.version: update for update in loop.updates}
     for receipt in loop.applied:
         update = sent[receipt.version]
-        yield receipt.sample / rate, SettingOrigin.UPDATE, update.tolerance, update.controller
+        yield receipt.sample / rate, SettingOrigin.UPDATE, update.setting.tolerance, update.setting.gains
     for fallback in loop.fallbacks:
-        yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.tolerance, fallback.controller
+        yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.setting.tolerance, fallback.setting.gains
 
 
 WINDOW_GAPS_DEG, WINDOW_STEPS = (3.0, 10.0, 18.0), 6

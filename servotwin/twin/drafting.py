@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from servotwin.control.gains import gains_of
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Update, Window, finite
 from servotwin.redesign.policy import Redesign
-from servotwin.twin.proof import proof_of
+from servotwin.twin.proof import verification_of
 
 
 def draft(message: Window, estimate: GapEstimate, redesign: Redesign, validity: float) -> Update:
@@ -18,11 +17,11 @@ def draft(message: Window, estimate: GapEstimate, redesign: Redesign, validity: 
         What it stands on.
     estimate : GapEstimate
     redesign : Redesign
-        With a tolerance.
+        With a setting.
     validity : float
         s after the window's first sample for which it may still be applied.
     """
-    assert redesign.tolerance is not None
+    assert redesign.setting is not None
     low, high = estimate.interval
     return Update(
         servo=message.servo,
@@ -34,9 +33,7 @@ def draft(message: Window, estimate: GapEstimate, redesign: Redesign, validity: 
         std=finite(estimate.std_total),
         interval=(finite(low), finite(high)),
         status=estimate.status.value,
-        tolerance=redesign.tolerance,
+        setting=redesign.setting,
         not_after=message.start + validity,
-        controller=None if redesign.controller is None else gains_of(redesign.controller),
-        band=redesign.band,
-        proof=None if redesign.certificate is None else proof_of(redesign.certificate),
+        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
     )

@@ -29,14 +29,13 @@ from pathlib import Path
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, part
 from servotwin.config.toml import changes
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
-from servotwin.messages import NAME_PATTERN
+from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
 from servotwin.twin import settings_file as settingsfile
 from servotwin.twin.estimating import Estimator, estimator_of
-from servotwin.twin.in_force import InForce
 from servotwin.twin.policies import certified, policy_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
@@ -55,7 +54,7 @@ class Model:
     servo : Servo
         The model, with the controller that runs.
     settings : TwinSettings
-    start : InForce or None
+    start : Setting or None
         What the edge runs before the first update, as far as it does not say so itself (`messages.Hello`). None: the
         fallback set that is proved for the whole stated range, as the edge of a policy "certified" begins with; it is
         made when a twin first needs it, which takes seconds.
@@ -64,12 +63,12 @@ class Model:
     name: str
     servo: Servo
     settings: TwinSettings
-    start: InForce | None = None
+    start: Setting | None = None
 
     @property
-    def begins(self) -> InForce:
-        """`start`, made where it has to be; nothing is known of it where no fallback set can be proved."""
-        return _proved_start(self) if self.start is None else self.start
+    def begins(self) -> Setting | None:
+        """`start`, or the certified fallback set; None where there is none for the whole stated range."""
+        return _certified_start(self) if self.start is None else self.start
 
     def twin(self, servo: str, store: Store, state: bytes | None = None) -> Twin:
         """The twin of one servo of this model; estimator and policy are made once per process.
@@ -197,12 +196,12 @@ def _servo(table: Table, folder: Path) -> Servo:
     return Servo.resolve(name, folder)
 
 
-def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> InForce | None:
+def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
     """What an edge begins with, as `Scenario.start` has it; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
-        return None if own else InForce(law, 0.0)
+        return None if own else Setting(0.0, gains_of(law))
     k_dz = 1.0 if settings.k_dz is None else settings.k_dz
-    return InForce(law, servo.tolerance_for(settings.initial_gap, k_dz))
+    return Setting(servo.tolerance_for(settings.initial_gap, k_dz), gains_of(law))
 
 
 @lru_cache(maxsize=MOST_MODELS)
@@ -216,9 +215,8 @@ def _policy(model: Model) -> Policy:
 
 
 @lru_cache(maxsize=MOST_MODELS)
-def _proved_start(model: Model) -> InForce:
+def _certified_start(model: Model) -> Setting | None:
     try:
-        proved = certified(model.servo, model.settings).fallback().setting
+        return certified(model.servo, model.settings).fallback().setting.setting()
     except InvalidInput:
-        return InForce()
-    return InForce(with_gains(model.servo.controller, gains_of(proved.controller)), proved.tolerance)
+        return None

@@ -9,14 +9,13 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
-from servotwin.messages import Update
+from servotwin.messages import Setting, Update
 from servotwin.redesign.certified.certificate import Refusal
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.region import Region
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
-from servotwin.redesign.setting import Setting
-from servotwin.twin.in_force import InForce
 
 if TYPE_CHECKING:
     from servotwin.twin.store import Store
@@ -34,14 +33,14 @@ class Question(Struct, frozen=True, tag="proof/1"):
         Boot and sequence of the one that it stands on.
     region : Region
         What the setting is to hold for.
-    setting : Setting
+    setting : Design
     """
 
     servo: str
     version: int
     window: tuple[str, int]
     region: Region
-    setting: Setting
+    setting: Design
 
 
 class Memory(Struct, frozen=True):
@@ -80,22 +79,23 @@ class Lookups:
         """A setting of the table; the fallback set once after a proof has failed, and proved settings from then on."""
         if self.memory.why:
             sent = self.policy.withdrawn(evidence, self.memory.why)
-            if sent.tolerance is not None:
+            if sent.setting is not None:
                 self.memory = Memory(misled=True)
             return sent
         return (self.policy.policy if self.memory.misled else self.policy).redesign(evidence)
 
-    def settle(self, question: Question, running: Sequence[InForce], store: Store) -> str:
+    def settle(self, question: Question, running: Sequence[Setting | None], store: Store) -> str:
         """Prove a setting for the evidence that it was sent on; why it is withdrawn, empty where it is not.
 
         Parameters
         ----------
         question : Question
-        running : sequence of InForce
+        running : sequence of Setting or None
             What is in force, or on its way: another setting is neither proved any more nor withdrawn.
         store : Store
         """
-        if not any(one.has(question.setting) for one in running):
+        wanted = question.setting.setting()
+        if not any(one is not None and wanted.same_loop(one) for one in running):
             store.add_proof(question, Refusal("not proved: another setting is in force by now"))
             return ""
         found = self.policy.policy.confirm(question.region, question.setting)

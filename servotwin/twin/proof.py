@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from servotwin.messages import Proof
+from servotwin.messages import Verification
 from servotwin.redesign.certified.certificate import Certificate
 
 
-def proof_of(certificate: Certificate) -> Proof:
+def verification_of(certificate: Certificate) -> Verification:
     """What an update says of its setting; what it took is no part of it, so that equal twins send equal bytes."""
-    return Proof(
+    return Verification(
         members=certificate.members,
         looked_at=certificate.looked_at,
         settled=certificate.settled,

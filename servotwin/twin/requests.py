@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import msgspec
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import Answer, Outcome, Probe, Request, Window
+from servotwin.messages import Answer, Outcome, Probe, Request, Setting, Window
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, Memory, Seen, long_enough
-from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import Store
 
@@ -53,7 +52,7 @@ class Requests:
         self.memory, self.boot, self.serial = Memory(), "", 0
         self.sent_at, self.attempts = -math.inf, 0
 
-    def learn(self, window: Window, estimate: GapEstimate, widest: float, runs: InForce, now: float) -> Decision:
+    def learn(self, window: Window, estimate: GapEstimate, widest: float, runs: Setting | None, now: float) -> Decision:
         """Decide after a window; what is asked for is `pending` then.
 
         Parameters
@@ -63,8 +62,8 @@ class Requests:
             What it says of the gap.
         widest : float
             rad: what else bounds the gap from above.
-        runs : InForce
-            Controller and dead zone.
+        runs : Setting or None
+            In force at the edge; None: not known.
         now : float
             s.
         """
@@ -84,7 +83,7 @@ class Requests:
         return decision
 
     def after(
-        self, window: Window, estimate: GapEstimate, widest: float, runs: InForce, store: Store, now: float
+        self, window: Window, estimate: GapEstimate, widest: float, runs: Setting | None, store: Store, now: float
     ) -> list[Request]:
         """What to send after a window, as of `learn`; decision and request are stored."""
         decision = self.learn(window, estimate, widest, runs, now)
@@ -164,8 +163,8 @@ def _extent(window: Window) -> tuple[float, float]:
     return window.samples / window.rate, math.inf if window.start == 0.0 else first - window.start
 
 
-def _slack(runs: InForce) -> float:
+def _slack(runs: Setting | None) -> float:
     """m: both thresholds of the dead zone together; NaN: not known."""
-    if runs.controller is None or runs.tolerance is None:
+    if runs is None or runs.gains is None:
         return math.nan
-    return (runs.controller.enter + runs.controller.leave) * runs.tolerance
+    return (runs.gains.enter + runs.gains.leave) * runs.tolerance

@@ -7,7 +7,7 @@ settings say is no part of it: a twin restored under other settings goes on with
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -15,12 +15,13 @@ from msgspec import Meta, Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.trend import Trend, TrendSettings
-from servotwin.messages import Request, Update
+from servotwin.messages import Gains, Request, Setting, Update
+from servotwin.messages.legacy import upgrade
 from servotwin.redesign.excitation import Memory
 from servotwin.redesign.policy import Policy
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.glance import Watch
-from servotwin.twin.in_force import InForce, Settings
+from servotwin.twin.in_force import Settings
 from servotwin.twin.lookups import Lookups
 from servotwin.twin.lookups import Memory as LookupMemory
 from servotwin.twin.requests import Requests
@@ -76,12 +77,12 @@ class RequestsState(Struct, frozen=True):
     attempts: int
 
 
-class TwinState(Struct, frozen=True, tag="twin-state/1"):
+class TwinState(Struct, frozen=True, tag="twin-state/2"):
     """What a `Twin` remembers."""
 
     servo: str
     versions: VersionsState
-    known: dict[int, InForce]
+    known: dict[int, Setting]
     wear: WearState
     requests: RequestsState | None
     tuned_for: float | None
@@ -134,7 +135,7 @@ def unpack(servo: str, data: bytes, fresh: Knowledge) -> Knowledge:
         The bytes are no state of this schema, or another servo's.
     """
     try:
-        state = _decoder.decode(data)
+        state = _decoded(data)
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
         raise InvalidInput(f"the state of servo {servo!r} is not understood: {error}") from None
     if state.servo != servo:
@@ -149,6 +150,35 @@ def unpack(servo: str, data: bytes, fresh: Knowledge) -> Knowledge:
         _restored_triage(fresh.triage, state.watch),
         _restored_policy(fresh.policy, state.lookups),
     )
+
+
+def _decoded(data: bytes) -> TwinState:
+    """The state in these bytes; that of the version before is converted."""
+    try:
+        return _decoder.decode(data)
+    except msgspec.ValidationError:
+        document = msgspec.msgpack.decode(data, strict=False)
+        if not isinstance(document, dict) or document.get("type") != "twin-state/1":
+            raise
+    versions = document["versions"]
+    known = {version: _setting(one) for version, one in document["known"].items()}
+    return msgspec.convert(
+        {
+            **document,
+            "type": "twin-state/2",
+            "versions": {**versions, "pending": upgrade(versions["pending"])},
+            "known": {version: setting for version, setting in known.items() if setting is not None},
+        },
+        TwinState,
+    )
+
+
+def _setting(known: dict[str, Any]) -> Setting | None:
+    """The setting that the version before kept as a whole controller and a tolerance, each None where not known."""
+    law, tolerance = known["controller"], known["tolerance"]
+    if tolerance is None:
+        return None
+    return Setting(tolerance, None if law is None else Gains(*(law[name] for name in Gains.__struct_fields__)))
 
 
 def trend_state(trend: Trend) -> TrendState:

@@ -17,6 +17,7 @@ from servotwin.messages import (
     InvalidMessage,
     Message,
     Receipt,
+    Setting,
     Update,
 )
 from servotwin.messages import Window as WindowMessage
@@ -27,7 +28,7 @@ from servotwin.redesign.policy import Policy, Redesign
 from servotwin.twin.delivery import Delivery
 from servotwin.twin.drafting import draft
 from servotwin.twin.estimating import UNUSABLE, Estimator, Observer, estimate_from, estimator_of, observed
-from servotwin.twin.in_force import InForce, Settings
+from servotwin.twin.in_force import Settings
 from servotwin.twin.lookups import Lookups, Question, question_of
 from servotwin.twin.policies import policy_of
 from servotwin.twin.requests import Requests, requests_of
@@ -63,8 +64,8 @@ class Twin:
     settings : TwinSettings
     observer : callable, optional
         identify.Window -> Disturbance; None: nobody looks.
-    start : InForce, optional
-        What the edge runs before the first update.
+    start : Setting, optional
+        In force at the edge before the first update; None: not known.
     requests : Requests, optional
         Asks for windows that tell more.
     triage : Triage, optional
@@ -79,7 +80,7 @@ class Twin:
         store: Store,
         settings: TwinSettings | None = None,
         observer: Observer | None = None,
-        start: InForce | None = None,
+        start: Setting | None = None,
         requests: Requests | None = None,
         triage: Triage | None = None,
     ) -> None:
@@ -87,7 +88,7 @@ class Twin:
         self.settings = settings or TwinSettings()
         self._policy = Lookups(policy) if isinstance(policy, TablePolicy) else policy
         self._estimator, self._store, self._observer = estimator, store, observer
-        self._versions, self._known = Versions(), Settings({0: start or InForce()})
+        self._versions, self._known = Versions(), Settings({} if start is None else {0: start})
         self._wear = Wear(self.settings.initial_gap, self.settings.trend)
         self._delivery = Delivery(self.settings.retry, self.settings.attempts)
         self._tuned_for: float | None = None
@@ -101,25 +102,25 @@ class Twin:
         store: Store,
         settings: TwinSettings,
         estimator: Estimator | None = None,
-        start: InForce | None = None,
+        start: Setting | None = None,
         state: bytes | None = None,
         policy: Policy | None = None,
     ) -> Twin:
         """The twin that `settings` describe, for a servo of that name and model; `estimator`, `policy` replace theirs.
 
-        The model's controller is the one that runs: policies design for it. Without `start` the edge is taken to begin
-        with it. With the `state` of an earlier twin of that servo it goes on where that one was.
+        The model's controller is the one that runs: policies design for it. With the `state` of an
+        earlier twin of that servo it goes on where that one was.
 
         Raises
         ------
         InvalidInput
             The state is not understood, or another servo's.
         """
-        begins, redesigns = start or InForce(servo.controller), policy or policy_of(servo, settings)
+        redesigns = policy or policy_of(servo, settings)
         chosen = estimator or estimator_of(servo, settings)
         asks = requests_of(name, servo, settings)
         triage = None if settings.triage is None else Triage(servo, settings.triage)
-        twin = cls(name, chosen, redesigns, store, settings, partial(disturbance, servo=servo), begins, asks, triage)
+        twin = cls(name, chosen, redesigns, store, settings, partial(disturbance, servo=servo), start, asks, triage)
         if state:
             twin.restore(state)
         return twin
@@ -223,7 +224,7 @@ class Twin:
         redesign = Redesign(None, math.nan, why_not) if unasked else self._redesign(estimate, disturbed, why_not)
         self._store.add_redesign(message, redesign)
         asked = [] if stale else self._ask(message, estimate, now, heard)
-        if redesign.tolerance is None:
+        if redesign.setting is None:
             return asked
         self._tuned_for = redesign.gap
         update = self._versions.issue(draft(message, estimate, redesign, self.settings.validity))
@@ -252,7 +253,7 @@ class Twin:
 
     def _redesign(self, estimate: GapEstimate, disturbed: Disturbance, why_not: str) -> Redesign:
         now = self._known.of(self._versions.in_force)
-        evidence = Evidence(estimate, disturbed, self.trend, now.controller, now.tolerance, self._tuned_for, why_not)
+        evidence = Evidence(estimate, disturbed, self.trend, now, self._tuned_for, why_not)
         try:
             return self._policy.redesign(evidence)
         except InvalidInput as error:

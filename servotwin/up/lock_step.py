@@ -24,7 +24,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear
-from servotwin.messages import Fallback, Gains, Message, Receipt, Window, decode, encode
+from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, Window, decode, encode
 from servotwin.plant.signals import PiecewiseCubic
 
 TIMEOUT = 300.0
@@ -153,7 +153,7 @@ class DrivenMachine:
 
     def _write(self, tolerance: float, gains: Gains | None) -> None:
         self._version += 1
-        self._drive.write(Parameters(self._version, tolerance, gains=gains))
+        self._drive.write(Parameters(self._version, Setting(tolerance, gains)))
 
     def _keep(self, block: Block) -> None:
         for name in CHANNELS:

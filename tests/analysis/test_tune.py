@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -16,7 +16,7 @@ from servotwin.analysis.tuning.tune import Specification, judged, tune
 from servotwin.cli import app as cli
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
+from servotwin.plant import linear, loop
 from servotwin.plant.servo import Servo
 from servotwin.simulation.simulate import simulate
 
@@ -112,13 +112,33 @@ def test_nyquist_agrees_with_the_poles(wc, phz, share, al):
     assert bool(circled(loops, plant.integrators + 1)[0]) is bool(np.max(poles.real) < 0.0)
 
 
+def test_a_double_zero_is_factored():
+    """(s + 2)^2: rounding may make it a complex pair or two that differ by the square root of it."""
+    for Tf in np.linspace(0.01, 0.3, 50):
+        law = Controller(Kp=4.0 - 4.0 * Tf, Ki=4.0, Kd=1.0 - (4.0 - 4.0 * Tf) * Tf, Tf=Tf)
+        found = factorised(law, 3.0)
+        assert found.phz == pytest.approx(math.atan2(3.0, 2.0), abs=1e-6)
+        assert found.be == pytest.approx(found.phz, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("law", "said"), [(Controller(1.0, 1.0, 1.0, 0.1), "complex"), (Controller(1.0, -1.0, 0.0, 0.1), "-10, 1 1/s")]
+)
+def test_zeros_that_are_not_real_and_stable_have_no_factors(law, said):
+    with pytest.raises(InvalidInput, match=said):
+        factorised(law, 1.0)
+
+
 @given(st.floats(0.5, 20.0), st.floats(0.05, 1.5), st.floats(0.0, 1.0), st.floats(0.05, 1.5))
+@example(1.0, 1.0, 1.0, 1.0)
+@example(7.0, 0.3, 1.0, 0.3)
+@example(1.0, 1.0, 1e-300, 1.0)
 def test_factors_and_gains_are_inverse(wc, phz, share, al):
     factors = Factors(3.0, wc, phz, share * phz, al, True)
     found = factorised(factors.controller(), wc)
     np.testing.assert_allclose(found[:5], factors[:5], rtol=1e-9, atol=1e-6)
     omega = np.logspace(-1, 3, 20)
-    np.testing.assert_allclose(linear.pidf(factors.controller()).response(omega), factors.response(omega), rtol=1e-9)
+    np.testing.assert_allclose(loop.pidf(factors.controller()).response(omega), factors.response(omega), rtol=1e-9)
 
 
 def test_frequency_data_give_what_the_system_gives():
@@ -200,7 +220,7 @@ def test_setpoint_weights_equal_the_law_that_weighs():
     law, omega = PAPER.controller, np.logspace(-1, 3, 30)
     s = 1j * omega
     above = 0.3 * law.Kp + law.Ki / s + 0.1 * law.Kd * s / (law.Tf * s + 1.0)
-    np.testing.assert_allclose(prefilter(law, 0.3, 0.1).response(omega) * linear.pidf(law).response(omega), above)
+    np.testing.assert_allclose(prefilter(law, 0.3, 0.1).response(omega) * loop.pidf(law).response(omega), above)
     np.testing.assert_allclose(prefilter(law, 1.0, 1.0).response(omega), 1.0)
 
 

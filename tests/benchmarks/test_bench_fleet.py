@@ -27,7 +27,7 @@ from benchmarks.fleet.tables import lines
 from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, Sample, Watch
 from servotwin.cli.app import app
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
-from servotwin.messages import Receipt, Update, decode, encode
+from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.store.records import Incoming, MessageKind
 from servotwin.store.store import open_store
 
@@ -105,7 +105,7 @@ def test_news_moves_the_gap_to_the_next_place_and_keeps_it_there() -> None:
 def test_updates_are_applied_once_and_answered() -> None:
     edges = fleet()
     edge = edges.edges[1]
-    update = Update("ax-00001", 4, 3, ("boot-9", 100), 200.0, 0.1, 1e-3, (0.09, 0.11), "ok", 0.0, 400.0)
+    update = Update("ax-00001", 4, 3, ("boot-9", 100), 200.0, 0.1, 1e-3, (0.09, 0.11), "ok", Setting(0.0), 400.0)
     key = key_of(verifier_of(""))
     body = msgspec.msgpack.encode([seal(key, TO_EDGE, "ax-00001", serial, encode(update)) for serial in (5, 6)])
     edges.heard(edge, body)

@@ -19,12 +19,12 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
 from servotwin.redesign.certified.uncertainty import Uncertainty
-from servotwin.redesign.setting import Setting
+from servotwin.redesign.design import Design
 from servotwin.simulation import simulate
 
 MODEL = Servo.preset("paper")
 KNOWN = Uncertainty(input_bias=(-0.1, 0.1))
-CALM = Setting(MODEL.controller.replace(Ki=0.0))
+CALM = Design(MODEL.controller.replace(Ki=0.0))
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -84,7 +84,7 @@ def test_the_table_and_its_document() -> None:
 
 def test_settled_is_a_share() -> None:
     those = tuple(machines(MODEL, KNOWN, "clean", 2, 1))
-    still, hunting = (run_machine(those[0], "clean", MODEL, Told(None, s)) for s in (CALM, Setting(MODEL.controller)))
+    still, hunting = (run_machine(those[0], "clean", MODEL, Told(None, s)) for s in (CALM, Design(MODEL.controller)))
     row = Row("clean", "two", type(still)(*np.array([still, hunting]).T), those)
     assert row.settled == 0.5
 

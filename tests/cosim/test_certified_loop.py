@@ -11,7 +11,7 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.estimation.estimate import GapStatus
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.twin.policies import certified
-from servotwin.twin.proof import proof_of
+from servotwin.twin.proof import verification_of
 from servotwin.twin.settings import TwinSettings
 
 LEARNT = 20.0  # s, the second step begins
@@ -41,7 +41,7 @@ def test_updates_are_applied_and_the_bias_is_learnt():
     assert len(loop().applied) == len(loop().updates) >= 1
     assert {receipt.version for receipt in loop().applied} == {update.version for update in loop().updates}
     for update in loop().updates:
-        assert abs(update.controller.feedforward + loop().scenario.input_bias) < 1e-3
+        assert abs(update.setting.gains.feedforward + loop().scenario.input_bias) < 1e-3
 
 
 def test_the_loop_stays_and_what_was_proved_holds():
@@ -62,14 +62,14 @@ def test_the_published_controller_does_not_settle_on_the_same_machine():
 
 
 def test_evidence_goes_with_the_update_and_stays_in_the_store():
-    sent = [redesign for redesign in loop().redesigns if redesign.tolerance is not None]
+    sent = [redesign for redesign in loop().redesigns if redesign.setting is not None]
     for update, redesign in zip(loop().updates, sent, strict=True):
         assert isinstance(redesign.certificate, Certificate)
-        assert update.proof == proof_of(redesign.certificate)
-        assert update.proof.members == 256
-        assert update.proof.settled >= 0.99
-        assert update.proof.Ms <= 2.0
-        assert update.band == redesign.band
+        assert update.verification == verification_of(redesign.certificate)
+        assert update.verification.members == 256
+        assert update.verification.settled >= 0.99
+        assert update.verification.Ms <= 2.0
+        assert update.setting.band == redesign.setting.band
 
 
 def test_the_same_scenario_gives_the_same_bytes():

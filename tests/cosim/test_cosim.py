@@ -54,7 +54,7 @@ def test_an_update_lands_three_seconds_after_the_reference_step(controller):
     kinds = [(type(m.message), m.sent, m.arrival) for m in loop.messages[:4]]
     assert kinds == [(Window, 1.0, 2.0), (Acknowledge, 2.0, 3.0), (Update, 2.0, 3.0), (Receipt, 3.0, 4.0)]
     expected = np.zeros(loop.scenario.samples)
-    expected[15000:40000], expected[40000:] = (update.tolerance for update in loop.updates)
+    expected[15000:40000], expected[40000:] = (update.setting.tolerance for update in loop.updates)
     assert np.array_equal(loop.run.tolerance, expected)
 
 
@@ -64,7 +64,7 @@ def test_the_estimate_is_near_the_truth_and_eq_21_follows_it(method, error_deg):
     for update, estimate in zip(loop.updates, loop.estimates, strict=True):
         assert abs(update.gap - GAP) < math.radians(error_deg)
         assert update.gap == estimate.gap
-        assert update.tolerance == PAPER.tolerance_for(estimate.gap, 1.0)
+        assert update.setting.tolerance == PAPER.tolerance_for(estimate.gap, 1.0)
     assert loop.updates[0].window == ("boot-1", 0)
     assert loop.updates[1].base_version == loop.updates[0].version
 
@@ -135,7 +135,9 @@ def test_no_fate_of_the_link_breaks_the_order(seed, controller):
     data_times = {update.version: update.data_time for update in loop.updates}
     assert [data_times[v] for v in versions] == sorted(data_times[v] for v in versions)
     assert sum(loop.accounts.values()) == 2
-    assert loop.run.tolerance[-1] == {u.version: u.tolerance for u in loop.updates}.get(max(versions, default=0), 0.0)
+    assert loop.run.tolerance[-1] == {u.version: u.setting.tolerance for u in loop.updates}.get(
+        max(versions, default=0), 0.0
+    )
 
 
 def test_a_lost_update_and_a_lost_acknowledgement_are_made_good():

@@ -112,7 +112,7 @@ def test_every_key_in_its_unit(tmp_path):
     agent = scenario.agent_settings()
     assert (agent.window_samples, agent.pre_trigger_samples, agent.retry.first_s) == (1600, 400, 3.0)
     assert agent.limits.maximum == pytest.approx(0.3e-3)
-    assert agent.parameters.tolerance == scenario.servo.tolerance_for(math.radians(4.0), 1.5)
+    assert agent.parameters.setting.tolerance == scenario.servo.tolerance_for(math.radians(4.0), 1.5)
     assert scenario.uplink == LinkSettings(0.5, 0.0, 0.1, outages=((1.0, 2.0),))
     assert scenario.downlink == LinkSettings(0.5, 0.3, 0.2, outages=((1.0, 2.0),))
     assert scenario.twin.estimator == paper.Settings(alpha=80.0, contact_travel=math.radians(2.0))

@@ -14,7 +14,7 @@ from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.estimation import paper, whitened
 from servotwin.estimation import settings_file as settingsfile
-from servotwin.messages import Band, Gains
+from servotwin.messages import Band, Gains, Setting
 from servotwin.plant.servo import Servo
 
 
@@ -151,7 +151,7 @@ def test_the_edge_looks_after_itself_as_a_scenario_says(tmp_path):
         maximum=0.2e-3, patience_s=2.0, gain_factor=2.5, integral_factor=0.05, feedforward=0.1
     )
     calm = Gains(own.Kp, 0.0, own.Kd, own.Tf, feedforward=0.01)
-    fallback = FallbackSet(0.0, calm, Band(1e-4, 8e-5, 0.2, 2.0), silence_s=60.0)
+    fallback = FallbackSet(Setting(0.0, calm, Band(1e-4, 8e-5, 0.2, 2.0)), silence_s=60.0)
     assert agent.supervision == Supervision(fallback, WatchSettings(margin=1.5, error_floor=2e-5), 0.1)
     assert (scenario.input_bias, scenario.friction) == (-0.1, 0.002)
 

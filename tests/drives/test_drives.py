@@ -24,7 +24,7 @@ from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, Sample, SupervisedDrive
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
+from servotwin.messages import Gains, Setting
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.simulation import Run, Simulation
 from servotwin.simulation.splice import shifted
@@ -79,7 +79,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
         drive.connect()
         before = [drive.read(2345), drive.read(10_000)]
         changed = before[-1].last
-        drive.write(Parameters(7, 2e-5, gains=gains_of(controller)))
+        drive.write(Parameters(7, Setting(2e-5, gains_of(controller))))
         between = [drive.read(1500)]
         moved = between[-1].last
         drive.move(2e-4)
@@ -103,7 +103,7 @@ def test_a_dead_zone_without_gains_is_set_as_it_is(tmp_path: Path) -> None:
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
         drive.connect()
         blocks = [drive.read(3000)]
-        drive.write(Parameters(1, 1e-4))
+        drive.write(Parameters(1, Setting(1e-4)))
         blocks += read_all(drive, 3000)
     same = simulation_of(Scenario.load(tmp_path / "scenario.toml"))
     same.advance(3000)
@@ -117,7 +117,7 @@ def test_what_is_no_controller_is_refused_and_nothing_changes(tmp_path: Path) ->
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
         drive.connect()
         for bad in (-1.0, np.inf):
-            refused = Parameters(3, gains=gains)
+            refused = Parameters(3, Setting(0.0, gains))
             object.__setattr__(refused, "tolerance", bad)
             with pytest.raises(DriveRefused, match="tolerance"):
                 drive.write(refused)

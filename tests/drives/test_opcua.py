@@ -27,6 +27,7 @@ from servotwin.drives.table import control_drive, supervised_drive
 from servotwin.edge.drive import Block, DriveLost, DriveRefused
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
+from servotwin.messages import Setting
 from servotwin.simulation import Run, Simulation
 
 pytest.importorskip("asyncua")
@@ -90,11 +91,11 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
         softer = scenario.start_law.replace(Kp=1000.0, Ki=9000.0, leave=1.3)
         drive.connect()
         blocks = [drive.read(), drive.read(37)]
-        drive.write(Parameters(5, 3e-5, gains=gains_of(softer)))
+        drive.write(Parameters(5, Setting(3e-5, gains_of(softer))))
         blocks += [drive.read(1000) for _ in range(6)]
         with pytest.raises(DriveRefused, match="tolerance"):
-            drive.write(_unchecked(Parameters(6, 1e-5), tolerance=-1.0))
-        drive.write(Parameters(7, 2e-5))
+            drive.write(_unchecked(Parameters(6), setting=Setting(-1.0)))
+        drive.write(Parameters(7, Setting(2e-5)))
         blocks += [drive.read(1000) for _ in range(6)]
         assert drive.rate == 5000.0
         assert not drive.can_move
@@ -163,7 +164,7 @@ def test_passwords_and_certificates(tmp_path: Path) -> None:
         secured = {"user": "edge", "certificate": mine, "private_key": key, "server_certificate": mine}
         with closing(drive_at(url, password="secret", **secured)) as drive:
             drive.connect()
-            drive.write(Parameters(1, 1e-5))
+            drive.write(Parameters(1, Setting(1e-5)))
             while drive.read().version != 1:
                 pass
         for wrong in ({"password": "guessed"}, {"password": "secret", "server_certificate": other}):

@@ -12,6 +12,7 @@ from servotwin.drives.replay import Replay
 from servotwin.edge.drive import Block, DriveLost
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
+from servotwin.messages import Setting
 
 HEAD = "time_s,position_m,voltage_v,measured_position_m,reference_m,theta_m_rad"
 
@@ -83,7 +84,7 @@ def test_a_loop_leaves_out_one_number_at_its_seam(log: Path) -> None:
 def test_parameters_are_noted_and_change_nothing(log: Path) -> None:
     with closing(Replay(log, speed=0.0)) as drive:
         drive.connect()
-        before, parameters = drive.read(10), Parameters(4, 1e-4)
+        before, parameters = drive.read(10), Parameters(4, Setting(1e-4))
         drive.write(parameters)
         drive.move(1e-3)
         after = drive.read(10)

@@ -16,7 +16,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window, checksum, unpack_channel
+from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, Window, checksum, unpack_channel
 from servotwin.runtime.retry import Retry
 
 
@@ -38,7 +38,8 @@ def windows(sent: list[Outgoing]) -> list[Window]:
 
 def update(**changes: Any) -> Update:
     values = {"servo": "axis-1", "version": 1, "base_version": 0, "window": ("b0", 0), "data_time": 0.0, "gap": 0.1,
-              "std": 0.01, "interval": (0.08, 0.12), "status": "OK", "tolerance": 1e-4, "not_after": 60.0}  # fmt: skip
+              "std": 0.01, "interval": (0.08, 0.12), "status": "OK", "setting": Setting(1e-4),
+              "not_after": 60.0}  # fmt: skip
     return Update(**{**values, **changes})
 
 
@@ -137,8 +138,8 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
     feed(agent, [1e-3] * 30)
     (good,) = agent.receive(update())
     assert good == Outgoing(30, Receipt("axis-1", 1, True, 30, Reason.APPLIED, 1, "b0"))
-    assert (agent.parameters.version, agent.parameters.tolerance, agent.parameters.sample) == (1, 1e-4, 30)
-    (bad,) = agent.receive(update(version=2, base_version=1, data_time=1.0, tolerance=3e-4))
+    assert (agent.parameters.version, agent.parameters.setting.tolerance, agent.parameters.sample) == (1, 1e-4, 30)
+    (bad,) = agent.receive(update(version=2, base_version=1, data_time=1.0, setting=Setting(3e-4)))
     assert bad.message == Receipt("axis-1", 2, False, 30, Reason.OUT_OF_BOUNDS, 1, "b0")
     feed(agent, [2e-3] * 10)
     assert agent.receive(update())[0].message == good.message
@@ -146,9 +147,9 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
 
 
 def test_hello_tells_what_is_in_force() -> None:
-    agent = Agent(settings(parameters=Parameters(7, 2e-4)))
+    agent = Agent(settings(parameters=Parameters(7, Setting(2e-4))))
     feed(agent, [0.0] * 5)
-    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, 2e-4, "paper")
+    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper")
 
 
 def test_messages_for_others_are_ignored() -> None:

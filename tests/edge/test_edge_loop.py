@@ -12,7 +12,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink
-from servotwin.messages import Acknowledge, Message, Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, Window, decode, encode
 from servotwin.runtime.clock import VirtualClock
 from servotwin.runtime.retry import Retry
 
@@ -25,7 +25,7 @@ def make_update(version: int, base: int, window: Window, lifetime_s: float) -> U
     known, start = (None, None, (None, None)), window.start
     tolerance = 1e-5 * (1 + window.sequence)
     identity = (window.boot, window.sequence)
-    return Update("axis-1", version, base, identity, start, *known, "OK", tolerance, start + lifetime_s)
+    return Update("axis-1", version, base, identity, start, *known, "OK", Setting(tolerance), start + lifetime_s)
 
 
 @dataclass

@@ -23,6 +23,7 @@ from servotwin.messages import (
     Outcome,
     Probe,
     Request,
+    Setting,
     Window,
     unpack_channel,
 )
@@ -111,7 +112,7 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
     assert answer(agent, request()).taken
-    fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, 0.0)
+    fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
     monkeypatch.setattr(Supervisor, "look", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
     assert fallback in sent

@@ -5,33 +5,49 @@ from pathlib import Path
 import pytest
 
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import FileStore, MemoryStore, Store
+from servotwin.edge.store import FileParameterStore, MemoryParameterStore, ParameterStore
 from servotwin.errors import InvalidInput
-from servotwin.messages import Band, Gains
+from servotwin.messages import Band, Gains, Setting
 
 GOOD = Parameters(
-    7, 1e-4, 20.0, ("b0", 3), 110_000, Gains(1377.7, 0.0, -135.1, 0.1), Band(1e-4, 2e-5, 0.1, 2.0), True, 160_000
+    7,
+    Setting(1e-4, Gains(1377.7, 0.0, -135.1, 0.1), Band(1e-4, 2e-5, 0.1, 2.0)),
+    20.0,
+    ("b0", 3),
+    110_000,
+    True,
+    160_000,
 )
 
 
 @pytest.fixture(params=["memory", "file"])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
-    return MemoryStore() if request.param == "memory" else FileStore(tmp_path / "axis-1.json")
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> ParameterStore:
+    return MemoryParameterStore() if request.param == "memory" else FileParameterStore(tmp_path / "axis-1.json")
 
 
-def test_nothing_is_kept_at_first(store: Store) -> None:
+def test_nothing_is_kept_at_first(store: ParameterStore) -> None:
     assert store.load() is None
 
 
-def test_what_outlives_a_boot(store: Store) -> None:
-    store.save(Parameters(3, 2e-4))
+def test_the_file_of_the_version_before_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "kept.json"
+    path.write_text(
+        '{"type":"kept/1","version":7,"tolerance":0.0001,"gains":{"Kp":1377.7,"Ki":0.0,"Kd":-135.1,"Tf":0.1,"enter":1.0,'
+        '"leave":1.0,"feedforward":0.0},"band":{"error":0.0001,"error_rms":0.00002,"effort":0.1,"settling":2.0},'
+        '"fallback":true}'
+    )
+    assert FileParameterStore(path).load() == Parameters(7, GOOD.setting, fallback=True)
+
+
+def test_what_outlives_a_boot(store: ParameterStore) -> None:
+    store.save(Parameters(3, Setting(2e-4)))
     store.save(GOOD)
-    assert store.load() == Parameters(7, 1e-4, gains=GOOD.gains, band=GOOD.band, fallback=True)
+    assert store.load() == Parameters(7, GOOD.setting, fallback=True)
 
 
 def test_a_crash_while_writing_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = FileStore(tmp_path / "kept.json")
-    store.save(Parameters(3, 2e-4))
+    store = FileParameterStore(tmp_path / "kept.json")
+    store.save(Parameters(3, Setting(2e-4)))
 
     def crash(_: int) -> None:
         raise OSError("power is gone")
@@ -39,7 +55,7 @@ def test_a_crash_while_writing_leaves_the_old_one(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("servotwin.runtime.files.os.fsync", crash)
     with pytest.raises(OSError, match="power"):
         store.save(GOOD)
-    assert store.load() == Parameters(3, 2e-4)
+    assert store.load() == Parameters(3, Setting(2e-4))
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"type":"kept/1","version":-1,"tolerance":0}', '{"type":"kept/2"}'])
@@ -47,4 +63,4 @@ def test_a_file_that_holds_something_else_is_named(tmp_path: Path, text: str) ->
     path = tmp_path / "kept.json"
     path.write_text(text)
     with pytest.raises(InvalidInput, match=r"kept\.json"):
-        FileStore(path).load()
+        FileParameterStore(path).load()

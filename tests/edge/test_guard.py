@@ -13,12 +13,12 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.switch import Rules, Switch, offer
 from servotwin.errors import InvalidInput
-from servotwin.messages import Reason, Receipt, Update
+from servotwin.messages import Reason, Receipt, Setting, Update
 
 HERE = Instant("axis-1", "b0", 110_000, 5000.0)
-CURRENT = Parameters(2, 0.9e-4, 0.0, ("b0", 0), 15_000)
+CURRENT = Parameters(2, Setting(0.9e-4), 0.0, ("b0", 0), 15_000)
 LIMITS = Limits(minimum=0.2e-4, maximum=3e-4, max_step=1e-4, lifetime_s=10.0, interval_s=5.0)
-UPDATE = Update("axis-1", 3, 2, ("b0", 1), 20.0, 0.1, 0.01, (0.08, 0.12), "OK", 1e-4, 60.0)
+UPDATE = Update("axis-1", 3, 2, ("b0", 1), 20.0, 0.1, 0.01, (0.08, 0.12), "OK", Setting(1e-4), 60.0)
 
 
 def decide(update: Update, current: Parameters, limits: Limits, here: Instant) -> tuple[Parameters, Receipt]:
@@ -31,7 +31,7 @@ def decide(update: Update, current: Parameters, limits: Limits, here: Instant) -
 
 def test_a_good_update_is_applied_at_the_next_sample() -> None:
     parameters, receipt = decide(UPDATE, CURRENT, LIMITS, HERE)
-    assert parameters == Parameters(3, 1e-4, 20.0, ("b0", 1), 110_000, gap=0.1)
+    assert parameters == Parameters(3, Setting(1e-4), 20.0, ("b0", 1), 110_000, gap=0.1)
     assert (receipt.applied, receipt.sample, receipt.reason) == (True, 110_000, Reason.APPLIED)
     assert (receipt.version, receipt.parameter_version, receipt.boot) == (3, 3, "b0")
 
@@ -49,9 +49,9 @@ def test_a_good_update_is_applied_at_the_next_sample() -> None:
         ({"data_time": 22.001}, Reason.FUTURE_DATA),
         ({"not_after": 22.0}, Reason.EXPIRED),
         ({"data_time": 11.9}, Reason.EXPIRED),
-        ({"tolerance": 3.1e-4}, Reason.OUT_OF_BOUNDS),
-        ({"tolerance": 0.1e-4}, Reason.OUT_OF_BOUNDS),
-        ({"tolerance": 2e-4}, Reason.STEP_TOO_LARGE),
+        ({"setting": Setting(3.1e-4)}, Reason.OUT_OF_BOUNDS),
+        ({"setting": Setting(0.1e-4)}, Reason.OUT_OF_BOUNDS),
+        ({"setting": Setting(2e-4)}, Reason.STEP_TOO_LARGE),
     ],
 )
 def test_everything_else_is_refused_with_its_reason(changes: dict[str, Any], reason: Reason) -> None:
@@ -62,15 +62,20 @@ def test_everything_else_is_refused_with_its_reason(changes: dict[str, Any], rea
 
 
 def test_updates_keep_their_distance() -> None:
-    soon = Parameters(2, 0.9e-4, 0.0, ("b0", 0), 110_000 - 24_999)
+    soon = Parameters(2, Setting(0.9e-4), 0.0, ("b0", 0), 110_000 - 24_999)
     assert judge(UPDATE, soon, LIMITS, HERE) is Reason.TOO_SOON
-    assert judge(UPDATE, Parameters(2, 0.9e-4, 0.0, ("b0", 0), 110_000 - 25_000), LIMITS, HERE) is Reason.APPLIED
-    assert judge(UPDATE, Parameters(2, 0.9e-4), LIMITS, Instant("axis-1", "b0", 110_000, 5000.0)) is Reason.APPLIED
+    assert (
+        judge(UPDATE, Parameters(2, Setting(0.9e-4), 0.0, ("b0", 0), 110_000 - 25_000), LIMITS, HERE) is Reason.APPLIED
+    )
+    assert (
+        judge(UPDATE, Parameters(2, Setting(0.9e-4)), LIMITS, Instant("axis-1", "b0", 110_000, 5000.0))
+        is Reason.APPLIED
+    )
 
 
 def test_the_limits_themselves_are_allowed() -> None:
-    current = Parameters(2, 2e-4, 0.0, ("b0", 0), 15_000)
-    edges = replace(UPDATE, tolerance=3e-4, data_time=12.0, not_after=22.0 + 1e-9)
+    current = Parameters(2, Setting(2e-4), 0.0, ("b0", 0), 15_000)
+    edges = replace(UPDATE, setting=Setting(3e-4), data_time=12.0, not_after=22.0 + 1e-9)
     assert (
         judge(edges, current, Limits(minimum=3e-4, maximum=3e-4, max_step=1e-4 * (1 + 1e-9), lifetime_s=10.0), HERE)
         is Reason.APPLIED
@@ -86,7 +91,7 @@ def test_a_repeated_update_gets_its_first_receipt_again() -> None:
 
 def test_a_version_used_twice_is_no_repetition() -> None:
     parameters, _ = decide(UPDATE, CURRENT, LIMITS, HERE)
-    other = replace(UPDATE, window=("b0", 2), data_time=21.0, tolerance=1.1e-4)
+    other = replace(UPDATE, window=("b0", 2), data_time=21.0, setting=Setting(1.1e-4))
     assert decide(other, parameters, LIMITS, HERE)[1].reason is Reason.OLD_VERSION
 
 
@@ -101,7 +106,7 @@ UPDATES = st.builds(
     std=st.none(),
     interval=st.just((None, None)),
     status=st.just("OK"),
-    tolerance=st.floats(0.0, 4e-4),
+    setting=st.builds(Setting, st.floats(0.0, 4e-4)),
     not_after=st.floats(0.0, 20.0),
 )
 
@@ -119,8 +124,8 @@ def test_parameters_only_move_forward_and_stay_in_bounds(arrivals: list[tuple[Up
             assert (after.version, after.sample) == (update.version, sample)
             assert after.version > current.version == update.base_version
             assert after.data_time > current.data_time
-            assert after.tolerance <= 3e-4
-            assert abs(after.tolerance - current.tolerance) <= 2e-4
+            assert after.setting.tolerance <= 3e-4
+            assert abs(after.setting.tolerance - current.setting.tolerance) <= 2e-4
             assert sample / 5000.0 < update.not_after
         elif receipt.applied:
             assert (receipt.version, receipt.sample) == (current.version, current.sample)
@@ -152,7 +157,7 @@ def test_bad_limits_are_refused(values: dict[str, float]) -> None:
         Limits(**values)
 
 
-@pytest.mark.parametrize("values", [{"version": -1}, {"tolerance": nan}, {"tolerance": -1e-9}])
+@pytest.mark.parametrize("values", [{"version": -1}, {"setting": Setting(nan)}, {"setting": Setting(-1e-9)}])
 def test_bad_parameters_in_force_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InvalidInput, match="in force"):
         Parameters(**values)

@@ -12,18 +12,18 @@ from servotwin.edge.guard import Instant, judge
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains, Reason, Update
+from servotwin.messages import Gains, Reason, Setting, Update
 
 OWN = gains_of(Controller(Kp=1000.0, Ki=20000.0, Kd=-100.0, Tf=0.1))
 
 
 def update(gains: Gains, tolerance: float = 1e-4) -> Update:
     known = (None, None, (None, None))
-    return Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", tolerance, 60.0, gains)
+    return Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", Setting(tolerance, gains), 60.0)
 
 
 def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0, tolerance: float = 1e-4) -> Reason:
-    current = Parameters(tolerance=1e-4, gains=old)
+    current = Parameters(setting=Setting(1e-4, old))
     here = Instant("axis-1", "b0", round(seconds * 1000), 1000.0)
     return judge(update(gains, tolerance), current, limits, here, OWN)
 
@@ -90,7 +90,7 @@ def test_the_allowed_factor_grows_with_time() -> None:
     limits = Limits(gain_rate=1.1)
     faster = replace(OWN, Kp=1200.0)
     assert judged(faster, limits, seconds=9.0) is Reason.APPLIED
-    current = Parameters(tolerance=1e-4, gains=OWN, sample=8200)
+    current = Parameters(setting=Setting(1e-4, OWN), sample=8200)
     here = Instant("axis-1", "b0", 10_000, 1000.0)  # 1.1 ** 1.8 = 1.187
     assert judge(update(faster), current, limits, here, OWN) is Reason.GAINS_STEP_TOO_LARGE
     assert Limits(gain_rate=1e300).allows_gains_step(OWN, replace(OWN, Kp=4000.0), OWN, 9e9)

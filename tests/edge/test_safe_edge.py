@@ -123,7 +123,7 @@ def test_the_machine_runs_on_what_the_edge_put_in_force() -> None:
     machine = replace(hostile.case(3), input_bias=0.03, friction=0.0)
     loop, plant, twin = cosimulated(Kind.LIES_LOW, 0.3, machine)
     assert loop.agent.parameters.version > 0
-    assert isinstance(loop.agent.parameters.gains, Gains)
+    assert isinstance(loop.agent.parameters.setting.gains, Gains)
     assert plant.controller == loop.agent.controller
-    assert plant.controller.feedforward == twin.said[-1].controller.feedforward
+    assert plant.controller.feedforward == twin.said[-1].setting.gains.feedforward
     assert plant.controller.feedforward == pytest.approx(-0.03, abs=2e-3)

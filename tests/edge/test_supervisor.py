@@ -13,12 +13,12 @@ from servotwin.control.gains import gains_of
 from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.limits import Limits
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.store import MemoryStore
+from servotwin.edge.store import MemoryParameterStore
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Update, Window
+from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Setting, Update, Window
 
 RATE = 200.0
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=RATE)
@@ -27,7 +27,7 @@ BAND = Band(1e-4, 6e-5, 0.2, 1.0)
 
 
 def agent_settings(silence_s: float = math.inf, patience_s: float = 0.0, **supervision: object) -> AgentSettings:
-    fallback = FallbackSet(0.0, CALM, Band(5e-4, 2e-4, 1.0, 1.0), silence_s, refuse_s=4.0)
+    fallback = FallbackSet(Setting(0.0, CALM, Band(5e-4, 2e-4, 1.0, 1.0)), silence_s, refuse_s=4.0)
     return AgentSettings(
         "axis-1", "b0", RATE, 1.0, controller=PAPER, limits=Limits(patience_s=patience_s),
         supervision=Supervision(**{"fallback": fallback, **supervision}),
@@ -36,7 +36,9 @@ def agent_settings(silence_s: float = math.inf, patience_s: float = 0.0, **super
 
 def update(version: int, base: int, data_time: float, tolerance: float = 1e-4) -> Update:
     known = (None, None, (None, None))
-    return Update("axis-1", version, base, ("b0", version), data_time, *known, "OK", tolerance, 1e6, CALM, BAND)
+    return Update(
+        "axis-1", version, base, ("b0", version), data_time, *known, "OK", Setting(tolerance, CALM, BAND), 1e6
+    )
 
 
 def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float = 1.5) -> list[Outgoing]:
@@ -59,7 +61,7 @@ def test_a_limit_cycle_under_an_update_ends_in_the_fallback_set() -> None:
     sent = feed(agent, 10.0, amplitude=9e-5)
     (fallback,) = fallbacks(sent)
     assert fallback.cause is Cause.LIMIT_CYCLE
-    assert (fallback.replaced, fallback.parameter_version, fallback.controller) == (1, 2, CALM)
+    assert (fallback.replaced, fallback.parameter_version, fallback.setting.gains) == (1, 2, CALM)
     assert 4.0 < fallback.sample / RATE < 8.0
     assert agent.parameters.fallback
     assert agent.parameters.sample == fallback.sample
@@ -114,7 +116,7 @@ def test_a_twin_that_was_not_asked_is_not_silent() -> None:
 
 
 def test_what_was_proved_is_kept_and_what_was_not_is_not() -> None:
-    store = MemoryStore()
+    store = MemoryParameterStore()
     agent = Agent(agent_settings(), store=store)
     agent.receive(update(1, 0, 0.0))
     feed(agent, 2.9)
@@ -122,9 +124,9 @@ def test_what_was_proved_is_kept_and_what_was_not_is_not() -> None:
     feed(agent, 0.2)  # 1 s of settling and a window of 2 s
     kept = store.load()
     assert kept is not None
-    assert (kept.version, kept.gains, kept.data_time, kept.window) == (1, CALM, -math.inf, None)
+    assert (kept.version, kept.setting.gains, kept.data_time, kept.window) == (1, CALM, -math.inf, None)
     agent.receive(update(2, 1, 1.0, 2e-4))
-    assert Agent(agent_settings(), store=store).parameters.tolerance == 1e-4
+    assert Agent(agent_settings(), store=store).parameters.setting.tolerance == 1e-4
     feed(agent, 10.0, amplitude=9e-4)
     again = Agent(agent_settings(), store=store)
     assert again.parameters.fallback
@@ -167,7 +169,7 @@ def test_blocks_and_single_samples_decide_the_same(steps: list[tuple[int, float,
 
 def test_a_fallback_with_gains_needs_a_controller() -> None:
     with pytest.raises(InvalidInput, match="needs a controller"):
-        AgentSettings("axis-1", "b0", RATE, supervision=Supervision(FallbackSet(0.0, CALM)))
+        AgentSettings("axis-1", "b0", RATE, supervision=Supervision(FallbackSet(Setting(0.0, CALM))))
 
 
 def test_the_period_is_whole_slots() -> None:
@@ -180,7 +182,7 @@ def test_the_period_is_whole_slots() -> None:
 
 def test_no_prediction_excuses_what_is_not_certified() -> None:
     agent = Agent(agent_settings())
-    generous = replace(update(1, 0, 0.0), band=Band(1.0, 1.0, 5.0, 1e6))
+    generous = replace(update(1, 0, 0.0), setting=Setting(1e-4, CALM, Band(1.0, 1.0, 5.0, 1e6)))
     agent.receive(generous)
     (fallback,) = fallbacks(feed(agent, 10.0, amplitude=3.3e-4, frequency=0.9))
     assert fallback.cause is Cause.LIMIT_CYCLE

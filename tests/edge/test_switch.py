@@ -15,15 +15,15 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.switch import Rules, Switch, Waiting, fall_back, is_safe, offer, settle
 from servotwin.edge.verdict import FallbackSet, Verdict
-from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Update
+from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
 OWN = gains_of(PAPER)
 CALM = replace(OWN, Ki=0.0, feedforward=0.05)
 BAND = Band(5e-5, 2e-5, 0.1, 2.0)
 RULES = Rules(Limits(patience_s=2.0), PAPER)
-UPDATE = Update("axis-1", 1, 0, ("b0", 0), 20.0, 0.1, 0.01, (0.08, None), "OK", 2e-4, 60.0, CALM, BAND)
-START = Switch(Parameters(tolerance=1e-4, gains=OWN))
+UPDATE = Update("axis-1", 1, 0, ("b0", 0), 20.0, 0.1, 0.01, (0.08, None), "OK", Setting(2e-4, CALM, BAND), 60.0)
+START = Switch(Parameters(setting=Setting(1e-4, OWN)))
 
 
 def at(seconds: float) -> Instant:
@@ -38,7 +38,7 @@ def reasons(said: tuple[Any, ...]) -> list[tuple[int, Reason]]:
 def test_a_safe_instant_is_used_at_once(error: float | None) -> None:
     state, said = offer(START, UPDATE, RULES, at(22.0), error)
     assert reasons(said) == [(1, Reason.APPLIED)]
-    assert state == Switch(Parameters(1, 2e-4, 20.0, ("b0", 0), 110_000, gains=CALM, band=BAND, gap=0.1))
+    assert state == Switch(Parameters(1, Setting(2e-4, CALM, BAND), 20.0, ("b0", 0), 110_000, gap=0.1))
     assert isinstance(said[0], Receipt)
     assert said[0].sample == 110_000
 
@@ -104,34 +104,36 @@ def test_a_newer_update_takes_the_place_of_what_waits() -> None:
 )
 def test_every_threshold_counts(old: float, new: float, error: float, safe: bool) -> None:
     controller = PAPER.replace(enter=0.5, leave=1.5)
-    assert is_safe(Parameters(tolerance=old), Parameters(tolerance=new), controller, error) is safe
+    assert is_safe(Parameters(setting=Setting(old)), Parameters(setting=Setting(new)), controller, error) is safe
 
 
 def test_without_a_controller_gains_are_refused() -> None:
     rules = Rules(Limits())
     assert reasons(offer(START, UPDATE, rules, at(22.0), 0.0).said) == [(1, Reason.NO_GAINS)]
-    assert reasons(offer(START, replace(UPDATE, controller=None), rules, at(22.0), 0.0).said) == [(1, Reason.APPLIED)]
+    assert reasons(offer(START, replace(UPDATE, setting=Setting(2e-4, None, BAND)), rules, at(22.0), 0.0).said) == [
+        (1, Reason.APPLIED)
+    ]
 
 
 def test_an_update_without_gains_leaves_them() -> None:
     state, _ = offer(START, UPDATE, RULES, at(22.0), 0.0)
-    second = replace(UPDATE, version=2, base_version=1, window=("b0", 1), data_time=21.0, controller=None, band=None)
+    second = replace(UPDATE, version=2, base_version=1, window=("b0", 1), data_time=21.0, setting=Setting(2e-4))
     state, _ = offer(state, second, RULES, at(23.0), 0.0)
-    assert (state.current.gains, state.current.band) == (CALM, None)
+    assert (state.current.setting.gains, state.current.setting.band) == (CALM, None)
 
 
 VERDICT = Verdict(Cause.LIMIT_CYCLE, 2e-4, 5e-5)
-SET = FallbackSet(0.0, CALM, BAND, refuse_s=10.0)
+SET = FallbackSet(Setting(0.0, CALM, BAND), refuse_s=10.0)
 
 
 def test_the_fallback_set_is_a_version_of_its_own() -> None:
-    state = Switch(Parameters(4, 1e-4, 20.0, ("b0", 0), 100_000, gains=OWN))
+    state = Switch(Parameters(4, Setting(1e-4, OWN), 20.0, ("b0", 0), 100_000))
     waiting = replace(UPDATE, version=6, base_version=4, data_time=21.0)
     state, _ = offer(state, waiting, RULES, at(22.0), 1.5e-4)
     state, said = fall_back(state, SET, VERDICT, at(23.0))
     assert reasons(said[:1]) == [(6, Reason.AFTER_FALLBACK)]
-    assert said[1] == Fallback("axis-1", "b0", 115_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 4, 7, 0.0, CALM)
-    assert (state.current.version, state.current.gains, state.current.band) == (7, CALM, BAND)
+    assert said[1] == Fallback("axis-1", "b0", 115_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 4, 7, Setting(0.0, CALM))
+    assert (state.current.version, state.current.setting.gains, state.current.setting.band) == (7, CALM, BAND)
     assert state.current.fallback
 
 
@@ -148,7 +150,7 @@ def test_the_fallback_set_is_a_version_of_its_own() -> None:
 def test_after_a_fallback_only_news_counts_and_not_at_once(
     changes: dict[str, Any], seconds: float, reason: Reason
 ) -> None:
-    state, _ = fall_back(Switch(Parameters(4, 1e-4, 20.0)), SET, VERDICT, at(23.0))
+    state, _ = fall_back(Switch(Parameters(4, Setting(1e-4), 20.0)), SET, VERDICT, at(23.0))
     (receipt,) = offer(state, replace(UPDATE, **changes), RULES, at(seconds), 1e-3).said
     assert isinstance(receipt, Receipt)
     assert (receipt.reason, receipt.version) == (reason, changes["version"])
@@ -173,7 +175,7 @@ def test_every_update_is_answered_at_most_once_and_versions_only_rise(steps: lis
             update = replace(UPDATE, version=next(number), base_version=before.version, data_time=second - 0.05)
             state, said = offer(state, update, RULES, at(second), error)
         elif kind == 1:
-            state, said = fall_back(state, FallbackSet(0.0, CALM, refuse_s=0.0), VERDICT, at(second))
+            state, said = fall_back(state, FallbackSet(Setting(0.0, CALM), refuse_s=0.0), VERDICT, at(second))
             number = count(state.current.version + 1)
         else:
             state, said = settle(state, RULES, at(second), error)

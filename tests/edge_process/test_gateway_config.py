@@ -21,7 +21,7 @@ from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
 from servotwin.edge_process.config_file import edge_toml, load, read
 from servotwin.errors import InvalidInput
-from servotwin.messages import Band
+from servotwin.messages import Band, Setting
 from servotwin.runtime.retry import Retry
 
 LAW = Controller(1377.7, 18907.6, -135.1, 0.1, voltage_limit=10.0, sample_rate=1000.0)
@@ -60,10 +60,12 @@ METRES = st.floats(1e-7, 1e-2)
 def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text: str, stay: bool) -> None:
     gains = gains_of(LAW.replace(Kp=1.0 + a, leave=1.0 + b))
     band = Band(a, b, 0.1 + c, 2.0)
-    supervision = Supervision(FallbackSet(c, None if stay else gains, band, 7.0 + a), WatchSettings(error_floor=b), 0.1)
+    supervision = Supervision(
+        FallbackSet(Setting(c, None if stay else gains, band), 7.0 + a), WatchSettings(error_floor=b), 0.1
+    )
     agent = AgentSettings(
         "axis-1", UNBOOTED, 1000.0, 0.5, 0.1, Retry(1.0, 1.5, 9.0), Limits(0.0, a, b, inf, max_rate=c),
-        Parameters(0, b, gains=gains, band=band, fallback=True), True, -a, text, LAW, gains, supervision, 2.0, 0.2,
+        Parameters(0, Setting(b, gains, band), fallback=True), True, -a, text, LAW, gains, supervision, 2.0, 0.2,
         ProbeLimits(c, 20.0, 0.5),
     )  # fmt: skip
     twin = TwinLink("https://twin.example:8443/base", None, "TOKEN", "ca.pem", 3.0, 5.0)

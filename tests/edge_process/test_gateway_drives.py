@@ -20,7 +20,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Window, unpack_channel
+from servotwin.messages import Setting, Window, unpack_channel
 
 RATE, WINDOW = 5000.0, 0.5
 SIMULATED = 11.0  # s: changes of the reference at 0, 2, ... 10 s
@@ -61,7 +61,7 @@ def windows_of(folder: Path) -> list[Window]:
 def test_windows_hold_what_the_machine_did(tmp_path: Path, kind: Any, count: int) -> None:
     with ExitStack() as stack:
         drive = kind(tmp_path, stack)
-        start = Parameters(tolerance=Scenario.load(tmp_path / "scenario.toml").start_tolerance)
+        start = Parameters(setting=Setting(Scenario.load(tmp_path / "scenario.toml").start_tolerance))
         agent = AgentSettings("axis", UNBOOTED, RATE, WINDOW, parameters=start)
         config = EdgeConfig(agent, "supervise", None, drive, folder=tmp_path)
         (tmp_path / "edge.toml").write_text(edge_toml(config))

@@ -23,7 +23,7 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
-from servotwin.edge_process.status import read_status
+from servotwin.edge_process.monitoring import read_status
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Hello, Receipt, Refusal, Update, Window
 from servotwin.runtime.retry import Retry

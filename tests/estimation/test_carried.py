@@ -169,5 +169,5 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
 def test_a_loop_tells_bias_and_reason_for_every_window():
     assert len(loop().disturbances) == len(loop().redesigns) == len(loop().estimates) == 10
     for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):
-        assert (redesign.tolerance is not None) == estimate.ok == (redesign.reason == "")
+        assert (redesign.setting is not None) == estimate.ok == (redesign.reason == "")
     assert {len(d.reasons) for d in loop().disturbances if not d.known} <= {1}

@@ -14,7 +14,7 @@ from servotwin.estimation.joint.identifiability import identifiability
 from servotwin.estimation.joint.motor_information import PRODUCTS, Case, SensorNoise, last_contacts, motor_cases, table
 from servotwin.estimation.window import Window
 from servotwin.plant.backlash import play
-from servotwin.plant.motor import motor_transfer
+from servotwin.plant.motor import Motor
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
@@ -41,7 +41,7 @@ def test_the_exponents_are_those_of_the_transfer_function():
     values = np.array([servo.J, servo.L, servo.R, servo.k_T, servo.k_B])
 
     def monic(numbers: np.ndarray) -> np.ndarray:
-        numerator, denominator = motor_transfer(*numbers)
+        numerator, denominator = Motor(*numbers).transfer()
         return denominator[1:] / numerator
 
     for hidden in null_space(VOLTAGE_AND_ANGLE.astype(float)).T:

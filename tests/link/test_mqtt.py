@@ -18,7 +18,7 @@ from servotwin.link import exchange
 from servotwin.link.broker import Broker, Connection, Events, Wanted
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, encode
+from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
 from servotwin.store.store import Store, open_store
 
 
@@ -40,7 +40,7 @@ def test_windows_letters_and_messages_go_both_ways(server: Mosquitto, store: Sto
     with twin(at, store) as there, edge(at, wait_s=20.0) as here, ThreadPoolExecutor(1) as pool:
         here.deliver(parcel(0))
         here.deliver(parcel(0))
-        here.deliver(Parcel("axis-1", encode(Hello("axis-1", "b0", 0.0, 10.0, 0, 0.0, ""))))
+        here.deliver(Parcel("axis-1", encode(Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), ""))))
         assert kept(store) == [0]
         polled = pool.submit(here.listen, 0)
         there.post("axis-1", b"first")

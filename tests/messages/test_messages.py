@@ -22,10 +22,11 @@ from servotwin.messages import (
     Hello,
     InvalidMessage,
     Message,
-    Proof,
     Reason,
     Receipt,
+    Setting,
     Update,
+    Verification,
     Window,
     checksum,
     codec,
@@ -36,6 +37,7 @@ from servotwin.messages import (
     pack_channel,
     unpack_channel,
 )
+from servotwin.messages.legacy import MAX_LEGACY_BYTES
 
 SAMPLES = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e200, max_value=1e200)
 
@@ -50,14 +52,16 @@ def window(**changes: Any) -> Window:
     return Window(**{**values, **changes})
 
 
-UPDATE = Update("axis-1", 3, 2, ("b0", 4), 20.0, 0.1, 0.01, (0.08, None), "OK", 1e-4, 60.0)
+UPDATE = Update("axis-1", 3, 2, ("b0", 4), 20.0, 0.1, 0.01, (0.08, None), "OK", Setting(1e-4), 60.0)
 RECEIPT = Receipt("axis-1", 3, True, 110_000, Reason.APPLIED, 3, "b0")
-HELLO = Hello("axis-1", "b0", 0.0, 5000.0, 0, 0.0, "paper")
+HELLO = Hello("axis-1", "b0", 0.0, 5000.0, 0, Setting(0.0), "paper")
 ACKNOWLEDGE = Acknowledge("axis-1", "b0", 4)
 GAINS = Gains(1377.7, 0.0, -135.1, 0.1, 0.5, 1.5, -0.03)
-PROOF = Proof(256, 16, 1.0, 1e-6, 0.1, 1.9, 4.2, 1.2, False)
-FULL_UPDATE = msgspec.structs.replace(UPDATE, controller=GAINS, band=Band(5e-5, 2e-5, 0.1, 2.0), proof=PROOF)
-FALLBACK = Fallback("axis-1", "b0", 110_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 3, 4, 0.0, GAINS)
+VERIFICATION = Verification(256, 16, 1.0, 1e-6, 0.1, 1.9, 4.2, 1.2, False)
+FULL_UPDATE = msgspec.structs.replace(
+    UPDATE, setting=Setting(1e-4, GAINS, Band(5e-5, 2e-5, 0.1, 2.0)), verification=VERIFICATION
+)
+FALLBACK = Fallback("axis-1", "b0", 110_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 3, 4, Setting(0.0, GAINS))
 MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE]
 
 
@@ -70,7 +74,7 @@ def test_messages_survive_the_bytes(message: Message) -> None:
 def test_parameter_messages_are_json_too(message: Any) -> None:
     text = encode_json(message)
     assert decode_json(text) == message
-    assert json.loads(text)["type"].endswith("/1")
+    assert json.loads(text)["type"] == type(message).__struct_config__.tag
 
 
 def test_a_window_knows_who_it_is() -> None:
@@ -156,7 +160,7 @@ def test_damaged_messages_decode_or_are_refused(message: Message, damages: list[
 
 @given(st.recursive(st.none() | st.integers(-9, 9) | st.text(max_size=4), lambda x: st.lists(x, max_size=3)))
 def test_foreign_objects_are_refused(thing: object) -> None:
-    for tag in ("window/1", "update/1", "receipt/1", "hello/1", "ack/1", "window/2"):
+    for tag in ("window/1", "update/1", "update/2", "receipt/1", "hello/1", "hello/2", "ack/1", "window/2"):
         with pytest.raises(InvalidMessage):
             decode(msgspec.msgpack.encode({"type": tag, "servo": thing}))
 
@@ -233,8 +237,8 @@ def test_fields_out_of_range_are_refused(changes: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"tolerance": -1e-9},
-        {"tolerance": math.nan},
+        {"setting": Setting(-1e-9)},
+        {"setting": Setting(math.nan)},
         {"gap": math.nan},
         {"interval": (0.0, math.inf)},
         {"not_after": math.inf},
@@ -249,12 +253,12 @@ def test_updates_carry_finite_numbers_or_none(changes: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("part", "changes"),
     [
-        ("controller", {"Kp": math.nan}),
-        ("controller", {"Ki": math.inf}),
-        ("controller", {"Tf": 0.0}),
-        ("controller", {"enter": -0.1}),
-        ("controller", {"enter": 2.0}),
-        ("controller", {"feedforward": math.inf}),
+        ("gains", {"Kp": math.nan}),
+        ("gains", {"Ki": math.inf}),
+        ("gains", {"Tf": 0.0}),
+        ("gains", {"enter": -0.1}),
+        ("gains", {"enter": 2.0}),
+        ("gains", {"feedforward": math.inf}),
         ("band", {"error": -1e-9}),
         ("band", {"error_rms": math.nan}),
         ("band", {"effort": math.inf}),
@@ -264,19 +268,40 @@ def test_updates_carry_finite_numbers_or_none(changes: dict[str, Any]) -> None:
 def test_gains_and_bands_are_in_range_or_refused(part: str, changes: dict[str, float]) -> None:
     """Made here or decoded: what a constructor refuses is refused from the wire too."""
     with pytest.raises(InvalidMessage):
-        msgspec.structs.replace(getattr(FULL_UPDATE, part), **changes)
+        msgspec.structs.replace(getattr(FULL_UPDATE.setting, part), **changes)
     raw = msgspec.msgpack.decode(encode(FULL_UPDATE))
-    raw[part].update(changes)
-    with pytest.raises(InvalidMessage, match=part if part == "band" else "gains"):
+    raw["setting"][part].update(changes)
+    with pytest.raises(InvalidMessage, match=part):
         decode(msgspec.msgpack.encode(raw))
 
 
-def test_an_update_without_gains_band_and_proof_does_not_mention_them() -> None:
-    assert set(msgspec.msgpack.decode(encode(UPDATE))) == {"type", *UPDATE.__struct_fields__} - {
-        "controller",
-        "band",
-        "proof",
-    }
+def test_an_update_without_gains_band_and_verification_does_not_mention_them() -> None:
+    raw = msgspec.msgpack.decode(encode(UPDATE))
+    assert set(raw) == {"type", *UPDATE.__struct_fields__} - {"verification"}
+    assert raw["setting"] == {"tolerance": 1e-4}
+
+
+def flat(message: Update | Fallback | Hello) -> dict[str, Any]:
+    """The document that the version before wrote of a message."""
+    document = msgspec.to_builtins(message)
+    setting = document.pop("setting")
+    document |= {"type": document["type"].replace("/2", "/1"), "tolerance": setting["tolerance"]}
+    document |= {new: setting[old] for old, new in (("gains", "controller"), ("band", "band")) if old in setting}
+    return document | ({"proof": document.pop("verification")} if "verification" in document else {})
+
+
+@pytest.mark.parametrize("message", [UPDATE, FULL_UPDATE, FALLBACK, HELLO])
+def test_messages_of_the_version_before_are_read(message: Update | Fallback | Hello) -> None:
+    document = flat(message)
+    assert decode(msgspec.msgpack.encode(document)) == message
+    assert decode_json(msgspec.json.encode(document)) == message
+
+
+def test_a_message_of_the_version_before_is_checked_like_a_new_one() -> None:
+    with pytest.raises(InvalidMessage, match="tolerance"):
+        decode(msgspec.msgpack.encode(flat(UPDATE) | {"tolerance": -1.0}))
+    with pytest.raises(InvalidMessage, match="not understood"):
+        decode(msgspec.msgpack.encode(flat(UPDATE) | {"more": bytes(MAX_LEGACY_BYTES)}))
 
 
 def test_an_unknown_schema_version_is_named() -> None:
@@ -297,6 +322,6 @@ def test_unknown_values_are_none() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("tail", math.inf), ("Ms", math.nan), ("settled", 1.5)])
-def test_a_proof_is_of_finite_numbers(name: str, value: float) -> None:
-    with pytest.raises(InvalidMessage, match=f"proof {name}"):
-        msgspec.structs.replace(PROOF, **{name: value})
+def test_a_verification_is_of_finite_numbers(name: str, value: float) -> None:
+    with pytest.raises(InvalidMessage, match=f"verification {name}"):
+        msgspec.structs.replace(VERIFICATION, **{name: value})

@@ -10,18 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.plant import linear
+from servotwin.plant import loop as loops
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, peak
-from servotwin.plant.polynomials import plus
+from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, margins, peak
 from servotwin.plant.servo import Servo
 
 
-def degrees(margins: Margins) -> list[float]:
-    return [math.degrees(crossover.phase_margin) for crossover in margins.gain_crossovers]
+def degrees(found: Margins) -> list[float]:
+    return [math.degrees(crossover.phase_margin) for crossover in found.gain_crossovers]
 
 
-def omegas(margins: Margins) -> list[float]:
-    return [crossover.omega for crossover in margins.gain_crossovers]
+def omegas(found: Margins) -> list[float]:
+    return [crossover.omega for crossover in found.gain_crossovers]
 
 
 def test_table1_as_printed_misses_the_stated_crossover() -> None:
@@ -106,6 +106,23 @@ def test_crossovers_and_margins_against_python_control(servo: Servo, filter_hz: 
     assert np.ravel(mine) == pytest.approx(np.ravel(theirs), rel=1e-5)
 
 
+@pytest.mark.parametrize("k_d", [math.inf, 1e6])
+@pytest.mark.parametrize("n", [40, 100])
+def test_a_long_chain_has_margins(n: int, k_d: float) -> None:
+    """Its polynomials are lost to rounding, those of a hundred masses overflow; the matrices are not."""
+    servo = Servo.preset("paper").replace(n=n, k_d=k_d)
+    found, loop = servo.margins(), servo.loop()
+    omega = np.geomspace(0.1, 200.0, 997)
+    identity = np.eye(loop.B.size)
+    values = np.array([loop.C @ np.linalg.solve(1j * w * identity - loop.A, loop.B) for w in omega])
+    np.testing.assert_allclose(loop.response(omega), values, rtol=1e-6, atol=1e-9)
+    places = np.flatnonzero(np.diff(np.abs(values) > 1.0))
+    assert len(found.gain_crossovers) >= len(places) > 0
+    for i in places:
+        assert any(omega[i] <= crossover.omega <= omega[i + 1] for crossover in found.gain_crossovers)
+    assert found.stable is bool(np.max(servo.closed_loop().poles().real) < 0.0)
+
+
 @given(servos())
 def test_responses_agree_in_both_forms_and_with_python_control(servo: Servo) -> None:
     omega = np.logspace(-1, 3, 41)
@@ -162,7 +179,7 @@ def test_feedback_of_known_first_order_loop() -> None:
 @pytest.mark.parametrize("damping", [0.01, 0.1, 0.5])
 def test_peak_of_a_resonance_in_closed_form(damping: float) -> None:
     numerator, denominator = np.array([9.0]), np.array([9.0, 6.0 * damping, 1.0])
-    omega, value = peak(numerator, denominator)
+    omega, value = peak(linear.realised(numerator, denominator))
     assert value == pytest.approx(1.0 / (2.0 * damping * math.sqrt(1.0 - damping**2)), rel=1e-9)
     assert omega == pytest.approx(3.0 * math.sqrt(1.0 - 2.0 * damping**2), rel=1e-4)
 
@@ -170,7 +187,7 @@ def test_peak_of_a_resonance_in_closed_form(damping: float) -> None:
 def test_a_loop_below_one_has_no_crossover() -> None:
     low = linear.lag(0.5, 1.0)
     assert gain_crossovers(low) == ()
-    assert peak(low.denominator, plus(low.denominator, low.numerator))[1] == pytest.approx(1.0, rel=1e-6)
+    assert margins(low, linear.feedback(low, linear.gain(1.0))).Ms == pytest.approx(1.0, rel=1e-6)
     assert bandwidth(linear.gain(1.0)) == math.inf
 
 
@@ -181,7 +198,7 @@ def test_pidf_with_terms_left_out() -> None:
     for changes in ({}, {"Ki": 0.0}, {"Kd": 0.0}, {"Ki": 0.0, "Kd": 0.0}):
         some = law.replace(**changes)
         expected = some.Kp + some.Ki / s + some.Kd * s / (some.Tf * s + 1.0)
-        system: LinearSystem = linear.pidf(some)
+        system: LinearSystem = loops.pidf(some)
         np.testing.assert_allclose(system.response(omega), expected, rtol=1e-13)
         assert system.B.size == (some.Ki != 0.0) + (some.Kd != 0.0)
 

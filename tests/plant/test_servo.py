@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.sampled import sampled_poles
+from servotwin.plant.loop import sampled_poles
 from servotwin.plant.servo import PRESETS, Servo
 
 GOOD = Servo.preset("paper").dumps()
@@ -189,7 +189,7 @@ def test_sampled_poles_tend_to_the_continuous_ones() -> None:
     continuous = np.sort_complex(servo.closed_loop().poles())[-6:]
     errors = []
     for rate in (20e3, 40e3):
-        z = sampled_poles(servo, servo.controller.replace(sample_rate=rate, voltage_limit=1.0, rate_limit=1.0))
+        z = sampled_poles(servo.plant(), servo.controller.replace(sample_rate=rate, voltage_limit=1.0, rate_limit=1.0))
         errors.append(np.max(np.abs(np.sort_complex(np.log(z) * rate)[-6:] - continuous)))
     assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.05)  # a hold delays by half a sample: first order
 
@@ -199,7 +199,7 @@ def test_sampled_loop_without_integral_and_with_filter() -> None:
     for changes in ({"Ki": 0.0}, {"loop_filter_hz": 20.0}, {"Kd": 0.0, "Kp": 100.0, "Ki": 10.0}):
         servo.check_loop(servo.controller.replace(sample_rate=5000.0, **changes))
     with pytest.raises(InvalidInput, match="needs a rate"):
-        sampled_poles(servo, servo.controller)
+        sampled_poles(servo.plant(), servo.controller)
 
 
 def test_to_control_and_its_absence(monkeypatch: pytest.MonkeyPatch) -> None:

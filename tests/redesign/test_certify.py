@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
+from servotwin.control.gains import gains_of
 from servotwin.control.law import start, tick
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.trend import Trend
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import STILL, Trial, assess
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
@@ -22,15 +25,15 @@ from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy, gap_range
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.setting import Setting
 from servotwin.redesign.settling import settling_map
 from servotwin.simulation import simulate
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
 OWN = SERVO.controller
-CALM = Setting(OWN.replace(Ki=0.0))
+CALM = Design(OWN.replace(Ki=0.0))
 SMALL = Demands(plants=4, conditions=4, screened=2)
 SHORT = Trial(duration=30.0, last=10.0)
 
@@ -107,7 +110,7 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
 @given(seed=st.integers(0, 1000), share=st.sampled_from([0.0, 0.01, 0.05]))
 def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
     """The oracle: one `simulate` per member, and the measures by numpy."""
-    setting = Setting(OWN.replace(Ki=share * OWN.Ki, feedforward=0.02))
+    setting = Design(OWN.replace(Ki=share * OWN.Ki, feedforward=0.02))
     known = Uncertainty(gap=gaps(3, 30), input_bias=(-0.05, 0.05))
     members = draw(SERVO, known, 2, 2, seed)
     (found,) = assess([setting], members, SHORT)
@@ -134,7 +137,7 @@ def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
 
 def test_what_hunts_is_not_settled_and_what_is_calm_is() -> None:
     members = draw(SERVO, Uncertainty(gap=gaps(9, 11)), 4, 4)
-    own, calm = assess([Setting(OWN), CALM], members, SHORT)
+    own, calm = assess([Design(OWN), CALM], members, SHORT)
     assert not own.settled.any()
     assert calm.settled.all()
     assert calm.tail.max() < 2.0 * STILL < own.tail.min()
@@ -144,14 +147,14 @@ def test_a_feedforward_against_the_bias_leaves_the_unbiased_loop() -> None:
     free = draw(SERVO, Uncertainty(gap=gaps(5, 6)), 2, 4)
     biased = replace(free, input_bias=np.full_like(free.gap, 0.08))
     (plain,) = assess([CALM], free, SHORT)
-    (fed,) = assess([Setting(CALM.controller.replace(feedforward=-0.08))], biased, SHORT)
+    (fed,) = assess([Design(CALM.controller.replace(feedforward=-0.08))], biased, SHORT)
     assert np.allclose(plain.cost, fed.cost, rtol=1e-9)
 
 
 def test_a_met_voltage_limit_is_told() -> None:
     members = draw(SERVO, Uncertainty(gap=gaps(5, 6), step=(2e-3, 2.5e-3)), 2, 2)
     limited, free = assess(
-        [Setting(CALM.controller.replace(voltage_limit=limit)) for limit in (0.5, 50.0)], members, SHORT
+        [Design(CALM.controller.replace(voltage_limit=limit)) for limit in (0.5, 50.0)], members, SHORT
     )
     assert limited.saturated.all()
     assert not free.saturated.any()
@@ -166,7 +169,7 @@ def test_noise_in_the_voltage_is_what_the_law_passes() -> None:
     for value in np.random.default_rng(0).normal(0.0, noise, 50_000):
         state = tick(parameters, state, 0.0, float(value))
         voltages.append(state.voltage)
-    predicted = Setting(law).noise_effort(noise, (0.01, 0.5 * rate))
+    predicted = Design(law).noise_effort(noise, (0.01, 0.5 * rate))
     assert np.std(voltages) == pytest.approx(predicted, rel=0.05)
 
 
@@ -233,22 +236,22 @@ def test_the_proof_covers_the_interval_not_the_point(policy: CertifiedPolicy) ->
 
 def test_a_bias_seen_at_rest_is_fed_forward(policy: CertifiedPolicy) -> None:
     made = policy.redesign(Evidence(estimated(10.0), at_rest(0.05, 1e-4)))
-    assert made.controller is not None
+    assert made.setting is not None
     assert made.certificate is not None
-    assert made.controller.feedforward == -0.05
+    assert made.setting.gains.feedforward == -0.05
     assert made.certificate.input_bias[0] < 0.05 < made.certificate.input_bias[1]
-    assert made.band == band_of(made.certificate)
+    assert made.setting.band == band_of(made.certificate)
 
 
 def test_a_bias_beyond_the_limit_is_fed_forward_up_to_it(policy: CertifiedPolicy) -> None:
     made = policy.redesign(Evidence(estimated(10.0), at_rest(-5.0)))
-    assert made.controller is not None
-    assert made.controller.feedforward == policy.feedforward_limit
+    assert made.setting is not None
+    assert made.setting.gains.feedforward == policy.feedforward_limit
 
 
 def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: CertifiedPolicy) -> None:
     made = policy.redesign(Evidence(estimated(59.9, 0.5), at_rest(0.01)))
-    assert (made.tolerance, made.controller) == (None, None)
+    assert made.setting is None
     assert "at most 60 deg are certified: nothing is sent" in made.reason
 
 
@@ -258,18 +261,18 @@ def test_where_nothing_is_proved_the_fallback_set_goes_out_with_the_bias(policy:
     made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
     assert "none of" in made.reason
     assert "the fallback set is sent" in made.reason
-    assert made.controller is not None
-    assert made.controller.replace(feedforward=0.0) == strict.fallback().setting.controller
-    assert made.controller.feedforward == -0.01
+    assert made.setting is not None
+    assert structs.replace(made.setting.gains, feedforward=0.0) == gains_of(strict.fallback().setting.controller)
+    assert made.setting.gains.feedforward == -0.01
 
 
 def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: CertifiedPolicy) -> None:
     refused = estimated(3.0, status=GapStatus.UNIDENTIFIABLE)
-    assert policy.redesign(Evidence(refused, at_rest(0.05))).tolerance is None
+    assert policy.redesign(Evidence(refused, at_rest(0.05))).setting is None
     trend = Trend.start(0.0).update(estimated(10.0))
     made = policy.redesign(Evidence(refused, at_rest(0.05), trend))
-    assert made.controller is not None
-    assert made.controller.feedforward == -0.05
+    assert made.setting is not None
+    assert made.setting.gains.feedforward == -0.05
     assert made.certificate is not None
     assert made.certificate.gap[0] < 10.0 * DEG < made.certificate.gap[1]
 
@@ -277,14 +280,14 @@ def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: Certifi
 def test_what_is_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
     evidence = Evidence(estimated(10.0), at_rest(0.05))
     made = policy.redesign(evidence)
-    again = policy.redesign(replace(evidence, controller=made.controller, tolerance=made.tolerance))
-    assert again.tolerance is None
+    again = policy.redesign(replace(evidence, setting=made.setting))
+    assert again.setting is None
     assert "in force already" in again.reason
 
 
 def test_a_voltage_at_rest_that_moved_speaks_of_friction(policy: CertifiedPolicy) -> None:
     now = OWN.replace(Ki=0.0, feedforward=-0.05)
-    evidence = Evidence(estimated(10.0), at_rest(0.01), None, now, 0.0, tuned_for=10.0 * DEG)
+    evidence = Evidence(estimated(10.0), at_rest(0.01), None, Setting(0.0, gains_of(now)), tuned_for=10.0 * DEG)
     made = policy.redesign(evidence)
     assert made.certificate is not None
     assert made.certificate.friction == pytest.approx((0.0, 0.04 * SERVO.k_T / SERVO.R))
@@ -300,7 +303,7 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     assert wide.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
     noisy = rule.redesign(Evidence(estimated(0.1), at_rest(0.0, noise=1e-3)))
     assert noisy.tolerance == pytest.approx(3e-3)
-    assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).tolerance is None
+    assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 
 def test_the_settling_map_holds_for_every_gap() -> None:
@@ -320,9 +323,9 @@ def test_the_settling_map_holds_for_every_gap() -> None:
 
 def test_hysteresis_enters_inside_and_leaves_outside() -> None:
     made = HysteresisPolicy(SERVO).redesign(Evidence(estimated(10.0)))
-    assert made.controller is not None
-    assert (made.controller.enter, made.controller.leave) == (0.5, 1.5)
-    assert made.tolerance == SERVO.tolerance_for(10.0 * DEG)
+    assert made.setting is not None
+    assert (made.setting.gains.enter, made.setting.gains.leave) == (0.5, 1.5)
+    assert made.setting.tolerance == SERVO.tolerance_for(10.0 * DEG)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0])

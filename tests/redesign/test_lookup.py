@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -31,8 +32,8 @@ from servotwin.redesign.certified.lookup_file import build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.region import Region
 from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.setting import Setting
 from servotwin.twin.policies import policy_of
 from servotwin.twin.settings import TwinSettings
 
@@ -167,24 +168,25 @@ def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
 def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
     asked = region(1.0, 2.0, feedforward=0.03)
     narrow = table().find(asked)
-    other = Setting(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
+    other = Design(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
     cells = {key: found if key.level == 0 else replace(found, setting=other) for key, found in table().cells.items()}
     changed = replace(table(), cells=cells)
-    kept = changed.find(asked, replace(other, controller=other.controller.replace(feedforward=-0.01)))
+    kept = changed.find(asked, replace(other, controller=other.controller.replace(feedforward=-0.01)).setting())
     assert kept.setting.controller == other.controller.replace(feedforward=0.03)
     assert kept.gap == POLICY.uncertainty.gap
     assert changed.find(asked).setting == narrow.setting
-    assert changed.find(asked, replace(other, controller=other.controller.replace(Ki=1.0))).setting == narrow.setting
+    integral = replace(other, controller=other.controller.replace(Ki=1.0))
+    assert changed.find(asked, integral.setting()).setting == narrow.setting
 
 
 def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
     fine = Grid(2.0 * DEG, (1e-2,), (0.0,))
     narrow, wide = (table().cells[Key(level, 0, 0, 0)] for level in (0, 1))
-    other = Setting(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
+    other = Design(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
     widest = len(fine.levels(POLICY.uncertainty.gap)) - 1
     assert widest > 3
     cells = {Key(0, 0, 0, 0): narrow, Key(widest, 0, 0, 0): replace(wide, setting=other)}
-    found = replace(table(), grid=fine, cells=cells).find(region(0.1, 0.2), other)
+    found = replace(table(), grid=fine, cells=cells).find(region(0.1, 0.2), other.setting())
     assert found.setting == narrow.setting
 
 
@@ -211,8 +213,8 @@ def test_a_cell_whose_voltage_meets_its_limit_is_not_proved() -> None:
 
 def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
     exact, looked_up = POLICY.redesign(evidence()), TablePolicy(POLICY, table()).redesign(evidence())
-    assert looked_up.controller is not None
-    assert looked_up.controller.feedforward == exact.controller.feedforward == -0.05
+    assert looked_up.setting is not None
+    assert looked_up.setting.gains.feedforward == exact.setting.gains.feedforward == -0.05
     assert exact.owed is None
     assert looked_up.owed is not None
     assert looked_up.owed.gap == exact.certificate.gap
@@ -222,15 +224,15 @@ def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
 def test_what_is_not_covered_gets_the_fallback_set_and_owes_nothing() -> None:
     made = TablePolicy(POLICY, table()).redesign(replace(evidence(), disturbance=Disturbance(0, math.inf, 0.0, 0, 0)))
     assert "the fallback set is sent" in made.reason
-    assert made.controller == table().fallback.setting.controller
+    assert made.setting.gains == gains_of(table().fallback.setting.controller)
     assert made.owed is None
 
 
 def test_what_is_in_force_is_not_sent_again() -> None:
     policy = TablePolicy(POLICY, table())
     made = policy.redesign(evidence())
-    again = policy.redesign(evidence(10.1, controller=made.controller, tolerance=made.tolerance))
-    assert again.tolerance is None
+    again = policy.redesign(evidence(10.1, setting=made.setting))
+    assert again.setting is None
     assert again.owed is None
     assert "in force already" in again.reason
 

@@ -136,8 +136,8 @@ def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path)
     agent = scenario.agent_settings()
     fallback = agent.supervision.fallback
     assert proved.gap == scenario.twin.uncertainty.gap
-    assert fallback.gains == agent.parameters.gains == gains_of(proved.setting.controller)
-    assert fallback.band == agent.parameters.band == band_of(proved)
+    assert fallback.setting.gains == agent.parameters.setting.gains == gains_of(proved.setting.controller)
+    assert fallback.setting.band == agent.parameters.setting.band == band_of(proved)
     assert agent.parameters.fallback
     assert scenario.start_law == proved.setting.controller
     assert fallback.silence_s == certified(scenario.model, scenario.twin).horizon
@@ -175,7 +175,7 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
         {"leave": 1.51},
     ):
         assert not limits.allows_gains(gains_of(first.replace(**change)), own)
-    assert limits.maximum * 1.5 == pytest.approx(agent.supervision.fallback.band.error)
+    assert limits.maximum * 1.5 == pytest.approx(agent.supervision.fallback.setting.band.error)
 
 
 def test_limits_that_are_given_go_first(tmp_path):
@@ -188,10 +188,10 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     scenario = load(tmp_path, "[twin]\npolicy = 'hysteresis'\ninitial_gap_deg = 2.0\n")
     agent = scenario.agent_settings()
     assert scenario.start_law == scenario.law
-    assert agent.parameters.tolerance == PAPER.tolerance_for(math.radians(2.0))
+    assert agent.parameters.setting.tolerance == PAPER.tolerance_for(math.radians(2.0))
     own = PAPER.controller
     sent = gains_of(own.replace(enter=0.5, leave=1.5))
     assert agent.limits.allows_gains(sent, agent.own)
     for wrong in (own.replace(Kp=1.1 * own.Kp), own.replace(Ki=1.1 * own.Ki), own.replace(leave=1.6)):
         assert not agent.limits.allows_gains(gains_of(wrong), agent.own)
-    assert isinstance(agent.supervision.fallback.gains, Gains)
+    assert isinstance(agent.supervision.fallback.setting.gains, Gains)

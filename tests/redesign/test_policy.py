@@ -17,7 +17,7 @@ GOOD = GapEstimate(0.2, 0.01, 0.02, (0.16, 0.24), GapStatus.OK, 0.5)
 
 def test_the_tolerance_is_the_gap_times_pitch_and_gain():
     made = PaperPolicy(SERVO, k_dz=1.5).redesign(Evidence(GOOD, tuned_for=0.1))
-    assert made.tolerance == pytest.approx(1.5 * SERVO.p * 0.2, rel=1e-15)
+    assert made.setting.tolerance == pytest.approx(1.5 * SERVO.p * 0.2, rel=1e-15)
     assert (made.gap, made.reason) == (0.2, "")
 
 
@@ -30,7 +30,7 @@ def test_smoothing_keeps_a_share_of_the_previous_gap():
 @pytest.mark.parametrize("status", [status for status in GapStatus if status is not GapStatus.OK])
 def test_only_estimates_that_are_ok_set_a_tolerance(status):
     made = PaperPolicy(SERVO).redesign(Evidence(replace(GOOD, status=status, reasons=("the motor rested",))))
-    assert made.tolerance is None
+    assert made.setting is None
     assert math.isnan(made.gap)
     assert made.reason == f"the estimate is {status.value}: the motor rested"
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from servotwin.plant.backlash import play_step
-from servotwin.plant.linear import held
+from servotwin.plant.linear import zero_order_hold
 from servotwin.plant.servo import Servo
 
 HOLD, DURATION, STEP = 2e-4, 40.0, 1e-3
@@ -49,7 +49,7 @@ def position(reading, motor, structure, output, gains, half_gap, tolerance):
 
 
 def over_a_tick(system):
-    return tuple(np.ascontiguousarray(part) for part in held(system.A, system.B, HOLD))
+    return tuple(np.ascontiguousarray(part) for part in zero_order_hold(system.A, system.B, HOLD))
 
 
 def swing(servo, reading, gap_deg):

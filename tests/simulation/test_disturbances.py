@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
+from servotwin.plant import loop
 from servotwin.plant.automaton import Shape, continuous_loop
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
@@ -40,7 +40,7 @@ def test_integral_action_removes_the_error(rate: float | None) -> None:
 def test_the_linear_loop_agrees_with_expm() -> None:
     """Plant and PIDF as one matrix, made from the transfer functions' state spaces and not from the automaton."""
     law, bias, reference, feedforward = PAPER.controller, 0.03, 1e-3, 0.02
-    plant, pidf = linear.plant(PAPER), linear.pidf(law)
+    plant, pidf = PAPER.plant(), loop.pidf(law)
     size, own = plant.B.size, pidf.B.size
     A, B = np.zeros((size + own, size + own)), np.zeros(size + own)
     A[:size, :size] = plant.A - np.outer(plant.B, pidf.D * plant.C)

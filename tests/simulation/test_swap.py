@@ -10,7 +10,6 @@ from scipy.linalg import expm
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant import linear
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
@@ -103,7 +102,7 @@ def test_the_same_controller_changes_nothing(at: int, rate: float | None, noisy:
 def test_the_linear_loop_agrees_with_expm() -> None:
     """Without gap and dead zone: two linear loops, the second with its states and with the offset that fades."""
     old, new = OLD.replace(feedforward=0.05), OLD.replace(Kp=0.5 * OLD.Kp, Ki=300.0, Kd=0.7 * OLD.Kd, release_time=0.3)
-    plant, reference, at, step = linear.plant(PAPER), 1e-3, 137, 0.01
+    plant, reference, at, step = PAPER.plant(), 1e-3, 137, 0.01
     size = plant.B.size
 
     def loop(law: Controller) -> tuple[np.ndarray, np.ndarray]:

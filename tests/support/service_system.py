@@ -15,7 +15,7 @@ import msgspec
 
 from servotwin import messages
 from servotwin.link.seal import verifier_of
-from servotwin.messages import Hello, Window, encode, pack_channel
+from servotwin.messages import Hello, Setting, Window, encode, pack_channel
 from servotwin.store.store import open_store
 from servotwin.twin_service.pool import Pool
 from servotwin.twin_service.system import System
@@ -52,7 +52,7 @@ def window(
 
 def hello(servo: str = "ax-1", boot: str = "b", time: float = 0.0) -> bytes:
     """An edge's first word."""
-    return encode(Hello(servo, boot, time, 1000.0, 0, 0.0, "model"))
+    return encode(Hello(servo, boot, time, 1000.0, 0, Setting(0.0), "model"))
 
 
 def bearer(token: str = TOKEN) -> dict[str, str]:

@@ -8,6 +8,7 @@ from servotwin.estimation.window import Window
 from servotwin.messages import (
     Reason,
     Receipt,
+    Setting,
     pack_channel,
 )
 from servotwin.redesign.evidence import Evidence
@@ -50,7 +51,7 @@ class Rule:
 
 
 def eq_21() -> Rule:
-    return Rule(lambda evidence: Redesign(PITCH * evidence.estimate.gap, evidence.estimate.gap, ""))
+    return Rule(lambda evidence: Redesign(Setting(PITCH * evidence.estimate.gap), evidence.estimate.gap, ""))
 
 
 def make(estimator=known_gap, **settings):

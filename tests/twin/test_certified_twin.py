@@ -10,14 +10,13 @@ from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.messages import Acknowledge, Gains, Update, pack_channel
+from servotwin.messages import Acknowledge, Gains, Setting, Update, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
-from servotwin.twin.in_force import InForce
 from servotwin.twin.policies import certified, policy_of
-from servotwin.twin.proof import proof_of
+from servotwin.twin.proof import verification_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
@@ -51,7 +50,7 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK
 
     store = MemoryStore()
     policy = policy_of(PAPER, settings)
-    start = InForce(PAPER.controller, 0.0)
+    start = Setting(0.0, gains_of(PAPER.controller))
     twin = Twin("axis", estimator, policy, store, settings, lambda _window: told or disturbed(0.05), start)
     acknowledge, *sent = twin.receive(window(), 0.0)
     assert isinstance(acknowledge, Acknowledge)
@@ -61,11 +60,11 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK
 def test_what_is_proved_is_sent_with_its_proof_and_band():
     (update,), redesign = answer()
     assert isinstance(update, Update)
-    assert update.controller.feedforward == pytest.approx(-0.05)
-    assert update.controller.Ki == 0.0
-    assert update.proof == proof_of(redesign.certificate)
-    assert update.proof.members == redesign.certificate.members
-    assert update.band == redesign.band
+    assert update.setting.gains.feedforward == pytest.approx(-0.05)
+    assert update.setting.gains.Ki == 0.0
+    assert update.verification == verification_of(redesign.certificate)
+    assert update.verification.members == redesign.certificate.members
+    assert update.setting.band == redesign.setting.band
     assert redesign.reason == ""
 
 
@@ -73,7 +72,7 @@ def test_what_is_proved_is_sent_with_its_proof_and_band():
 def test_an_interval_wider_than_what_is_certified_sends_nothing(gap_deg):
     sent, redesign = answer(gap_deg)
     assert sent == []
-    assert redesign.tolerance is None
+    assert redesign.setting is None
     assert redesign.reason.startswith(f"the gap may be {gap_deg[0]:g} to ")
     assert "at most 60 deg are certified" in redesign.reason
 
@@ -99,8 +98,8 @@ def test_where_nothing_is_proved_the_fallback_set_is_sent_and_it_is_said():
     proved = certified(PAPER, settings).fallback()
     assert "is proved: the best is off by" in redesign.reason
     assert redesign.reason.endswith("; the fallback set is sent")
-    assert update.controller == gains_of(proved.setting.controller.replace(feedforward=-0.1))
-    assert update.band == band_of(proved)
+    assert update.setting.gains == gains_of(proved.setting.controller.replace(feedforward=-0.1))
+    assert update.setting.band == band_of(proved)
 
 
 def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window():
@@ -116,6 +115,6 @@ def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
         sent, redesign = answer((gap - 0.1, gap + 0.1), told=noisy)
         proved = certified(PAPER, SETTINGS).fallback()
         assert sent
-        assert isinstance(sent[0].controller, Gains)
+        assert isinstance(sent[0].setting.gains, Gains)
         assert redesign.certificate.tail <= proved.tail
-        assert sent[0].tolerance * sent[0].controller.leave <= band_of(proved).error
+        assert sent[0].setting.tolerance * sent[0].setting.gains.leave <= band_of(proved).error

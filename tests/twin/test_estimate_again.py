@@ -13,11 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
-from servotwin.messages import Acknowledge, checksum, encode
+from servotwin.messages import Acknowledge, Setting, checksum, encode
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage
@@ -25,7 +26,6 @@ from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.evidence import plain
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.replay import replay
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.work import work
@@ -37,7 +37,7 @@ NAMES = ("fig15", "fig16", "calm")
 def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], Model]:
     """(window, evidence, context) of each estimate that a scenario led to."""
     scenario = Scenario.preset(name).replace(duration=65.0)
-    model = Model("m", scenario.model, scenario.twin, InForce(scenario.start_law, scenario.start_tolerance))
+    model = Model("m", scenario.model, scenario.twin, Setting(scenario.start_tolerance, gains_of(scenario.start_law)))
     fleet, state, found = Fleet((model,), (("*", "m"),)), b"", []
     for each in (m for m in cosimulate(scenario).messages if m.direction == "up"):
         stored = StoredMessage(1, MessageKind.WINDOW, each.data, "", each.arrival)

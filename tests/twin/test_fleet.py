@@ -10,9 +10,9 @@ from servotwin.config.table import parse_toml
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 
@@ -59,21 +59,23 @@ def test_models_carry_settings_controller_and_start():
     wanted = TwinSettings(policy="paper", initial_gap=math.radians(1.0))
     assert plain.settings.replace(estimator=None) == wanted
     assert plain.servo == Servo.preset("paper")
-    assert plain.begins == InForce(plain.servo.controller, plain.servo.tolerance_for(plain.settings.initial_gap))
+    assert plain.begins == Setting(
+        plain.servo.tolerance_for(plain.settings.initial_gap), gains_of(plain.servo.controller)
+    )
     assert calm.servo == Servo.preset("paper").replace(Ki=0.0)
-    assert calm.begins == InForce(calm.servo.controller, 0.0)
+    assert calm.begins == Setting(0.0, gains_of(calm.servo.controller))
 
 
 def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
     scenario = Scenario.preset("certified")
     model = Model("axis", scenario.model, scenario.twin)
-    assert model.begins == InForce(scenario.start_law, scenario.start_tolerance)
-    assert gains_of(model.begins.controller) != gains_of(scenario.law)
+    assert model.begins == Setting(scenario.start_tolerance, gains_of(scenario.start_law))
+    assert model.begins.gains != gains_of(scenario.law)
 
 
 def test_where_nothing_is_proved_nothing_is_known_of_the_start():
     settings = TwinSettings(uncertainty=TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0)))
-    assert Model("axis", Servo.preset("paper"), settings).begins == InForce()
+    assert Model("axis", Servo.preset("paper"), settings).begins is None
 
 
 def test_a_servos_file_lies_beside_the_fleets(tmp_path):

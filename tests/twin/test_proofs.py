@@ -13,14 +13,13 @@ import pytest
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Cause, Fallback, Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.lookups import Question, decode_question
 from servotwin.twin.policies import certified
 from servotwin.twin.settings import TwinSettings
@@ -49,7 +48,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(file: Path) -> Fleet:
-    start = InForce(SCENARIO.start_law, SCENARIO.start_tolerance)
+    start = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
     return Fleet((Model("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
 
 
@@ -113,7 +112,7 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: F
     question = decode_question(asked.body)
     assert (asked.servo, asked.kind, asked.encoding) == ("axis", MessageKind.VERIFICATION, "")
     assert (question.version, question.window) == (update.version, update.window)
-    assert gains_of(question.setting.controller) == update.controller
+    assert gains_of(question.setting.controller) == update.setting.gains
     assert question.region.gap[0] < 12.0 * DEG < question.region.gap[1]
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
@@ -152,8 +151,8 @@ def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: F
     proved = certified(SERVO, fleet.models[0].settings).fallback()
     assert back.base_version == update.version
     assert back.data_time > update.data_time
-    law = proved.setting.controller.replace(feedforward=back.controller.feedforward)
-    assert back.controller == gains_of(law)
+    law = proved.setting.controller.replace(feedforward=back.setting.gains.feedforward)
+    assert back.setting.gains == gains_of(law)
     assert not following.enqueue
     said = {row.kind: row.status for row in following.evidence}
     assert "the proof of version" in said["glance"]
@@ -194,7 +193,9 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> N
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
     assert kinds(quiet) == ["glance"]
-    told = Fallback("axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, 0.0)
+    told = Fallback(
+        "axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, Setting(0.0)
+    )
     queue.give(told)
     outcome = queue.window(2, update.version + 1)
     assert "estimate" in kinds(outcome)

@@ -17,6 +17,7 @@ from servotwin.messages import (
     Hello,
     InvalidMessage,
     Reason,
+    Setting,
     pack_channel,
 )
 from servotwin.twin.decode import decode_channel, decode_window
@@ -33,7 +34,7 @@ def test_a_window_is_acknowledged_and_answered_with_an_update():
     assert update.window == ("boot-1", 3)
     assert (update.version, update.base_version, update.data_time, update.not_after) == (1, 0, 20.0, 27.0)
     assert update.gap == pytest.approx(0.2)
-    assert update.tolerance == pytest.approx(PITCH * 0.2)
+    assert update.setting.tolerance == pytest.approx(PITCH * 0.2)
     assert store.updates == [update]
     assert messages.decode(messages.encode(update)) == update
 
@@ -142,7 +143,7 @@ def test_a_refused_base_is_replaced_by_what_is_in_force():
     _, update = twin.receive(window_message(1, 20.0), 21.0)
     (again,) = twin.receive(receipt(update, Reason.BASE_MISMATCH, in_force=0), 24.0)
     assert (again.version, again.base_version) == (3, 0)
-    assert (again.tolerance, again.window) == (update.tolerance, update.window)
+    assert (again.setting.tolerance, again.window) == (update.setting.tolerance, update.window)
     assert twin.receive(receipt(again), 27.0) == []
     assert twin.next_wake() is None
     assert lost.version == 1
@@ -218,7 +219,7 @@ def test_too_soon_is_tried_again_later():
 def test_after_a_reboot_only_windows_of_the_new_boot_count():
     twin, store = make()
     twin.receive(window_message(0, 10.0), 11.0)
-    twin.receive(Hello("axis", "boot-2", 0.0, 100.0, 1, 0.0, "model"), 12.0)
+    twin.receive(Hello("axis", "boot-2", 0.0, 100.0, 1, Setting(0.0), "model"), 12.0)
     assert len(twin.receive(window_message(1, 99.0), 13.0)) == 1
     _, update = twin.receive(window_message(0, 9.0, boot="boot-2", version=1), 14.0)
     assert (update.version, update.base_version, update.window) == (2, 1, ("boot-2", 0))

@@ -16,13 +16,13 @@ from servotwin.messages import (
     Band,
     Cause,
     Fallback,
+    Setting,
 )
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.simulation import simulate
-from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
@@ -32,7 +32,7 @@ def test_the_policy_smooths_from_the_gap_it_last_tuned_for():
     servo = Servo.preset("paper")
     twin = Twin("axis", known_gap, PaperPolicy(servo, smoothing=0.5), MemoryStore())
     updates = [twin.receive(window_message(k, 10.0 * k), 0.0)[1] for k in (1, 2, 3)]
-    assert [update.tolerance / servo.p for update in updates] == pytest.approx([0.1, 0.15, 0.225])
+    assert [update.setting.tolerance / servo.p for update in updates] == pytest.approx([0.1, 0.15, 0.225])
     assert [update.gap for update in updates] == pytest.approx([0.1, 0.2, 0.3])
 
 
@@ -47,7 +47,7 @@ CALM = OWN.replace(Ki=0.0, feedforward=-0.02, sample_rate=5000.0, voltage_limit=
 
 
 def with_policy(rule: Rule, **changes):
-    store, start = MemoryStore(), InForce(OWN.replace(voltage_limit=12.0), 1e-4)
+    store, start = MemoryStore(), Setting(1e-4, gains_of(OWN))
     return Twin("axis", known_gap, rule, store, observer=lambda _: DISTURBED, start=start, **changes), store
 
 
@@ -59,33 +59,33 @@ def test_a_policy_sees_the_evidence():
     assert evidence.estimate.gap == 0.1
     assert evidence.disturbance == DISTURBED == store.disturbances["axis", "boot-1", 1]
     assert evidence.trend is twin.trend
-    assert (evidence.controller, evidence.tolerance) == (OWN.replace(voltage_limit=12.0), 1e-4)
+    assert evidence.setting == Setting(1e-4, gains_of(OWN))
     assert evidence.tuned_for is None
     twin.receive(receipt(update), 1.0)
     twin.receive(window_message(2, 20.0, version=1), 2.0)
     evidence = rule.asked[1]
-    assert (evidence.tolerance, evidence.tuned_for) == (PITCH * 0.1, 0.1)
-    assert evidence.controller == OWN.replace(voltage_limit=12.0)
+    assert (evidence.setting.tolerance, evidence.tuned_for) == (PITCH * 0.1, 0.1)
+    assert evidence.gains == gains_of(OWN)
 
 
 def test_a_whole_controller_is_sent_and_known_to_be_in_force_once_it_is():
     """Its gains, thresholds and feedforward; the limits and the rate stay the edge's."""
-    rule = Rule(lambda e: Redesign(0.0, e.estimate.gap, "", CALM, Band(1e-4, 5e-5, 1.0, 2.0)))
+    rule = Rule(lambda e: Redesign(Setting(0.0, gains_of(CALM), Band(1e-4, 5e-5, 1.0, 2.0)), e.estimate.gap, ""))
     twin, _ = with_policy(rule)
     _, update = twin.receive(window_message(1, 10.0), 0.0)
     assert messages.decode(messages.encode(update)) == update
-    assert (update.controller.Ki, update.controller.feedforward, update.band.effort) == (0.0, -0.02, 1.0)
+    assert (update.setting.gains.Ki, update.setting.gains.feedforward, update.setting.band.effort) == (0.0, -0.02, 1.0)
     twin.receive(window_message(2, 20.0), 1.0)
-    assert rule.asked[1].controller.Ki == OWN.Ki
+    assert rule.asked[1].gains.Ki == OWN.Ki
     twin.receive(window_message(3, 30.0, version=1), 2.0)
-    assert rule.asked[2].controller == OWN.replace(Ki=0.0, feedforward=-0.02, voltage_limit=12.0)
+    assert rule.asked[2].gains == gains_of(OWN.replace(Ki=0.0, feedforward=-0.02))
 
 
 def test_what_somebody_else_set_is_not_known():
     rule = eq_21()
     twin, _ = with_policy(rule)
     twin.receive(window_message(1, 10.0, version=17), 0.0)
-    assert (rule.asked[0].controller, rule.asked[0].tolerance) == (None, None)
+    assert rule.asked[0].setting is None
 
 
 def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
@@ -95,13 +95,13 @@ def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
     twin.receive(receipt(update), 1.0)
     twin.receive(window_message(2, 20.0, version=1), 2.0)
     assert twin.next_wake() is not None
-    fallback = Fallback("axis", "boot-1", 2100, Cause.LIMIT_CYCLE, 1e-3, 1e-4, 1, 3, 2e-4, gains_of(CALM))
+    fallback = Fallback("axis", "boot-1", 2100, Cause.LIMIT_CYCLE, 1e-3, 1e-4, 1, 3, Setting(2e-4, gains_of(CALM)))
     assert twin.receive(fallback, 3.0) == []
     assert twin.next_wake() is None
     assert store.fallbacks == [fallback]
     _, again = twin.receive(window_message(3, 30.0, version=3), 4.0)
     evidence = rule.asked[-1]
-    assert (evidence.controller.Ki, evidence.tolerance, evidence.tuned_for) == (0.0, 2e-4, None)
+    assert (evidence.gains.Ki, evidence.setting.tolerance, evidence.tuned_for) == (0.0, 2e-4, None)
     assert (again.version, again.base_version) == (4, 3)
 
 
@@ -112,7 +112,7 @@ def test_every_window_has_its_redesign_or_the_reason_why_not():
     twin, store = make()
     for k, start in enumerate((20.0, 10.0)):
         twin.receive(window_message(k, start), 0.0)
-    assert [r.tolerance is None for r in store.redesigns.values()] == [False, True]
+    assert [r.setting is None for r in store.redesigns.values()] == [False, True]
     assert "not newer" in store.redesigns["axis", "boot-1", 1].reason
 
 

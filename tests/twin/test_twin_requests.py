@@ -6,11 +6,11 @@ import msgspec
 import pytest
 
 from servotwin import messages
+from servotwin.control.gains import gains_of
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
-from servotwin.messages import Answer, LongerWindow, Outcome, Probe, pack_channel
+from servotwin.messages import Answer, LongerWindow, Outcome, Probe, Setting, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
@@ -45,10 +45,14 @@ class Says:
         return GapEstimate(self.gap, 1e-4, 1e-3, interval_95(self.gap, 1e-3), status, window.mid_time, method="test")
 
 
-def make(says: Says | None = None, runs: InForce | None = None, **settings) -> tuple[Twin, MemoryStore]:
+START = Setting(0.0, gains_of(LAW))
+LATE = gains_of(LAW.replace(leave=1.5))
+
+
+def make(says: Says | None = None, runs: Setting | None = START, **settings) -> tuple[Twin, MemoryStore]:
     store, excitation = MemoryStore(), ExcitationSettings(probe=1e-2, interval=15.0)
     told = TwinSettings(policy="paper", excitation=excitation, retry=2.0, attempts=3, **settings)
-    return Twin.of("axis", SERVO, store, told, says or Says(), runs or InForce(LAW, 0.0)), store
+    return Twin.of("axis", SERVO, store, told, says or Says(), runs), store
 
 
 def requests(sent) -> list[messages.Request]:
@@ -130,14 +134,18 @@ def test_a_new_boot_begins_anew() -> None:
 @pytest.mark.parametrize(
     ("status", "runs", "size"),
     [
-        (GapStatus.UNIDENTIFIABLE, InForce(LAW, 0.0), SERVO.p * math.radians(65.0)),
-        (GapStatus.UNIDENTIFIABLE, InForce(LAW, 1e-4), 2e-4 + SERVO.p * math.radians(65.0)),
-        (GapStatus.UNIDENTIFIABLE, InForce(LAW.replace(leave=1.5), 1e-4), 2.5e-4 + SERVO.p * math.radians(65.0)),
-        (GapStatus.UNIDENTIFIABLE, InForce(LAW), None),
+        (GapStatus.UNIDENTIFIABLE, START, SERVO.p * math.radians(65.0)),
+        (GapStatus.UNIDENTIFIABLE, Setting(1e-4, gains_of(LAW)), 2e-4 + SERVO.p * math.radians(65.0)),
+        (
+            GapStatus.UNIDENTIFIABLE,
+            Setting(1e-4, LATE),
+            2.5e-4 + SERVO.p * math.radians(65.0),
+        ),
+        (GapStatus.UNIDENTIFIABLE, None, None),
     ],
 )
 def test_the_size_comes_from_the_stated_range_and_the_dead_zone(
-    status: GapStatus, runs: InForce, size: float | None
+    status: GapStatus, runs: Setting | None, size: float | None
 ) -> None:
     twin, store = make(Says(status), runs)
     found = asked(twin, long(0), long(1))
@@ -146,7 +154,7 @@ def test_the_size_comes_from_the_stated_range_and_the_dead_zone(
 
 
 def test_the_size_comes_from_the_trend_once_there_is_one() -> None:
-    twin, _ = make(Says(GapStatus.OK), InForce(LAW, 0.0))
+    twin, _ = make(Says(GapStatus.OK), Setting(0.0, gains_of(LAW)))
     (request,) = asked(twin, long(0), long(1), long(2))
     assert request.ask.size < 2.0 * SERVO.p * (0.1 + math.radians(5.0))
     assert request.ask.size > SERVO.p * (0.1 + math.radians(5.0))
@@ -170,7 +178,7 @@ def test_what_no_estimator_takes_is_no_reason_to_move_the_machine() -> None:
 
 def test_without_settings_answers_are_kept_and_nothing_is_asked() -> None:
     store = MemoryStore()
-    twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), Says(), InForce(LAW, 0.0))
+    twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), Says(), Setting(0.0, gains_of(LAW)))
     assert asked(twin, window(0), window(1), window(2)) == []
     late = Answer("axis", "b0", 1, 0, Outcome.TAKEN, 1)
     assert twin.receive(late, 50.0) == []

@@ -27,13 +27,14 @@ from servotwin.messages import (
     InvalidMessage,
     Reason,
     Receipt,
+    Setting,
     decode,
     encode,
 )
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.in_force import NEWEST, InForce
+from servotwin.twin.in_force import NEWEST
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import TrendState, restored_trend, trend_state
 from servotwin.twin.store import MemoryStore
@@ -52,7 +53,7 @@ class Reborn:
 
     def twin(self) -> Twin:
         s = self.scenario
-        start = InForce(s.start_law, s.start_tolerance)
+        start = Setting(s.start_tolerance, gains_of(s.start_law))
         return Twin.of(s.name, s.model, self.store, s.twin, start=start, state=self.state)
 
     def receive(self, message, now):
@@ -125,12 +126,7 @@ def test_and_finds_the_same(name):
     ]
     assert states[0] == states[1]
     for one, other in zip(living.redesigns, reborn.redesigns, strict=True):
-        assert (one.tolerance, one.reason, one.controller, one.band) == (
-            other.tolerance,
-            other.reason,
-            other.controller,
-            other.band,
-        )
+        assert (one.setting, one.reason) == (other.setting, other.reason)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -191,9 +187,9 @@ def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
     for number, boot, now, version, kind in events:
         message = {
             "window": window_message(number, 3.0 * number, boot, version=version),
-            "hello": Hello("axis", boot, 0.0, 100.0, version, 1e-5, "m", Gains(1.0, 2.0, 3.0, 0.1)),
+            "hello": Hello("axis", boot, 0.0, 100.0, version, Setting(1e-5, Gains(1.0, 2.0, 3.0, 0.1)), "m"),
             "receipt": Receipt("axis", version, True, 3, Reason.APPLIED, version, boot),
-            "fallback": Fallback("axis", boot, 5, Cause.ERROR, 1.0, 0.5, version, version + 1, 2e-5),
+            "fallback": Fallback("axis", boot, 5, Cause.ERROR, 1.0, 0.5, version, version + 1, Setting(2e-5)),
         }.get(kind)
         said = [twin.wake(now) if message is None else twin.receive(message, now) for twin in (lives, dies)]
         assert said[0] == said[1]
@@ -229,7 +225,7 @@ def test_a_broken_state_is_refused_or_restored_never_anything_else(data):
 
 def test_a_later_schema_and_another_servos_state_are_refused():
     twin = make()[0]
-    later = twin.state().replace(b"twin-state/1", b"twin-state/2")
+    later = twin.state().replace(b"twin-state/2", b"twin-state/3")
     with pytest.raises(InvalidInput, match="not understood"):
         twin.restore(later)
     other = Twin("other", known_gap, eq_21(), MemoryStore())
@@ -273,10 +269,10 @@ def test_what_is_remembered_is_bounded():
 
 def test_what_runs_is_remembered_however_many_updates_follow():
     twin, _ = make()
-    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 3, 1e-5, "m"), 0.0)
+    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 3, Setting(1e-5), "m"), 0.0)
     for k in range(3 * NEWEST):
         twin.receive(window_message(k, 1.0 + k, version=3), 2.0 + k)
-    assert twin._known.of(3) == InForce(None, 1e-5)
+    assert twin._known.of(3) == Setting(1e-5)
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -285,10 +281,10 @@ def test_a_hello_tells_what_a_new_boot_runs(told):
     store = MemoryStore()
     twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), known_gap)
     law = SERVO.controller.replace(Kp=1234.0)
-    hello = Hello("axis", "boot-2", 0.0, 100.0, 17, 3e-5, "m", gains_of(law) if told else None)
+    hello = Hello("axis", "boot-2", 0.0, 100.0, 17, Setting(3e-5, gains_of(law) if told else None), "m")
     assert twin.receive(hello, 5.0) == []
     assert store.hellos == [hello]
-    assert twin._known.of(17) == InForce(law if told else None, 3e-5)
+    assert twin._known.of(17) == Setting(3e-5, gains_of(law) if told else None)
 
 
 def test_a_hello_of_an_earlier_boot_tells_nothing():
@@ -296,18 +292,18 @@ def test_a_hello_of_an_earlier_boot_tells_nothing():
     twin.receive(window_message(0, 1.0, boot="boot-1"), 0.0)
     twin.receive(window_message(0, 1.0, boot="boot-2"), 1.0)
     before = twin.state()
-    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 0, 7e-5, "m"), 2.0)
+    twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 0, Setting(7e-5), "m"), 2.0)
     assert twin.state() == before
 
 
 def test_an_edge_says_which_gains_are_in_force():
     scenario = Scenario.preset("certified")
     hello = Agent(scenario.agent_settings()).hello()
-    assert hello.controller == gains_of(scenario.start_law)
+    assert hello.setting.gains == gains_of(scenario.start_law)
     assert decode(encode(hello)) == hello
-    silent = Hello("axis", "b", 0.0, 1.0, 0, 0.0, "m")
-    assert b"controller" not in encode(silent)
-    assert decode(encode(silent)).controller is None
+    silent = Hello("axis", "b", 0.0, 1.0, 0, Setting(0.0), "m")
+    assert b"gains" not in encode(silent)
+    assert decode(encode(silent)).setting.gains is None
 
 
 def test_a_window_that_is_safe_is_learnt_from_without_an_acknowledgement():

@@ -15,22 +15,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servotwin import messages
+from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, Window, decode, encode
 from servotwin.messages.compression import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import twin as twinmodule
 from servotwin.twin.evidence import LONGEST_STATUS, plain, tail_of
 from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.in_force import InForce
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import trend_state
 from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=65.0, name="axis")
-START = InForce(SCENARIO.start_law, SCENARIO.start_tolerance)
+START = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
 QUICK = SCENARIO.twin.replace(method="whitened", estimator=None, retry=5.0, attempts=3)
 
 
@@ -119,7 +119,7 @@ def test_and_in_another_process():
         "said = o.state, o.outgoing, [row._replace(context='') for row in o.evidence]\n"
         "print(hashlib.sha256(repr(said).encode()).hexdigest())"
     )
-    paths = os.pathsep.join((".", "tests"))
+    paths = os.pathsep.join((".", "tests", "tests/twin"))
     seen = {
         subprocess.run(
             [sys.executable, "-c", script],
@@ -158,13 +158,13 @@ BOMB = compress(bytes(40_000_000), DEFLATE)
 SPOILT = {
     "no message": (b"\xc1", "InvalidMessage"),
     "nothing": (b"", "InvalidMessage"),
-    "wrong encoding": ((encode(Hello("axis", "b", 0.0, 1.0, 0, 0.0, "m")), DEFLATE), "InvalidMessage"),
+    "wrong encoding": ((encode(Hello("axis", "b", 0.0, 1.0, 0, Setting(0.0), "m")), DEFLATE), "InvalidMessage"),
     "unknown encoding": ((b"x", "br"), "InvalidMessage"),
     "a bomb": ((BOMB, DEFLATE), "InvalidMessage"),
     "a bomb of zstd": ((compress(bytes(40_000_000), ZSTD), ZSTD), "InvalidMessage"),
     "cut short": ((zlib.compress(b"x" * 1000)[:-3], DEFLATE), "InvalidMessage"),
     "an edge's": (encode(Acknowledge("axis", "b", 1)), "InvalidMessage"),
-    "another servo's": (encode(Hello("other", "b", 0.0, 1.0, 0, 0.0, "m")), "InvalidMessage"),
+    "another servo's": (encode(Hello("other", "b", 0.0, 1.0, 0, Setting(0.0), "m")), "InvalidMessage"),
 }
 
 
@@ -263,13 +263,12 @@ def test_what_passed_between_two_boots_is_taken_from_when_windows_came():
 def test_a_hello_says_what_a_restarted_edge_runs():
     law = SCENARIO.start_law.replace(Kp=1000.0)
     gains = messages.Gains(law.Kp, law.Ki, law.Kd, law.Tf)
-    hello = Hello("axis", "boot-9", 0.0, 5000.0, 7, 1e-5, "m", gains)
+    hello = Hello("axis", "boot-9", 0.0, 5000.0, 7, Setting(1e-5, gains), "m")
     outcome = work(fleet(), claim(hello), 0.0)
     (row,) = outcome.evidence
     assert (row.kind, row.version, row.status, decode(row.body)) == ("hello", 7, "boot-9", hello)
     known = msgspec.msgpack.decode(outcome.state)["known"]
-    assert (known[7]["controller"]["Kp"], known[7]["tolerance"]) == (1000.0, 1e-5)
-    assert known[7]["controller"]["sample_rate"] == law.sample_rate
+    assert known[7] == {"tolerance": 1e-5, "gains": msgspec.to_builtins(gains)}
     then = work(fleet(), claim(msgspec.structs.replace(windows()[1], boot="boot-9"), state=outcome.state), 0.0)
     assert (decode(then.outgoing[0]).version, decode(then.outgoing[0]).base_version) == (8, 7)
 
@@ -332,7 +331,7 @@ def test_it_says_what_the_twin_of_the_simulation_says(name):
     """Every message of a scenario in the order and at the times in which it came."""
     scenario = Scenario.preset(name).replace(duration=45.0)
     lived = cosimulate(scenario)
-    start = InForce(scenario.start_law, scenario.start_tolerance)
+    start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
     mine = Fleet((Model("m", scenario.model, scenario.twin, start),), (("*", "m"),))
     state, sent = b"", []
     for each in (m for m in lived.messages if m.direction == "up"):

@@ -24,7 +24,7 @@ from service_system import (
 )
 
 from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
-from servotwin.messages import Acknowledge, Update, decode, encode
+from servotwin.messages import Acknowledge, Setting, Update, decode, encode
 from servotwin.messages.compression import compress
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
@@ -260,7 +260,7 @@ def test_a_full_queue_and_a_store_that_cannot_write_are_for_later(serving):
 
 
 def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
-    update = Update("ax-1", 1, 0, ("b", 0), 0.0, 0.1, 0.01, (0.0, None), "ok", 1e-4, 100.0)
+    update = Update("ax-1", 1, 0, ("b", 0), 0.0, 0.1, 0.01, (0.0, None), "ok", Setting(1e-4), 100.0)
 
     async def body(system, client):
         await client.post("/v1/servos/ax-1/letters", content=hello(), headers=bearer())

@@ -158,7 +158,7 @@ def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> 
         assert 'url = "http://127.0.0.1:4321"' in (path / SERVOS[0].name / "edge.toml").read_text()
     assert [each.name for each in tmp_path.iterdir()] == ["up"]
     bands = {servo.name: load(path / servo.name / "edge.toml").agent.supervision.fallback for servo in SERVOS}
-    errors = {name: None if fallback is None else fallback.band.error for name, fallback in bands.items()}
+    errors = {name: None if fallback is None else fallback.setting.band.error for name, fallback in bands.items()}
     assert errors["noisy"] == pytest.approx(errors["quick"] + 0.05e-3)  # the edge puts up with its encoder's noise
     with folder.opened(path) as again:
         assert not again.new

@@ -15,8 +15,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.margins import level_crossings
-from servotwin.plant.polynomials import mirrored, on_axis, positive_roots, times
+from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
 from servotwin.plant.servo import Servo
 
 # Looks within each band of frequencies in which a prediction is possible.
@@ -135,14 +134,15 @@ def _play_phase(angle: float) -> float:
 
 def _bands(loop: LinearSystem) -> list[tuple[float, float]]:
     """Bands of rad/s in which abs(L) >= 1, Re L < 0 and Im L < 0."""
-    real, imaginary = on_axis(times(loop.numerator, mirrored(loop.denominator)))
-    phases = [np.sqrt(positive_roots(part)) for part in (real, imaginary)]
-    edges = np.sort(np.concatenate([*phases, level_crossings(loop.numerator, loop.denominator, 1.0)]))
-    edges = np.concatenate([[0.0], edges])
-    middles = 0.5 * (edges[:-1] + edges[1:])
+    omega = search_frequencies(loop)
+    edges = [one.omega for one in gain_crossovers(loop)]
+    edges += crossings(lambda w: direction(loop.response(w)).real, omega)
+    edges += crossings(lambda w: direction(loop.response(w)).imag, omega)
+    bounds = np.array([0.0, *sorted(edges)])
+    middles = 0.5 * (bounds[:-1] + bounds[1:])
     values = loop.response(middles)
     inside = (np.abs(values) >= 1.0) & (values.real < 0.0) & (values.imag < 0.0)
-    return [(float(a), float(b)) for a, b, good in zip(edges[:-1], edges[1:], inside, strict=True) if good]
+    return [(float(a), float(b)) for a, b, good in zip(bounds[:-1], bounds[1:], inside, strict=True) if good]
 
 
 def _prediction(servo: Servo, loop: LinearSystem, gap: float, omega: float) -> Prediction:

@@ -19,6 +19,7 @@ from servotwin.plant.linear import Complex
 
 # Where a type has no filter of its own: the law's derivative needs one, so fast that it costs half a degree at most.
 FASTEST_FILTER = 0.01
+_ROUNDING = 8.0 * float(np.finfo(float).eps)
 
 
 class Kind(NamedTuple):
@@ -92,11 +93,31 @@ def factorised(controller: Controller, wc: float) -> Factors:
     c = controller
     if c.Ki == 0.0:
         raise InvalidInput("controller Ki = 0: the factorisation needs integral action")
-    above = np.array([c.Ki, c.Kp + c.Ki * c.Tf, c.Kp * c.Tf + c.Kd])
-    zeros = np.roots(np.trim_zeros(above[::-1], "f"))
-    if not (np.isreal(zeros).all() and (zeros.real < 0.0).all()):
-        raise InvalidInput(f"the controller's zeros {zeros} 1/s are not real and negative, so it has no such factors")
-    angles = sorted((math.atan2(wc, -float(zero)) for zero in zeros.real), reverse=True)
+    zeros = _zeros(c)
+    if not all(zero < 0.0 for zero in zeros):
+        shown = "complex" if math.isnan(zeros[0]) else f"{', '.join(f'{zero:.6g}' for zero in zeros)} 1/s"
+        raise InvalidInput(f"the controller's zeros are {shown}: they must be real and negative to be factored")
+    angles = sorted((math.atan2(wc, -zero) for zero in zeros), reverse=True)
     angles += [0.0] * (2 - len(angles))
     K = abs(complex(c.Kp + c.Ki / (1j * wc) + c.Kd * 1j * wc / (c.Tf * 1j * wc + 1.0)))
     return Factors(math.copysign(K, c.Ki), wc, angles[0], angles[1], math.atan(wc * c.Tf), True)
+
+
+def _zeros(c: Controller) -> list[float]:
+    """Real zeros of a controller with integral action, 1/s; NaN for two that are complex.
+
+    What cancels but for rounding is zero: the highest coefficient of a controller with one zero only, and the
+    discriminant of two equal ones.
+    """
+    square, linear, constant = c.Kp * c.Tf + c.Kd, c.Kp + c.Ki * c.Tf, c.Ki
+    linear_rounding = _ROUNDING * (abs(c.Kp) + abs(c.Ki) * c.Tf)
+    square_rounding = _ROUNDING * (abs(c.Kp) * c.Tf + abs(c.Kd))
+    if abs(square) <= square_rounding:
+        return [-constant / linear] if abs(linear) > linear_rounding else []
+    discriminant = linear**2 - 4.0 * square * constant
+    if abs(discriminant) <= 2.0 * abs(linear) * linear_rounding + 4.0 * abs(constant) * square_rounding:
+        discriminant = 0.0
+    if discriminant < 0.0:
+        return [math.nan, math.nan]
+    larger = -0.5 * (linear + math.copysign(math.sqrt(discriminant), linear))
+    return [larger / square, constant / larger]

@@ -1,21 +1,17 @@
-"""A plant for tuning: a linear system or a measured frequency response, with a delay; and its loop's margins from the
-response alone, where there are no polynomials."""
+"""A plant for tuning: a linear system or a measured frequency response, with a delay; and the stability of its loop."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq, minimize_scalar
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.linear import Complex, LinearSystem
-from servotwin.plant.margins import GainCrossover, Margins, PhaseCrossover
 
 # Poles and zeros of the plant get looks of their own, this many of their widths about them.
 _CLUSTER = np.linspace(-8.0, 8.0, 49)
@@ -156,39 +152,3 @@ def circled(loops: Complex, integrators: int) -> Array:
     turned = np.sum((np.diff(phase, axis=1) + np.pi) % (2.0 * np.pi) - np.pi, axis=1)
     end = begin - 0.5 * np.pi * integrators + turned
     return np.asarray((np.abs(begin) < 0.5 * np.pi) & (np.abs(end) < 0.5 * np.pi))
-
-
-def seen_margins(loop: Callable[[Array], Complex], omega: Array, stable: bool) -> Margins:
-    """Crossovers, margins, Ms and bandwidth of a loop known by its response only, from looks at `omega` refined."""
-    values = loop(omega)
-    gains = _crossings(lambda w: np.log(np.abs(loop(w))), omega)
-    phases = [w for w in _crossings(lambda w: loop(w).imag, omega) if loop(np.array([w]))[0].real < 0.0]
-    rests = np.abs(values / (1.0 + values)) / abs(values[0] / (1.0 + values[0])) * math.sqrt(2.0)
-    below = np.flatnonzero(rests < 1.0)
-    Ms, at = _peak(lambda w: 1.0 / np.abs(1.0 + loop(w)), omega) if stable else (math.inf, math.nan)
-    at_gains = [complex(loop(np.array([w]))[0]) for w in gains]
-    return Margins(
-        tuple(GainCrossover(w, math.atan2(-v.imag, -v.real)) for w, v in zip(gains, at_gains, strict=True)),
-        tuple(PhaseCrossover(w, 1.0 / float(abs(loop(np.array([w]))[0]))) for w in phases),
-        Ms,
-        at,
-        float(omega[below[0]]) if below.size else math.inf,
-        stable,
-    )
-
-
-def _crossings(value: Callable[[Array], Array], omega: Array) -> list[float]:
-    signs = np.sign(value(omega))
-    places = np.flatnonzero(signs[:-1] * signs[1:] < 0.0)
-
-    def at(w: float) -> float:
-        return float(value(np.array([w]))[0])
-
-    return [float(brentq(at, omega[i], omega[i + 1], xtol=1e-14 * omega[i])) for i in places]
-
-
-def _peak(value: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
-    best = int(np.argmax(value(omega)))
-    ends = (omega[max(best - 1, 0)], omega[min(best + 1, omega.size - 1)])
-    found = minimize_scalar(lambda w: -float(value(np.array([w]))[0]), bounds=ends, method="bounded")
-    return max((-float(found.fun), float(found.x)), (float(value(omega[best : best + 1])[0]), float(omega[best])))

@@ -17,9 +17,9 @@ from numpy.polynomial import polynomial as poly
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.linear import LinearSystem, series
+from servotwin.plant.linear import LinearSystem, realised, series
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import Array, Samples
+from servotwin.plant.signals import Samples
 
 
 def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
@@ -55,7 +55,7 @@ def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
         raise InvalidInput(f"setpoint weights need a controller whose zeros are stable; its zeros are {zeros} 1/s")
     if np.any(above[order + 1 :] != 0.0):
         raise InvalidInput(f"setpoint weights b = {b:g}, c = {c:g}: Kp Tf = -Kd, so only c = b gives a proper filter")
-    return _realised(above[: order + 1], below[: order + 1])
+    return realised(above[: order + 1], below[: order + 1])
 
 
 def shaped(controller: Controller, b: float, c: float, size: float, duration: float, rate: float) -> Samples:
@@ -71,13 +71,3 @@ def overshoot(servo: Servo, controller: Controller, b: float = 1.0, c: float = 1
     slowest = float(np.min(np.abs(system.poles())))
     response = system.step(np.linspace(0.0, 20.0 * math.pi / slowest, 20_001))
     return float(np.max(response) - 1.0)
-
-
-def _realised(above: Array, below: Array) -> LinearSystem:
-    """State space (controllable form) of a proper fraction of polynomials, ascending."""
-    order = below.size - 1
-    direct = float(above[-1] / below[-1])
-    rest = (above - direct * below)[:-1] / below[-1]
-    A = np.eye(order, k=1)
-    A[-1:] = -below[:-1] / below[-1]
-    return LinearSystem(A, np.eye(order)[-1] if order else np.zeros(0), rest, direct, above, below)

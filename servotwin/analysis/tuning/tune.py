@@ -14,12 +14,13 @@ import numpy as np
 
 from servotwin.analysis.tuning.candidates import Candidate, search
 from servotwin.analysis.tuning.factors import KINDS, Factors
-from servotwin.analysis.tuning.response import FrequencyData, Plant, circled, seen_margins
+from servotwin.analysis.tuning.response import FrequencyData, Plant, circled
 from servotwin.config.table import did_you_mean
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.linear import LinearSystem, feedback, gain, pidf, series
-from servotwin.plant.margins import Margins, margins
+from servotwin.plant.linear import LinearSystem, feedback, gain, series
+from servotwin.plant.loop import pidf
+from servotwin.plant.margins import Margins, margins, margins_of_response
 
 # Candidates whose Ms is this close to the smallest count as equal, and the largest Ki wins.
 _EQUAL = 1.01
@@ -157,4 +158,4 @@ def judged(system: LinearSystem | FrequencyData, controller: Controller, delay: 
     omega = plant.looks(float(at_one[np.argmin(np.abs(np.log(np.abs(law.response(at_one) * plant.response(at_one)))))]))
     loops = law.response(omega) * plant.response(omega)
     stable = bool(circled(loops[None, :], plant.integrators + (controller.Ki != 0.0))[0])
-    return seen_margins(lambda w: np.asarray(law.response(w) * plant.response(w)), omega, stable)
+    return margins_of_response(lambda w: np.asarray(law.response(w) * plant.response(w)), omega, stable)

@@ -87,8 +87,8 @@ class OpcUaDrive:
         """Write all, commit, and wait for the drive's decision."""
         session = self._connected
         before, committed = session.read((model.COMMIT, model.DECISION[0]))
-        gains = parameters.gains or Gains(0.0, 0.0, 0.0, 1.0)
-        values = (parameters.version, parameters.tolerance, parameters.gains is not None)
+        gains = parameters.setting.gains or Gains(0.0, 0.0, 0.0, 1.0)
+        values = (parameters.version, parameters.setting.tolerance, parameters.setting.gains is not None)
         session.write(dict(zip(model.PARAMETERS, (*values, *msgspec.structs.astuple(gains)), strict=True)))
         commit = (max(before, committed) + 1) % 2**32
         session.write({model.COMMIT: commit})

@@ -199,9 +199,9 @@ class SimulatedSupervised:
 
     def write(self, parameters: Parameters) -> None:
         """Run on these from the next sample on."""
-        gains = _NO_GAINS if parameters.gains is None else msgspec.structs.astuple(parameters.gains)
-        numbers = parameters.tolerance, *gains
-        status, count, _, _ = self._ask(wire.WRITE, parameters.version, numbers, parameters.gains is not None)
+        gains = _NO_GAINS if parameters.setting.gains is None else msgspec.structs.astuple(parameters.setting.gains)
+        numbers = parameters.setting.tolerance, *gains
+        status, count, _, _ = self._ask(wire.WRITE, parameters.version, numbers, parameters.setting.gains is not None)
         if status == wire.REFUSED:
             raise DriveRefused(self._line.receive(count).decode("utf-8", "replace"))
 

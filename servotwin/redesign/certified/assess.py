@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
 from servotwin.redesign.certified.uncertainty import Members
-from servotwin.redesign.setting import Setting
+from servotwin.redesign.design import Design
 from servotwin.simulation.cases import Cases
 from servotwin.simulation.ensemble import summarise_members
 
@@ -80,7 +80,7 @@ class Outcome:
         return self.ripple < STILL
 
 
-def assess(settings: Sequence[Setting], members: Members, trial: Trial) -> list[Outcome]:
+def assess(settings: Sequence[Design], members: Members, trial: Trial) -> list[Outcome]:
     """Simulate every setting on every member, exactly and in continuous time; the reference steps once from rest."""
     laws = np.empty((len(settings), 1, 1), dtype=object)
     laws[:, 0, 0] = [setting.continuous.controller for setting in settings]
@@ -105,7 +105,7 @@ def assess(settings: Sequence[Setting], members: Members, trial: Trial) -> list[
     ]
 
 
-def nearness(setting: Setting, input_bias: Array, step: float) -> Array:
+def nearness(setting: Design, input_bias: Array, step: float) -> Array:
     """m: an error within which the loop is where it is to be, for each input bias (V) and the largest step (m).
 
     That is 2 % of the step, what an input bias leaves where nothing integrates, and the dead zone.

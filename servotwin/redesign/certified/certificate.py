@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from servotwin.redesign.setting import Setting
+from servotwin.redesign.design import Design
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Certificate:
 
     Attributes
     ----------
-    setting : Setting
+    setting : Design
     gap, input_bias, step, friction : (float, float)
         rad, V, m, N m: ranges of the members.
     members : int
@@ -88,7 +88,7 @@ class Certificate:
         What it took.
     """
 
-    setting: Setting
+    setting: Design
     gap: tuple[float, float]
     input_bias: tuple[float, float]
     step: tuple[float, float]

@@ -22,7 +22,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import Outcome, Trial, assess, nearness
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certified.uncertainty import Members, Uncertainty, draw
-from servotwin.redesign.setting import Setting
+from servotwin.redesign.design import Design
 
 # Measurement noise reaches from well above the crossover to half the rate at which it is sampled.
 _NOISE_BAND = (10.0, 2500.0)
@@ -84,7 +84,7 @@ def certify(
 def confirm(
     servo: Servo,
     uncertainty: Uncertainty,
-    setting: Setting,
+    setting: Design,
     demands: Demands,
     trial: Trial | None = None,
     noise: float = 0.0,
@@ -96,7 +96,7 @@ def confirm(
     ----------
     servo, uncertainty, demands, trial, noise, clock
         As for `certify`.
-    setting : Setting
+    setting : Design
         With its feedforward.
     """
     begin, fed = clock(), setting.controller.feedforward
@@ -119,7 +119,7 @@ def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: fl
     return (replace(demands, overshoot=math.inf) if disturbed else demands), disturbed
 
 
-def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Setting]:
+def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Design]:
     """Every combination of scales, integral action and dead zone within the bound on Ms.
 
     Integral action is for friction and for an input bias that is not known, a dead zone keeps noise out of the voltage:
@@ -136,10 +136,10 @@ def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, n
             f"no candidate has Ms <= {demands.Ms:g} on this servo: raise the bound or allow smaller scales than "
             f"{min(demands.scales):g}"
         )
-    plain = [Setting(law) for law in laws]
+    plain = [Design(law) for law in laws]
     zone = servo.tolerance_for(gap)
     hysteretic = [
-        Setting(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
+        Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
     return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
 
@@ -161,11 +161,11 @@ def _margins(servo: Servo, law: Controller) -> Margins:
     return servo.margins(law)
 
 
-def _fed(setting: Setting, feedforward: float) -> Setting:
-    return Setting(setting.controller.replace(feedforward=feedforward), setting.tolerance)
+def _fed(setting: Design, feedforward: float) -> Design:
+    return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)
 
 
-def _ranked(candidates: list[Setting], members: Members, trial: Trial, demands: Demands, noise: float) -> list[Setting]:
+def _ranked(candidates: list[Design], members: Members, trial: Trial, demands: Demands, noise: float) -> list[Design]:
     """Best first: those that settle on more members, in whole percents, then the cheaper."""
     outcomes = assess(candidates, members, trial)
 
@@ -177,14 +177,14 @@ def _ranked(candidates: list[Setting], members: Members, trial: Trial, demands: 
     return [candidates[k] for k in sorted(range(len(candidates)), key=place)]
 
 
-def _cost(setting: Setting, outcome: Outcome, demands: Demands, noise: float) -> float:
+def _cost(setting: Design, outcome: Outcome, demands: Demands, noise: float) -> float:
     price = demands.effort_weight * setting.noise_effort(noise, _NOISE_BAND) if noise else 0.0
     return float(np.percentile(outcome.cost, 95.0)) + price
 
 
 def _certificate(
     servo: Servo,
-    setting: Setting,
+    setting: Design,
     members: Members,
     uncertainty: Uncertainty,
     outcome: Outcome,

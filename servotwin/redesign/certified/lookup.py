@@ -13,16 +13,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
+import msgspec
+
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
+from servotwin.messages import Setting
 from servotwin.redesign.certified.certificate import Certificate, Refusal
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.region import Region
 from servotwin.redesign.certified.uncertainty import Range
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
-from servotwin.redesign.setting import Setting
 
 _KEPT_LEVELS = 2  # of width: nobody is troubled with an update for a little less
 _QUIET = 1e-6  # m rms: noise below is like none
@@ -245,11 +248,13 @@ def _holds(cell: Range, low: float, high: float) -> bool:
     return cell[0] <= low and high <= cell[1]
 
 
-def _alike(one: Setting, other: Setting | None) -> bool:
+def _alike(one: Design, other: Setting | None) -> bool:
     """Whether two settings are the same but for the feedforward."""
-    if other is None or one.tolerance != other.tolerance:
+    if other is None or other.gains is None or one.tolerance != other.tolerance:
         return False
-    return gains_of(one.controller) == gains_of(other.controller.replace(feedforward=one.controller.feedforward))
+    return gains_of(one.controller) == msgspec.structs.replace(
+        other.gains, feedforward=float(one.controller.feedforward)
+    )
 
 
 def _fed(found: Certificate, feedforward: float) -> Certificate:

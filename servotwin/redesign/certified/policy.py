@@ -12,7 +12,7 @@ from typing import ClassVar
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.trend import Trend
-from servotwin.messages import Band
+from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import NEAR, Trial
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
@@ -20,9 +20,9 @@ from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.region import Prover, Region
 from servotwin.redesign.certified.uncertainty import Range, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
+from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
-from servotwin.redesign.setting import Setting
 
 # Relative, and V: nobody is troubled with an update for less.
 _SAME, _SAME_FEEDFORWARD = 1e-3, 1e-3
@@ -88,7 +88,7 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         region = Region(gap, *self._input_bias(evidence), self._friction(evidence), _noise(evidence))
-        found = prover.prove(region, _running(evidence))
+        found = prover.prove(region, evidence.setting)
         if isinstance(found, Refusal):
             return _fallen_back(prover.fallback(), region, found.reason)
         if _in_force(found.setting, evidence):
@@ -101,7 +101,7 @@ class CertifiedPolicy:
         known = region.within(self.uncertainty)
         return certify(self.servo, known, self.held(), self.trial, region.feedforward, region.noise, self.clock)
 
-    def confirm(self, region: Region, setting: Setting) -> Certificate | Refusal:
+    def confirm(self, region: Region, setting: Design) -> Certificate | Refusal:
         """Whether one setting holds in a region."""
         known = region.within(self.uncertainty)
         return confirm(self.servo, known, setting, self.held(), self.trial, region.noise, self.clock)
@@ -138,7 +138,8 @@ class CertifiedPolicy:
         """What to feed forward (V), and the range of biases to reckon with; what cannot be told from the feedforward
         in force leaves it."""
         told = evidence.disturbance
-        fed = evidence.controller.feedforward if evidence.controller is not None else 0.0
+        gains = evidence.gains
+        fed = gains.feedforward if gains is not None else 0.0
         if not math.isfinite(told.bias_std):
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * told.bias_std, self.bias_floor)
@@ -148,7 +149,7 @@ class CertifiedPolicy:
 
     def _friction(self, evidence: Evidence) -> Range:
         """Torques (N m) to reckon with: those stated, and what the last feedforward left at rest."""
-        told, now = evidence.disturbance, evidence.controller
+        told, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
         if evidence.tuned_for is None or now is None or not math.isfinite(told.bias_std):
             return low, high
@@ -162,20 +163,13 @@ def _noise(evidence: Evidence) -> float:
     return noise if math.isfinite(noise) else 0.0
 
 
-def _running(evidence: Evidence) -> Setting | None:
-    """What the edge runs, as far as is known."""
-    if evidence.controller is None or evidence.tolerance is None:
-        return None
-    return Setting(evidence.controller, evidence.tolerance)
-
-
-def _in_force(setting: Setting, evidence: Evidence) -> bool:
+def _in_force(setting: Design, evidence: Evidence) -> bool:
     """Whether the edge runs it, as far as is known."""
-    now, new = evidence.controller, setting.controller
-    if now is None or evidence.tolerance is None or abs(now.feedforward - new.feedforward) > _SAME_FEEDFORWARD:
+    now, new = evidence.gains, setting.controller
+    if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > _SAME_FEEDFORWARD:
         return False
     gains = ((getattr(now, name), getattr(new, name)) for name in ("Kp", "Ki", "Kd", "Tf", "enter", "leave"))
-    pairs = (*gains, (evidence.tolerance, setting.tolerance))
+    pairs = (*gains, (evidence.setting.tolerance, setting.tolerance))
     return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
 
 
@@ -205,6 +199,4 @@ def _fallen_back(proved: Certificate, region: Region, reason: str) -> Redesign:
 
 def _sent(proved: Certificate, noise: float, gap: float, reason: str) -> Redesign:
     """The redesign that carries a certificate."""
-    setting = proved.setting
-    band = band_of(proved, noise)
-    return Redesign(setting.tolerance, gap, reason, setting.controller, band, proved)
+    return Redesign(proved.setting.setting(band_of(proved, noise)), gap, reason, proved)

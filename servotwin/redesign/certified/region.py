@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from servotwin.messages import Setting
 from servotwin.redesign.certified.certificate import Certificate, Refusal
 from servotwin.redesign.certified.uncertainty import Range, Uncertainty
-from servotwin.redesign.setting import Setting
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.plant.linear import LinearSystem, pidf
+from servotwin.plant.linear import LinearSystem
+from servotwin.plant.loop import pidf
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 from servotwin.reproduction import measures as measure

@@ -1,4 +1,4 @@
-"""What a policy can send: a controller and its dead zone."""
+"""Designs: controllers with a dead zone, as they are simulated and certified."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.messages import Band, Setting
 
 _GRID = 512
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A controller and the half-width of its dead zone.
+class Design:
+    """A whole controller and the half-width of its dead zone.
 
     Attributes
     ----------
@@ -26,10 +28,14 @@ class Setting:
     controller: Controller
     tolerance: float = 0.0
 
+    def setting(self, band: Band | None = None) -> Setting:
+        """Part of it that an update sets, with the band that is predicted for it."""
+        return Setting(self.tolerance, gains_of(self.controller), band)
+
     @property
-    def continuous(self) -> Setting:
+    def continuous(self) -> Design:
         """The same law in continuous time, in which candidates are simulated."""
-        return Setting(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
+        return Design(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
 
     def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
         """Voltage, V rms, that white measurement noise of `noise` (m rms) within `band` (Hz) causes by itself.

@@ -1,0 +1,135 @@
+"""The linear loop without a gap, composed of its parts: motor, structure, controller, loop filter (Eqs 8-15).
+
+In continuous time as a `LinearSystem`; at a sample rate as the poles of one tick: zero-order hold on the plant, the
+edge's own tick as the law.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.control.law import LawState, tick
+from servotwin.errors import InvalidInput
+from servotwin.plant.linear import (
+    Complex,
+    LinearSystem,
+    feedback,
+    gain,
+    integrator,
+    lag,
+    minus,
+    parallel,
+    plus,
+    series,
+    times,
+    zero_order_hold,
+)
+from servotwin.plant.motor import ANGLE, SPEED, Motor
+from servotwin.plant.structure import Structure, chain, transfer
+
+
+def motor_system(motor: Motor) -> LinearSystem:
+    """G1, voltage to the unloaded motor's angle (Eq 8)."""
+    A, B, _ = motor.matrices()
+    numerator, denominator = motor.transfer()
+    return LinearSystem(A, B, np.eye(3)[ANGLE], 0.0, numerator, denominator)
+
+
+def structure_system(structure: Structure, pitch: float) -> LinearSystem:
+    """G2, angle of the screw to the position of the last mass (Eq 13 for n = 3), for a pitch in m/rad.
+
+    The input's derivative is absorbed by the state: z = x - B_velocity d.
+    """
+    links = chain(structure.m, structure.k, structure.c, structure.k_d)
+    B = pitch * (links.B_position + links.A @ links.B_velocity)
+    numerator, denominator, _ = transfer(structure.m, structure.k, structure.c, structure.k_d)
+    return LinearSystem(links.A, B, links.C_last, 0.0, pitch * numerator, denominator)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def plant_system(motor: Motor, structure: Structure, pitch: float) -> LinearSystem:
+    """Voltage to the position of the last mass without a gap.
+
+    With a rigid screw G1 G2. With an elastic one (finite k_d) the load acts on the motor: the screw's force F turns it
+    back with the torque p F.
+    """
+    if math.isinf(structure.k_d):
+        return series(motor_system(motor), structure_system(structure, pitch))
+    links = chain(structure.m, structure.k, structure.c, structure.k_d)
+    A_m, B_m, E = motor.matrices()
+    size = links.B_position.size
+    A = np.zeros((3 + size, 3 + size))
+    A[:3, :3], A[3:, 3:] = A_m, links.A
+    A[3:, ANGLE] = pitch * links.B_position
+    A[SPEED, 3:] = -pitch * E[SPEED] * links.reaction
+    A[SPEED, ANGLE] = -pitch * E[SPEED] * links.reaction_position * pitch
+    B = np.concatenate([B_m, np.zeros(size)])
+    C = np.concatenate([np.zeros(3), links.C_last])
+    # (L s + R)(J s^2 theta + p F) = k_T (u - k_B s theta), F = k_d p theta (1 - k_d inner / whole).
+    numerator, whole, inner = transfer(structure.m, structure.k, structure.c, structure.k_d)
+    electric = np.array([motor.R, motor.L])
+    reaction = pitch**2 * structure.k_d * minus(whole, structure.k_d * inner)
+    mechanical = plus(times(np.array([0.0, 0.0, motor.J]), whole), reaction)
+    back_emf = times(np.array([0.0, motor.k_T * motor.k_B]), whole)
+    denominator = plus(times(electric, mechanical), back_emf)
+    return LinearSystem(A, B, C, 0.0, motor.k_T * pitch * numerator, denominator)
+
+
+def pidf(controller: Controller) -> LinearSystem:
+    """C_PIDF = Kp + Ki/s + Kd s/(Tf s + 1) (Eq 14); terms whose gain is zero have no state."""
+    system = gain(controller.Kp)
+    if controller.Ki != 0.0:
+        system = parallel(system, integrator(controller.Ki))
+    if controller.Kd != 0.0:
+        rate = controller.Kd / controller.Tf
+        system = parallel(system, parallel(gain(rate), lag(-rate, controller.Tf)))
+    return system
+
+
+def loop_filter(controller: Controller) -> LinearSystem:
+    """First-order low-pass on the measurement (section 4.3), or 1 where there is none."""
+    if controller.loop_filter_hz is None:
+        return gain(1.0)
+    return lag(1.0, 1.0 / (2.0 * math.pi * controller.loop_filter_hz))
+
+
+def open_loop(plant: LinearSystem, controller: Controller) -> LinearSystem:
+    """L = C_PIDF P and, where the controller has one, the loop filter."""
+    return series(series(pidf(controller), plant), loop_filter(controller))
+
+
+def closed_loop(plant: LinearSystem, controller: Controller) -> LinearSystem:
+    """Reference to measured position (Eq 15); the loop filter is in the feedback."""
+    return feedback(series(pidf(controller), plant), loop_filter(controller))
+
+
+def sampled_poles(plant: LinearSystem, controller: Controller) -> Complex:
+    """Poles z of the sampled loop: eigenvalues of plant and law over one tick; stable when all abs(z) < 1.
+
+    The law's matrix comes from applying the tick to unit states, with limits and dead zone off, where it is linear.
+    """
+    if controller.sample_rate is None:
+        raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
+    law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)
+    advance, drive = zero_order_hold(plant.A, plant.B, 1.0 / controller.sample_rate)
+    size = plant.B.size
+    names = ["derivative"] + ["integral"] * (controller.Ki != 0.0) + ["filtered"] * (law.loop_step < 1.0)
+    matrix = np.zeros((size + len(names), size + len(names)))
+    for column, unit in enumerate(np.eye(len(matrix))):
+        before = LawState(0.0, 0.0, 0.0, 0.0, 1.0)._replace(**dict(zip(names, map(float, unit[size:]), strict=True)))
+        after = tick(law, before, 0.0, float(plant.C @ unit[:size]))
+        matrix[:size, column] = advance @ unit[:size] + drive * after.voltage
+        matrix[size:, column] = [getattr(after, name) for name in names]
+    return np.asarray(np.linalg.eigvals(matrix), dtype=complex)
+
+
+def slowest_pole(plant: LinearSystem, controller: Controller) -> complex:
+    """The closed loop's pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
+    if controller.sample_rate is None:
+        poles = closed_loop(plant, controller).poles()
+        return complex(poles[np.argmax(poles.real)])
+    poles = sampled_poles(plant, controller)
+    return complex(np.log(poles[np.argmax(np.abs(poles))]) * controller.sample_rate)
