@@ -40,10 +40,10 @@ class FailingFilter:
     def check_rate(self, sample_rate: float) -> None:
         """Any rate will do."""
 
-    def start(self, saved: bytes | None = None) -> "FailingFilter":
+    def start(self, _saved: bytes | None = None) -> "FailingFilter":
         return self
 
-    def __call__(self, cut: Cut) -> Cut | None:
+    def __call__(self, _cut: Cut) -> Cut | None:
         raise ZeroDivisionError
 
     def dumps(self) -> bytes:
@@ -113,7 +113,7 @@ def test_an_edge_hears_that_nothing_is_owed_any_more() -> None:
     box = PipeOutlet(True)
     box.offer(cut(0).cut, 0.0)
     assert box.unacknowledged
-    heard = box._hear([frames.encode(frames.AckFrame(1))])
+    heard = box._receive([frames.encode(frames.AckFrame(1))])
     assert heard.pending_changed
     assert not box.unacknowledged
 
@@ -172,7 +172,7 @@ def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
     good = Parameters(3, Setting(1e-3, gains))
     assert permitted(good, SETTINGS) is good
     assert permitted(None, SETTINGS) is None
-    assert permitted(replace(good, tolerance=1.1e-3), SETTINGS) is None
+    assert permitted(replace(good, setting=Setting(1.1e-3)), SETTINGS) is None
     assert permitted(good, replace(SETTINGS, limits=Limits(maximum=1e-4))) is None
     assert permitted(good, replace(SETTINGS, controller=None)) is None
     assert permitted(good, replace(SETTINGS, controller=LAW.replace(Kp=20.0))) is None

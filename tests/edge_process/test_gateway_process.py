@@ -84,7 +84,7 @@ class Gateway:
 
     def outbox(self) -> list[tuple[str, int]]:
         box = SqliteOutbox(self.folder / "outbox.sqlite", "axis-1")
-        box.settle()
+        box.flush()
         keys = box.pending()
         box.close()
         return keys

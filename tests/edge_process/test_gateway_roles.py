@@ -300,7 +300,7 @@ def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> Non
     for _ in range(3):
         role.step()
     in_force = edge.agent.parameters
-    assert (in_force.version, in_force.setting.setting.tolerance) == (2, drive.voltages[0].setting.tolerance)
+    assert (in_force.version, in_force.setting.tolerance) == (2, drive.voltages[0].setting.tolerance)
     assert [p.version for p in drive.voltages] == [0]
     pumped(box)
     receipt, fallback = letters(far, (Receipt, Fallback))
