@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cholesky, expm, solve_triangular, toeplitz
@@ -117,7 +118,8 @@ def _scaled(servo: Servo, name: str) -> Servo:
     """With one of its numbers larger by the step."""
     value = getattr(servo, name)
     larger = tuple((1.0 + _STEP) * one for one in value) if isinstance(value, tuple) else (1.0 + _STEP) * value
-    return servo.replace(**{name: larger})
+    changes: dict[str, Any] = {name: larger}
+    return servo.replace(**changes)
 
 
 def _spread(column: Array, others: Array, root: Array) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -160,8 +161,11 @@ def estimates(group: Sequence[Case], loop: Loop, voltage: bool, together: bool) 
 
 def described(servo: Servo, factors: Mapping[str, float]) -> Servo:
     """As a data sheet would have it that is wrong by these factors."""
-    numbers = {name: np.multiply(factor, getattr(servo, name)).tolist() for name, factor in factors.items()}
-    return servo.replace(**{name: tuple(one) if isinstance(one, list) else one for name, one in numbers.items()})
+    changes: dict[str, Any] = {}
+    for name, factor in factors.items():
+        value = np.multiply(factor, getattr(servo, name)).tolist()
+        changes[name] = tuple(value) if isinstance(value, list) else value
+    return servo.replace(**changes)
 
 
 def limit(cases: Sequence[Case], loop: Loop, voltage: bool) -> float:

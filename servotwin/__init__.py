@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Certificate": "servotwin.redesign.certified.certificate",
     "Controller": "servotwin.control",
+    "CycleResult": "servotwin.analysis.limit_cycles.cycle",
+    "Demands": "servotwin.redesign.certified.certificate",
     "GapEstimate": "servotwin.estimation.estimate",
     "GapStatus": "servotwin.estimation.estimate",
     "InvalidInput": "servotwin.errors",
+    "Loop": "servotwin.cosim",
     "Noise": "servotwin.plant.noise",
     "PiecewiseCubic": "servotwin.plant.signals",
     "Run": "servotwin.simulation.run",
@@ -21,19 +25,30 @@ _HOMES = {
     "Servo": "servotwin.plant.servo",
     "Simulation": "servotwin.simulation",
     "SquareWave": "servotwin.plant.signals",
+    "StabilityMap": "servotwin.analysis.maps.result",
     "Step": "servotwin.plant.signals",
     "Trend": "servotwin.estimation.trend",
+    "Tuning": "servotwin.analysis.tuning.tune",
+    "Uncertainty": "servotwin.redesign.certified.uncertainty",
     "Window": "servotwin.estimation.window",
+    "certify": "servotwin.redesign.certified.certify",
     "cosimulate": "servotwin.cosim",
     "estimate_gap": "servotwin.estimation.gap",
     "estimate_jointly": "servotwin.estimation.joint.estimator",
+    "limit_cycle": "servotwin.analysis.limit_cycles.cycle",
     "simulate": "servotwin.simulation",
+    "stability_map": "servotwin.design",
+    "tune": "servotwin.design",
 }
 
 if TYPE_CHECKING:
+    from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
+    from servotwin.analysis.maps.result import StabilityMap
+    from servotwin.analysis.tuning.tune import Tuning
     from servotwin.control import Controller
-    from servotwin.cosim import cosimulate
+    from servotwin.cosim import Loop, cosimulate
     from servotwin.cosim.scenario import Scenario
+    from servotwin.design import stability_map, tune
     from servotwin.errors import InvalidInput
     from servotwin.estimation.estimate import GapEstimate, GapStatus
     from servotwin.estimation.gap import estimate_gap
@@ -43,14 +58,21 @@ if TYPE_CHECKING:
     from servotwin.plant.noise import Noise
     from servotwin.plant.servo import Servo
     from servotwin.plant.signals import PiecewiseCubic, Samples, SCurve, SquareWave, Step
+    from servotwin.redesign.certified.certificate import Certificate, Demands
+    from servotwin.redesign.certified.certify import certify
+    from servotwin.redesign.certified.uncertainty import Uncertainty
     from servotwin.simulation import Simulation, simulate
     from servotwin.simulation.run import Run
 
 __all__ = [
+    "Certificate",
     "Controller",
+    "CycleResult",
+    "Demands",
     "GapEstimate",
     "GapStatus",
     "InvalidInput",
+    "Loop",
     "Noise",
     "PiecewiseCubic",
     "Run",
@@ -60,13 +82,20 @@ __all__ = [
     "Servo",
     "Simulation",
     "SquareWave",
+    "StabilityMap",
     "Step",
     "Trend",
+    "Tuning",
+    "Uncertainty",
     "Window",
+    "certify",
     "cosimulate",
     "estimate_gap",
     "estimate_jointly",
+    "limit_cycle",
     "simulate",
+    "stability_map",
+    "tune",
 ]
 
 

@@ -14,8 +14,8 @@ from servotwin.messages import Update, Window, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin.fleet import Fleet
+from servotwin.twin.settings import TriageSettings
 from servotwin.twin.state import TwinState
-from servotwin.twin.triage_settings import TriageSettings
 from servotwin.twin.work import work
 
 RATE = 1000.0

@@ -22,9 +22,8 @@ from benchmarks.novelty.loops import Account, Case
 from benchmarks.novelty.sequences import Delays, delays, one_window, run_length, wearing
 from benchmarks.novelty.windows import CONDITIONS, RATE, TOLD, Condition, Pool, Task, pools, recorded
 from servotwin.analysis.maps.pool import workplace
-from servotwin.commissioning.novelty import model_of
-from servotwin.edge.novelty.score import score
-from servotwin.edge.novelty.settings import NoveltyRules
+from servotwin.novelty.score import model_of, score
+from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.servo import Servo
 
 SCHEMA = "servotwin-bench-novelty/1"

@@ -14,8 +14,8 @@ import numpy as np
 from servotwin.analysis.maps.pool import shared
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.edge.outlet import FILTERED
+from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.signals import Array, SCurve
 
 GROWTH = math.radians(20.0)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.novelty.windows import Pool
-from servotwin.edge.novelty.chart import Chart, begun, look, relearning
-from servotwin.edge.novelty.settings import NoveltyRules
+from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
+from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.signals import Array
 
 QUIET = 50  # windows before a change
@@ -36,7 +36,7 @@ class Delays(NamedTuple):
 def follow(chart: Chart, scores: Array, rules: NoveltyRules) -> Iterator[tuple[Chart, bool]]:
     """The chart after each of some windows (n, 2), and whether it was news."""
     for gap, std in scores.tolist():
-        seen = look(chart, gap, std, rules)
+        seen = add_window(chart, gap, std, rules)
         chart = seen.chart
         yield chart, seen.sudden or seen.slow
 
@@ -70,7 +70,7 @@ def _summary(found: list[float]) -> Delays:
 def _delay(before: Pool, after: Pool, rate: float, rules: NoveltyRules, rng: np.random.Generator, fresh: bool) -> float:
     chart = _settled(before, rules, rng)
     if fresh:
-        chart = relearning(begun(chart, float(before.drawn(1, rng)[0, 0]), math.inf), 1)
+        chart = with_fewer_windows(restarted(chart, float(before.drawn(1, rng)[0, 0]), math.inf), 1)
     for start in range(0, LONGEST, QUIET):
         scores = after.drawn(QUIET, rng)
         scores[:, 0] += rate * np.arange(start + 1, start + QUIET + 1)

@@ -12,9 +12,8 @@ import numpy as np
 
 from benchmarks.estimator_figures import FLOOR
 from servotwin.analysis.maps.pool import shared
-from servotwin.commissioning.novelty import model_of
-from servotwin.edge.novelty.score import score
 from servotwin.estimation.window import Window
+from servotwin.novelty.score import model_of, score
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SquareWave

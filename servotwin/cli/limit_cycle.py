@@ -66,8 +66,9 @@ def tell(
 ) -> None:
     """The command: a table, or one JSON object, on the standard output."""
     servo = Servo.resolve(name)
-    changes = {key: value for key, value in (("enter", enter), ("leave", leave)) if value is not None}
-    servo = servo.replace(sample_rate=None, **changes)
+    servo = servo.replace(sample_rate=None)
+    servo = servo if enter is None else servo.replace(enter=enter)
+    servo = servo if leave is None else servo.replace(leave=leave)
     tolerance = None if tolerance_mm is None else tolerance_mm / _MM
     if not (math.isfinite(gap_deg) and gap_deg >= 0.0):
         raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be finite and 0 or more")

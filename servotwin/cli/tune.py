@@ -11,10 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.analysis.tuning.setpoint import overshoot
-from servotwin.analysis.tuning.tune import Specification, Tuning, judged, tune
+from servotwin.analysis.tuning.tune import Tuning, judged
 from servotwin.control.controller import Controller
-from servotwin.plant.linear import series
-from servotwin.plant.loop import loop_filter
+from servotwin.design import tune, tuned_system
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 
@@ -41,11 +40,16 @@ def tell(request: Request, as_json: bool) -> None:
     """The command: a table, or one JSON object, on the standard output."""
     servo = Servo.resolve(request.servo)
     servo = servo.replace(sample_rate=None)
-    system = series(servo.plant(), loop_filter(servo.controller))
-    margin = math.radians(request.phase_margin_deg)
-    wanted = Specification(request.crossover, margin, request.kind, request.Ms_max, request.prefer)
     delay = 1e-3 * request.delay_ms
-    tuning = tune(system, wanted, delay, servo.controller)
+    tuning = tune(
+        servo,
+        request.crossover,
+        math.radians(request.phase_margin_deg),
+        kind=request.kind,
+        Ms_max=request.Ms_max,
+        prefer=request.prefer,
+        delay=delay,
+    )
     overshoots = None
     weights = (request.b, request.b if request.c is None else request.c)
     if delay == 0.0:
@@ -55,7 +59,7 @@ def tell(request: Request, as_json: bool) -> None:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
         return
     console = Console()
-    present = judged(system, servo.controller, delay)
+    present = judged(tuned_system(servo), servo.controller, delay)
     _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))

@@ -22,7 +22,7 @@ import inspect
 import math
 import textwrap
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass
 from enum import StrEnum
 from functools import cache
@@ -101,12 +101,14 @@ class Key:
     """The metadata of one attribute; `key` and `value` make it."""
 
     names: tuple[str, ...] = ()
+    unit: str = ""
     range: Range = ANY
     help: str = ""
     table: str = ""
     choices: tuple[str, ...] | None = None
     prefix: str | None = None
     switch: str = ""
+    relative: bool = False
     makers: Mapping[str, Maker] | None = None
     select: Callable[[Table], Maker] | None = None
     parse: Callable[[Table, str, Any], Any] | None = None
@@ -120,11 +122,13 @@ def key(
     maximum: float = math.inf,
     below: float = math.inf,
     infinite: bool = False,
+    unit: str = "",
     help: str = "",  # noqa: A002
     table: str = "",
     choices: tuple[str, ...] | None = None,
     prefix: str | None = None,
     switch: str = "",
+    relative: bool = False,
     makers: Mapping[str, Maker] | None = None,
     select: Callable[[Table], Maker] | None = None,
     parse: Callable[[Table, str, Any], Any] | None = None,
@@ -138,6 +142,8 @@ def key(
         several of them, the last one counts.
     minimum, above, maximum, below, infinite
         Range, in the attribute's unit.
+    unit : str
+        The attribute's unit, where the key's end does not say it.
     help : str
         One sentence.
     table : str
@@ -148,13 +154,16 @@ def key(
         For an attribute that is a declared class: its keys lie in the same table and begin with this.
     switch : str
         For an attribute that is a declared class or None: a key that is true or false; false: None.
+    relative : bool
+        The text is a path, relative to the file's folder.
     makers : mapping
-        For an inner table of several kinds: what makes each; the key `kind` says which, or `select`.
+        What makes the attribute of an inner table, by kind; the table's key `kind` says which, or `select`, and neither
+        is needed for a single one.
     parse : callable
         Takes the table, the key and its value, and gives the attribute; raises `table.invalid`.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
-    return Key(names, allowed, help, table, choices, prefix, switch, makers, select, parse)
+    return Key(names, unit, allowed, help, table, choices, prefix, switch, relative, makers, select, parse)
 
 
 def value(
@@ -165,11 +174,12 @@ def value(
     below: float = math.inf,
     infinite: bool = False,
     choices: tuple[str, ...] | None = None,
+    unit: str = "",
     help: str = "",  # noqa: A002
 ) -> Key:
     """Declare range and help of an attribute that no file sets."""
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
-    return Key((), allowed, help, choices=choices, in_file=False)
+    return Key((), unit, allowed, help, choices=choices, in_file=False)
 
 
 class Form(StrEnum):
@@ -211,7 +221,7 @@ class Item:
     @property
     def unit(self) -> str:
         """The attribute's unit."""
-        return unit_of(self.names[0]).si
+        return self.key.unit or unit_of(self.names[0]).si
 
     @property
     def required(self) -> bool:
@@ -250,8 +260,13 @@ def settings(name: str) -> Callable[[_Class], _Class]:
     return decorate
 
 
-def check(described: Any) -> None:
+def check(described: Any, but: Collection[str] = ()) -> None:
     """Refuse a value out of its declared range; for `__post_init__`.
+
+    Parameters
+    ----------
+    but : collection of str
+        Attributes for which the range holds in files only.
 
     Raises
     ------
@@ -260,9 +275,9 @@ def check(described: Any) -> None:
     """
     for item in items_of(type(described)):
         given = getattr(described, item.name)
-        if (given is None and item.optional) or _fits(item, given):
+        if (given is None and item.optional) or item.name in but or _fits(item, given):
             continue
-        shown, words = item.name, allowed(item)
+        shown, words = item.name, allowed(item) + did_you_mean(str(given), item.key.choices or ())
         if item.form is Form.NUMBERS and isinstance(given, tuple) and given:
             index = next(i for i, each in enumerate(given) if not _number_fits(item, each))
             shown, given, words = f"{item.name}[{index}]", given[index], str(item.key.range)

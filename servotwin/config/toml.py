@@ -129,7 +129,8 @@ def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
     if form is Form.BOOLEAN:
         return table.boolean(name)
     if form is Form.TEXT:
-        return table.text(name, choices=item.key.choices)
+        text = table.text(name, choices=item.key.choices)
+        return str(folder / text) if item.key.relative else text
     if form is Form.PATH:
         return folder / table.text(name)
     if form is Form.INTEGER and unit.exact:
@@ -152,6 +153,8 @@ def _of_kind(table: Table, item: Item, folder: Path) -> Any:
     makers = item.key.makers or {}
     if item.key.select is not None:
         return _whole(table, item.key.select(table), folder)
+    if len(makers) == 1:
+        return _whole(table, next(iter(makers.values())), folder)
     return _whole(table, makers[table.text("kind", choices=tuple(makers))], folder)
 
 

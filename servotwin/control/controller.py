@@ -2,15 +2,36 @@
 
 from dataclasses import dataclass, fields, replace
 from math import expm1, inf, isfinite, pi, sqrt
-from typing import Annotated, Any
+from typing import Annotated, TypedDict, Unpack
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.control.law import LawParameters
 from servotwin.errors import InvalidInput
+from servotwin.runtime.notebook import html_table
+
+_GAINS = ("Kp", "Ki", "Kd", "Tf")
+
+
+class ControllerChanges(TypedDict, total=False):
+    """The keywords of `Controller.replace`: the fields of `Controller`, each of them optional."""
+
+    Kp: float
+    Ki: float
+    Kd: float
+    Tf: float
+    enter: float
+    leave: float
+    loop_filter_hz: float | None
+    voltage_limit: float | None
+    rate_limit: float | None
+    sample_rate: float | None
+    tracking_time: float | None
+    feedforward: float
+    release_time: float
 
 
 @settings("controller")
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Controller:
     """Filtered PID (Eq 14) with a dead zone on its error (Eq 20), limits and an optional loop filter.
 
@@ -82,12 +103,32 @@ class Controller:
         if self.leave < self.enter:
             raise InvalidInput(f"controller leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
 
-    def replace(self, **changes: Any) -> "Controller":
-        """A copy with some values changed, validated again."""
-        unknown = set(changes) - {field.name for field in fields(self)}
-        if unknown:
-            allowed = ", ".join(field.name for field in fields(self))
-            raise InvalidInput(f"controller has no value named {sorted(unknown)[0]!r}: allowed are {allowed}")
+    def __repr__(self) -> str:
+        """Gains, and whatever is not its default."""
+        shown = [f for f in fields(self) if f.name in _GAINS or getattr(self, f.name) != f.default]
+        return f"Controller({', '.join(f'{f.name}={getattr(self, f.name)!r}' for f in shown)})"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        given = [item for item in items_of(type(self)) if getattr(self, item.name) is not None]
+        return html_table("Controller", {one.name: f"{getattr(self, one.name):g} {one.unit}" for one in given})
+
+    def replace(self, **changes: Unpack[ControllerChanges]) -> "Controller":
+        """A copy with some values changed, validated again.
+
+        Parameters
+        ----------
+        **changes
+            Any fields of the controller, by name: ``controller.replace(Ki=500.0, sample_rate=5000.0)``.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown, or a value is out of its range.
+        """
+        allowed = [field.name for field in fields(self)]
+        if unknown := sorted(set(changes) - set(allowed)):
+            raise InvalidInput(f"controller has no value named {unknown[0]!r}: allowed are {', '.join(allowed)}")
         return replace(self, **changes)
 
     @property

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import Disturbance
@@ -15,7 +19,12 @@ from servotwin.link.simulated import Fate
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, Window, decode
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
+from servotwin.runtime.notebook import html_table
 from servotwin.simulation import Run
+from servotwin.simulation.views import arrow_table, pandas_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", "tolerance")
 
@@ -50,7 +59,7 @@ class Transmission:
         return decode(self.data)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Loop:
     """What a co-simulation returns.
 
@@ -119,6 +128,78 @@ class Loop:
         """How long after `trend.time` the gap reaches the scenario's `gap_limit`; None without limit or trend."""
         limit = self.scenario.twin.gap_limit
         return None if limit is None or self.trend is None else self.trend.time_until(limit)
+
+    def __repr__(self) -> str:
+        """Scenario, windows, updates and the newest trend in one line."""
+        counts = f"{len(self.windows)} windows, {len(self.updates)} updates, {len(self.applied)} applied"
+        return f"<Loop {self.scenario.name!r}: {self.scenario.duration:g} s, {counts}, {self.trend!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        rows = {
+            "scenario": repr(self.scenario),
+            "windows": str(len(self.windows)),
+            "estimates that are ok": str(sum(estimate.ok for estimate in self.estimates)),
+            "updates sent, applied": f"{len(self.updates)}, {len(self.applied)}",
+            "returns to the fallback set": str(len(self.fallbacks)),
+            "trend": repr(self.trend),
+        }
+        return html_table(f"Co-simulation of {self.scenario.name}", rows)
+
+    @property
+    def columns(self) -> dict[str, list[Any]]:
+        """One row per window: what was estimated from it. Signals are in ``loop.run.columns``."""
+        found = self.estimates
+        return {
+            "sequence": [window.sequence for window in self.windows],
+            "start_s": [window.start for window in self.windows],
+            "time_s": [estimate.time for estimate in found],
+            "status": [estimate.status.value for estimate in found],
+            "gap_rad": [estimate.gap for estimate in found],
+            "gap_low_rad": [estimate.interval[0] for estimate in found],
+            "gap_high_rad": [estimate.interval[1] for estimate in found],
+            "trend_gap_rad": [math.nan if trend is None else trend.gap for trend in self.trends],
+            "trend_rate_rad_per_s": [math.nan if trend is None else trend.rate for trend in self.trends],
+        }
+
+    def to_pandas(self) -> Any:
+        """``pandas.DataFrame`` of `columns`, one row per window; ``loop.run.to_pandas()`` holds the signals.
+
+        Raises
+        ------
+        InvalidInput
+            pandas is not installed.
+        """
+        return pandas_table(self.columns)
+
+    def to_arrow(self) -> Any:
+        """``pyarrow.Table`` of `columns`, one row per window; ``loop.run.to_arrow()`` holds the signals.
+
+        Raises
+        ------
+        InvalidInput
+            pyarrow is not installed.
+        """
+        return arrow_table(self.columns)
+
+    def plot(self) -> Figure:
+        """Figure of the run with the estimates of the gap, bars of 95 %.
+
+        Raises
+        ------
+        InvalidInput
+            matplotlib is not installed.
+        """
+        figure = self.run.plot()
+        usable = [estimate for estimate in self.estimates if estimate.ok]
+        gaps = np.degrees([estimate.gap for estimate in usable])
+        ends = np.degrees([estimate.interval for estimate in usable]).reshape(-1, 2)
+        bars = np.maximum(np.stack([gaps - ends[:, 0], ends[:, 1] - gaps]), 0.0)
+        axes = figure.axes[2]
+        axes.errorbar([e.time for e in usable], gaps, bars, fmt=".", label="estimate, 95 %", linewidth=1.0)
+        axes.legend(loc="upper left", fontsize="small")
+        figure.axes[0].set_title(repr(self).partition(", <")[0].strip("<"))
+        return figure
 
     def digest(self) -> str:
         """SHA-256 over every message (bytes, times, fate) and the trajectory: equal only for runs equal bit for bit."""

@@ -13,23 +13,24 @@ from pathlib import Path
 from typing import Any
 
 from servotwin.commissioning.guarding import Guarding, guarding, start_of
-from servotwin.commissioning.novelty import model_of
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.cosim import scenario_file
 from servotwin.cosim.scenario_file import Recording
 from servotwin.edge.limits import Limits
-from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN, Setting
+from servotwin.novelty.score import model_of
+from servotwin.novelty.settings import NoveltySettings
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SignalLike, as_nonnegative, as_pieces
+from servotwin.plant.signals import SignalLike, as_gap, as_pieces
+from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
@@ -39,7 +40,7 @@ MOST_SAMPLES = 1e8  # some 10 GB of signals
 PRESETS = ("fig15", "fig15-sampled", "fig16", "calm", "certified")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scenario:
     """One servo, its wear, its link and its twin.
 
@@ -111,8 +112,26 @@ class Scenario:
             raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
         self._check_rates()
         as_pieces(self.reference, self.duration)
-        as_nonnegative(self.gap, self.duration, "gap", "rad")
+        as_gap(self.gap, self.duration)
         self._check_window()
+
+    def __repr__(self) -> str:
+        """Name, length, servo and policy in one line."""
+        return f"<Scenario {self.name!r}: {self.duration:g} s, policy {self.twin.policy!r}, {self.servo!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        rows = {
+            "servo": repr(self.servo),
+            "controller": repr(self.law),
+            "duration": f"{self.duration:g} s",
+            "reference": repr(self.reference),
+            "gap": repr(self.gap),
+            "policy": self.twin.policy,
+            "estimator": self.twin.method,
+            "seed": str(self.seed),
+        }
+        return html_table(f"Scenario {self.name}", rows)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scenario:

@@ -14,17 +14,17 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import read_gains
 from servotwin.edge import settings_file as edgefile
 from servotwin.edge.limits import Limits
-from servotwin.edge.novelty import settings_file as noveltyfile
-from servotwin.edge.novelty.settings import NoveltyRules
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
+from servotwin.novelty import settings_file as noveltyfile
+from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.runtime.retry import Retry
-from servotwin.twin import settings_file as twinfile
+from servotwin.twin.settings import read_twin_settings
 
 MM = 1e-3
 DEG = math.pi / 180.0
@@ -92,7 +92,7 @@ def read(table: Table, folder: Path) -> dict[str, Any]:
         "reference": part(table, "reference", _reference),
         "gap": part(table, "gap", _gap),
         "recording": replace(part(table, "recording", _recording), probe=_probe(table), novelty=_novelty(table)),
-        "twin": part(table, "twin", lambda inner: twinfile.twin(inner, folder)),
+        "twin": part(table, "twin", lambda inner: read_twin_settings(inner, folder)),
         **part(table, "disturbances", _disturbances),
     }
     values["controller"] = part(table, "controller", lambda t: _controller(t, servo.controller))

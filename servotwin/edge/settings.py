@@ -116,7 +116,7 @@ class AgentSettings:
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
         if self.window_filter is not None:
-            self.window_filter.check_rate(self.sample_rate)
+            self.window_filter.check(self.sample_rate)
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.setting.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")

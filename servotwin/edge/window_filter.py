@@ -25,8 +25,8 @@ class WindowFilterSettings(Protocol):
     def longest_pause_s(self) -> float:
         """Time after a window at which one is cut though the reference rests, s; inf: never."""
 
-    def check_rate(self, sample_rate: float) -> None:
-        """Raise InvalidInput where the filter is not made for samples at this rate (Hz)."""
+    def check(self, sample_rate: float) -> None:
+        """Raise InvalidInput where the filter cannot run, or is not made for samples at this rate (Hz)."""
 
     def start(self, saved: bytes | None = None) -> WindowFilter:
         """Start the filter for a new boot, from the state that an earlier boot saved.

@@ -12,12 +12,12 @@ from servotwin.config.toml import read as read_settings
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_given, read_gains
 from servotwin.edge import settings_file as edgefile
-from servotwin.edge.novelty import settings_file as noveltyfile
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
 from servotwin.edge_process.config_writer import edge_toml
 from servotwin.messages import Gains, Setting
+from servotwin.novelty import settings_file as noveltyfile
 from servotwin.runtime.retry import Retry
 
 __all__ = ["edge_toml", "load", "read"]

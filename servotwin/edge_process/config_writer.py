@@ -8,13 +8,13 @@ from typing import Any
 
 from servotwin.config.toml import dumps, values_of
 from servotwin.control.gains import written_gains
-from servotwin.edge.novelty import settings_file as noveltyfile
-from servotwin.edge.novelty.settings import NoveltySettings
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge_process.config import MB, EdgeConfig
 from servotwin.messages import Band, Gains
+from servotwin.novelty import settings_file as noveltyfile
+from servotwin.novelty.settings import NoveltySettings
 
 Values = dict[str, Any]
 _LENGTHS = {"minimum": "minimum_m", "maximum": "maximum_m", "max_step": "max_step_m", "max_rate": "max_rate_m_per_s"}

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+from servotwin.runtime.notebook import html_table
+
 Interval = tuple[float, float]
 NOTHING_KNOWN: Interval = (0.0, math.inf)
 NORMAL_95 = 1.959963984540054  # standard deviations on either side of the mean hold 95 % of a normal distribution
@@ -46,7 +48,7 @@ class CarriedOffset:
     slope: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GapEstimate:
     """The total gap as one window shows it.
 
@@ -98,6 +100,25 @@ class GapEstimate:
             object.__setattr__(self, name, float(getattr(self, name)))
         low, high = self.interval
         object.__setattr__(self, "interval", (float(low), float(high)))
+
+    def __repr__(self) -> str:
+        """Status, gap with its 95 % interval and time in one line."""
+        low, high = map(math.degrees, self.interval)
+        value = f"{math.degrees(self.gap):.4g} deg (95 %: {low:.4g} .. {high:.4g} deg)"
+        return f"<GapEstimate {self.status.value}: {value} at {self.time:.6g} s>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        low, high = map(math.degrees, self.interval)
+        rows = {
+            "status": self.status.value,
+            "total gap": f"{math.degrees(self.gap):.4g} deg",
+            "95 % interval": f"{low:.4g} .. {high:.4g} deg",
+            "time": f"{self.time:.6g} s",
+            "method": self.method or "-",
+            "model": self.model_version or "-",
+        }
+        return html_table("Gap estimate", rows | ({"reasons": "; ".join(self.reasons)} if self.reasons else {}))
 
     @property
     def ok(self) -> bool:

@@ -28,6 +28,7 @@ from servotwin.estimation.trend_model import (
 )
 from servotwin.estimation.trend_settings import TrendSettings
 from servotwin.plant.signals import Array
+from servotwin.runtime.notebook import html_table
 
 __all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
 
@@ -46,7 +47,7 @@ class Prior:
     offset_std: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trend:
     """Gap, wear rate and encoder offset at a time, with their covariance.
 
@@ -77,6 +78,24 @@ class Trend:
     refused: int = 0
     reasons: tuple[str, ...] = ()
     rival: Trend | None = None
+
+    def __repr__(self) -> str:
+        """Gap and wear rate with their 95 % intervals in one line."""
+        low, high = map(math.degrees, self.gap_interval)
+        gap = f"{math.degrees(self.gap):.4g} deg (95 %: {low:.4g} .. {high:.4g} deg)"
+        return f"<Trend {gap} at {self.time:.6g} s, {math.degrees(self.rate):.3g} deg/s, {self.updates} windows>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        low, high = map(math.degrees, self.gap_interval)
+        slow, fast = map(math.degrees, self.rate_interval)
+        rows = {
+            "time": f"{self.time:.6g} s",
+            "total gap": f"{math.degrees(self.gap):.4g} deg (95 %: {low:.4g} .. {high:.4g} deg)",
+            "wear rate": f"{math.degrees(self.rate):.3g} deg/s (95 %: {slow:.3g} .. {fast:.3g} deg/s)",
+            "windows that counted": str(self.updates),
+        }
+        return html_table("Trend", rows | ({"last window": "; ".join(self.reasons)} if self.reasons else {}))
 
     @classmethod
     def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:

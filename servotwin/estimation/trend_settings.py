@@ -1,37 +1,20 @@
-"""What the filter across windows assumes of wear."""
+"""Settings of the filter across windows: what it assumes of wear."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated, Any
 
+from servotwin.config.keys import check, key, settings, value
+from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
-from servotwin.estimation.settings_check import check_number
 
 
+@settings("trend")
 @dataclass(frozen=True)
 class TrendSettings:
     """What is assumed of wear before anything was measured. `for_wear` derives all of it from two plain numbers.
-
-    Parameters
-    ----------
-    gap_std_rad, rate_std_rad_per_s, offset_std_rad : float
-        Spread, around zero, of the total gap, its rate and the encoder's offset before the first window.
-    gap_walk_rad_per_sqrt_s : float
-        Random walk of the gap itself, on top of its rate.
-    rate_walk_rad_per_s_per_sqrt_s : float
-        Random walk of the rate: how fast wear may change its pace.
-    offset_walk_rad_per_sqrt_s : float
-    shared_error_rad : float
-        Error that all windows have in common (the model's), which no number of windows averages away; it widens the
-        stated gap, not its rate.
-    outlier_std : float
-        An estimate farther from the prediction than so many standard deviations is refused.
-    restart_after : int
-        So many outliers in a row that agree with each other mean that the machine has changed (a crash, a new or
-        re-adjusted screw): the gap then starts afresh from them.
-    agreement_std : float
-        Outliers agree when each is within so many standard deviations of what the ones before it predict.
 
     Raises
     ------
@@ -39,22 +22,55 @@ class TrendSettings:
         A value is negative or not finite, or `restart_after` is not a whole number of at least 1.
     """
 
-    gap_std_rad: float = math.radians(60.0)
-    rate_std_rad_per_s: float = math.radians(0.2)
-    offset_std_rad: float = math.radians(60.0)
-    gap_walk_rad_per_sqrt_s: float = 0.0
-    rate_walk_rad_per_s_per_sqrt_s: float = math.radians(0.015)
-    offset_walk_rad_per_sqrt_s: float = 0.0
-    shared_error_rad: float = math.radians(0.02)
-    outlier_std: float = 6.0
-    restart_after: int = 2
-    agreement_std: float = 3.0
+    gap_std_rad: Annotated[
+        float, value(minimum=0.0, help="Spread of the total gap, around zero, before the first window.")
+    ] = math.radians(60.0)
+    rate_std_rad_per_s: Annotated[
+        float, value(minimum=0.0, help="Spread of its rate, around zero, before the first window.")
+    ] = math.radians(0.2)
+    offset_std_rad: Annotated[
+        float, value(minimum=0.0, help="Spread of the encoder's offset, around zero, before the first window.")
+    ] = math.radians(60.0)
+    gap_walk_rad_per_sqrt_s: Annotated[
+        float, value(minimum=0.0, unit="rad/sqrt(s)", help="Random walk of the gap itself, on top of its rate.")
+    ] = 0.0
+    rate_walk_rad_per_s_per_sqrt_s: Annotated[
+        float,
+        value(minimum=0.0, unit="rad/s/sqrt(s)", help="Random walk of the rate: how fast wear may change its pace."),
+    ] = math.radians(0.015)
+    offset_walk_rad_per_sqrt_s: Annotated[
+        float, value(minimum=0.0, unit="rad/sqrt(s)", help="Random walk of the encoder's offset.")
+    ] = 0.0
+    shared_error_rad: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="Error that all windows have in common (the model's), which no number of windows averages away; it "
+            "widens the stated gap, not its rate.",
+        ),
+    ] = math.radians(0.02)
+    outlier_std: Annotated[
+        float,
+        value(minimum=0.0, help="An estimate more standard deviations off the prediction is refused."),
+    ] = 6.0
+    restart_after: Annotated[
+        int,
+        value(
+            minimum=1,
+            help="So many outliers in a row that agree mean that the machine has changed (a crash, a new or "
+            "re-adjusted screw): the gap then starts afresh from them.",
+        ),
+    ] = 2
+    agreement_std: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="Outliers agree when each is within so many standard deviations of what the ones before it predict.",
+        ),
+    ] = 3.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            check_number(f"trend {item.name}", getattr(self, item.name))
-        if not isinstance(self.restart_after, int) or self.restart_after < 1:
-            raise InvalidInput(f"trend restart_after = {self.restart_after!r}: must be a whole number of at least 1")
+        check(self)
 
     @classmethod
     def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
@@ -67,3 +83,16 @@ class TrendSettings:
         rate = gap / over
         known = {"rate_std_rad_per_s": rate, "rate_walk_rad_per_s_per_sqrt_s": rate / math.sqrt(over)}
         return cls(**{**known, **changes})  # type: ignore[arg-type]
+
+
+def wear(
+    gap: Annotated[float, key("wear_deg", above=0.0, help="Growth of the gap that is expected within over_s.")],
+    over: Annotated[float, key("over_s", above=0.0, help="Time in which the gap grows by wear_deg.")],
+) -> TrendSettings:
+    """Trend settings from a table."""
+    return TrendSettings.for_wear(gap, over)
+
+
+def trend_maker(table: Table) -> Any:
+    """What makes trend settings of a table: the defaults of an empty one, otherwise `wear`."""
+    return wear if table.values else TrendSettings

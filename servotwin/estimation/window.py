@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
+from servotwin.runtime.notebook import html_table
+from servotwin.simulation.views import Panel, stacked_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MINIMUM_SAMPLES = 16
 CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
@@ -27,7 +32,7 @@ class RunLike(Protocol):
     def measured(self, name: str) -> Array: ...
 
 
-@dataclass(frozen=True, init=False, eq=False)
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class Window:
     """Uniformly sampled measurements of one servo, each channel `(n,)` float64, read-only.
 
@@ -83,6 +88,31 @@ class Window:
         rate, start = _timing(where, size, sample_rate, time, start)
         for name, value in {**channels, "sample_rate": rate, "start": start, "source": source}.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        """Source, span, rate and channels in one line."""
+        span = f"{self.start:.6g} .. {self.start + self.duration:.6g} s at {self.sample_rate:g} Hz"
+        return f"<Window {self.where}{span}: {', '.join(self.channels)}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        ranges = {
+            name: f"{values.min():.6g} .. {values.max():.6g} {CHANNELS[name]}" for name, values in self.channels.items()
+        }
+        end = self.start + self.duration
+        rows = {"time": f"{self.start:.6g} .. {end:.6g} s", "sample rate": f"{self.sample_rate:g} Hz", **ranges}
+        return html_table(f"Window {self.source or ''}".strip(), rows)
+
+    def plot(self) -> Figure:
+        """Figure of every channel over time.
+
+        Raises
+        ------
+        InvalidInput
+            matplotlib is not installed.
+        """
+        panels = [Panel(f"{name}, {CHANNELS[name]}", {name: values}) for name, values in self.channels.items()]
+        return stacked_figure(repr(self).strip("<>"), self.time, panels)
 
     @classmethod
     def from_run(cls, run: RunLike, start: float, duration: float) -> Window:

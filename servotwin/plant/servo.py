@@ -8,24 +8,25 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias, Unpack
 
 import numpy as np
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps, read, values_of
-from servotwin.control.controller import Controller
+from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import Array, check_gap
 from servotwin.plant.structure import Chain, Structure, chain
+from servotwin.runtime.notebook import html_table
 
 PerMass: TypeAlias = float | tuple[float, ...]
 _PLANT = (
@@ -46,8 +47,27 @@ class Control(NamedTuple):
     closed_loop: Any
 
 
+class ServoChanges(ControllerChanges, total=False):
+    """The keywords of `Servo.replace`: the fields of `Servo` and of its `Controller`, each of them optional."""
+
+    m: PerMass
+    k: PerMass
+    c: PerMass
+    J: float
+    p: float
+    L: float
+    R: float
+    k_T: float
+    k_B: float
+    controller: Controller
+    n: int
+    k_d: float
+    encoder_resolution: float
+    position_resolution: float
+
+
 @settings("servo")
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Servo:
     """A position servo: DC motor, lead screw, chain of n masses, sensors and its default controller.
 
@@ -114,6 +134,17 @@ class Servo:
             if name != "n":
                 object.__setattr__(self, name, tuple(map(float, value)) if isinstance(value, tuple) else float(value))
 
+    def __repr__(self) -> str:
+        """Preset or model version, masses, screw and controller in one line."""
+        name = next((repr(name) for name in PRESETS if _preset_version(name) == self.version), "other")
+        screw = "rigid" if self.rigid else f"k_d={self.k_d:g} N/m"
+        return f"<Servo {name}, model {self.version}: {self.n} masses, {screw} screw, {self.controller!r}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        rows = {one.name: f"{getattr(self, one.name)} {one.unit}" for one in items_of(type(self))}
+        return html_table(f"Servo, model {self.version}", rows)
+
     @classmethod
     def preset(cls, name: str = "paper") -> Servo:
         """One of the paper's servos: "paper", "table1" or "paper-gain2" (erratum E1 says how they differ)."""
@@ -158,14 +189,26 @@ class Servo:
         """The servo as TOML that `load` reads back to an equal servo."""
         return dumps(values_of(self, only=(*_PLANT, "controller")))
 
-    def replace(self, **changes: Any) -> Servo:
-        """A copy with some values changed; the controller's own names (Kp, Ki, Kd, Tf, voltage_limit, ...) go to it."""
+    def replace(self, **changes: Unpack[ServoChanges]) -> Servo:
+        """A copy with some values changed, validated again.
+
+        Parameters
+        ----------
+        **changes
+            Any fields of the servo or of its controller, by name: ``servo.replace(k=9e3, Ki=500.0)``.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown, or a value is out of its range.
+        """
         _refuse_unknown(changes)
-        for_controller = {key: changes.pop(key) for key in _CONTROLLER_FIELDS if key in changes}
-        changed = dataclasses.replace(self, **changes)
+        for_plant = {key: value for key, value in changes.items() if key not in _CONTROLLER_FIELDS}
+        for_controller = {key: value for key, value in changes.items() if key in _CONTROLLER_FIELDS}
+        changed = dataclasses.replace(self, **for_plant)  # type: ignore[arg-type]
         if not for_controller:
             return changed
-        return dataclasses.replace(changed, controller=changed.controller.replace(**for_controller))
+        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **for_controller))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
@@ -173,11 +216,12 @@ class Servo:
         Raises
         ------
         InvalidInput
-            The gap or k_dz is negative or not finite.
+            The gap or k_dz is negative or not finite, or the gap is above one turn.
         """
         for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
             if not (math.isfinite(value) and value >= 0.0):
                 raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
+        check_gap(gap)
         return k_dz * self.p * gap
 
     @property
@@ -272,6 +316,11 @@ class Servo:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
         systems = (self.G1(), self.G2(), loop.pidf(self.controller), self.loop(), self.closed_loop())
         return Control(*(system.to_control() for system in systems))
+
+
+@cache
+def _preset_version(name: str) -> str:
+    return Servo.preset(name).version
 
 
 def _spread(value: PerMass, n: int) -> Array:

@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from servotwin.errors import InvalidInput
 
 Array: TypeAlias = NDArray[np.float64]
+LARGEST_GAP = 2.0 * math.pi
+"""Largest total gap that is accepted, rad: a number above it is nearly always an angle in degrees."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _SMALLEST = float(np.finfo(float).tiny)
 _MOST_PIECES = 1e7
@@ -297,6 +299,34 @@ def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit:
     if value < -_ROUNDING * float(np.max(np.abs(pieces.value(np.append(pieces.times, duration))))):
         raise InvalidInput(f"{name} = {value:.6g} {unit} at t = {time:.6g} s is negative; it must be 0 {unit} or more")
     return pieces
+
+
+def as_gap(signal: SignalLike, duration: float) -> PiecewiseCubic:
+    """As `as_nonnegative`, refusing a total gap (rad) above one turn.
+
+    Raises
+    ------
+    InvalidInput
+        Also for a gap above 2 pi rad, which is nearly always one in degrees.
+    """
+    pieces = as_nonnegative(signal, duration)
+    check_gap(-pieces.scaled(-1.0).minimum(duration)[1])
+    return pieces
+
+
+def check_gap(gap: float, name: str = "gap") -> None:
+    """Refuse a total gap (rad) above one turn.
+
+    Raises
+    ------
+    InvalidInput
+        With the angle in degrees, and what was probably meant.
+    """
+    if gap > LARGEST_GAP:
+        raise InvalidInput(
+            f"{name} = {gap:.6g} rad ({math.degrees(gap):.0f} deg): the total gap is an angle in rad of at most one "
+            f"turn (2 pi); did you mean math.radians({gap:.6g})?"
+        )
 
 
 def reference_changes(signal: SignalLike, duration: float) -> Array:

@@ -95,4 +95,4 @@ class HysteresisPolicy:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
         law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
-        return Redesign(Setting(self.servo.tolerance_for(estimate.gap), gains_of(law)), estimate.gap, "")
+        return Redesign(Setting(self.servo.p * estimate.gap, gains_of(law)), estimate.gap, "")

@@ -10,7 +10,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Outcome, Probe
@@ -19,27 +21,10 @@ _ROUNDING = 1e-6  # s: windows are whole numbers of samples
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 
 
+@settings("excitation")
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """What may be asked for, and when.
-
-    Parameters
-    ----------
-    after : int
-        Windows in a row without an estimate, for want of information, until something is asked for.
-    window, pre_trigger : float
-        s, of the windows asked for.
-    probe : float
-        m, the largest probing move; 0: none is asked for.
-    interval : float
-        s from one probing move to the next.
-    hold : float
-        s that a probing move stays away, and is watched after it came back.
-    strokes : int
-        How often it goes there and back.
-    margin : float
-        rad that it turns the screw beyond the gap. The estimator needs 0.5 deg pushed in each direction; the rest is
-        for the time that the loop takes to cross the gap.
+    """What may be asked of the edge when windows tell too little of the gap, and when.
 
     Raises
     ------
@@ -47,22 +32,36 @@ class ExcitationSettings:
         A value is out of its range.
     """
 
-    after: int = 2
-    window: float = 2.0
-    pre_trigger: float = 0.3
-    probe: float = 0.0
-    interval: float = 60.0
-    hold: float = 0.85
-    strokes: int = 1
-    margin: float = math.radians(5.0)
+    after: Annotated[
+        int,
+        key(minimum=1, help="Windows in a row without an estimate, for want of information, until the twin asks."),
+    ] = 2
+    window: Annotated[float, key("window_s", above=0.0, help="Length of the windows asked for.")] = 2.0
+    pre_trigger: Annotated[
+        float,
+        key("pre_trigger_s", minimum=0.0, help="Part of them before the reference changes, below window_s."),
+    ] = 0.3
+    probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is asked for.")] = 0.0
+    interval: Annotated[float, key("interval_s", above=0.0, help="Time from one probing move to the next.")] = 60.0
+    hold: Annotated[
+        float, key("hold_s", above=0.0, help="Time that a probing move stays away, and is watched after it came back.")
+    ] = 0.85
+    strokes: Annotated[int, key(minimum=1, help="Number of times that it goes there and back.")] = 1
+    margin: Annotated[
+        float,
+        key(
+            "margin_deg",
+            above=0.0,
+            help="Angle by which it turns the screw beyond the gap. The estimator needs 0.5 deg in each direction; the "
+            "rest is for the time that the loop takes to cross the gap.",
+        ),
+    ] = math.radians(5.0)
 
     def __post_init__(self) -> None:
-        for name in ("after", "strokes"):
-            _check(name, getattr(self, name), "", getattr(self, name) >= 1, "1 or more")
-        for name, unit in {"window": "s", "interval": "s", "hold": "s", "margin": "rad"}.items():
-            _check(name, getattr(self, name), unit, getattr(self, name) > 0.0, "finite and greater than 0")
-        _check("pre_trigger", self.pre_trigger, "s", 0.0 <= self.pre_trigger < self.window, "0 or more, below window")
-        _check("probe", self.probe, "m", self.probe >= 0.0, "finite and 0 or more")
+        check(self)
+        if not self.pre_trigger < self.window:
+            allowed = f"must be below window = {self.window!r} s"
+            raise InvalidInput(f"excitation pre_trigger = {self.pre_trigger!r} s: {allowed}")
 
 
 class Stage(StrEnum):
@@ -224,8 +223,3 @@ def long_enough(length: float, pre_trigger: float, settings: ExcitationSettings)
 
 def _mm(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm"
-
-
-def _check(name: str, value: float, unit: str, accepted: bool, allowed: str) -> None:
-    if isinstance(value, bool) or not (math.isfinite(value) and accepted):
-        raise InvalidInput(f"excitation {name} = {value!r}{' ' if unit else ''}{unit}: must be {allowed}")

@@ -93,4 +93,4 @@ class PaperPolicy:
             return Redesign(None, math.nan, evidence.unusable)
         kept = self.smoothing if evidence.tuned_for is not None else 0.0
         gap = (1.0 - kept) * evidence.estimate.gap + kept * (evidence.tuned_for or 0.0)
-        return Redesign(Setting(self.servo.tolerance_for(gap, self.k_dz)), gap, "")
+        return Redesign(Setting(self.k_dz * self.servo.p * gap), gap, "")

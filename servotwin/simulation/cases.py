@@ -15,6 +15,7 @@ from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.ensemble import Members
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, without_feedforward
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import check_gap
 from servotwin.simulation.continuous import controller_constants
 
 NOT_NEGATIVE = ("gap", "tolerance", "friction")
@@ -137,6 +138,7 @@ def _check(constants: dict[str, Array]) -> None:
         allowed = "finite and 0 or more" if name in NOT_NEGATIVE else "finite"
         if not np.isfinite(values).all() or (name in NOT_NEGATIVE and values.min(initial=0.0) < 0.0):
             raise InvalidInput(f"{name}: every value of an ensemble must be {allowed}")
+    check_gap(float(constants["gap"].max(initial=0.0)))
 
 
 def _sort_of(servo: Servo, law: Controller) -> tuple[object, ...]:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.runtime.notebook import html_table
+from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EVENT_TYPE = np.dtype([("time", float), ("kind", "U10"), ("side", np.int8), ("state_triggered", bool)])
 
@@ -50,7 +56,7 @@ def quantised(values: Array, resolution: float) -> Array:
     return values if resolution == 0.0 else np.round(values / resolution) * resolution
 
 
-@dataclass
+@dataclass(repr=False)
 class Run:
     """A simulated run, N samples from time 0; arrays are ``(N,)`` unless said otherwise, right-continuous at jumps.
 
@@ -149,6 +155,83 @@ class Run:
         if name == "theta_m":
             return quantised(self.theta_m, self.servo.encoder_resolution)
         return {"position": self.measured_position, "voltage": self.voltage, "reference": self.reference}[name]
+
+    def __repr__(self) -> str:
+        """Length, rate, model and kind of loop in one line."""
+        duration = (self.samples - 1) / self.sample_rate
+        return f"<Run {duration:g} s, {self.samples} samples at {self.sample_rate:g} Hz, model {self.servo.version}>"
+
+    def _repr_html_(self) -> str:
+        """Table for notebooks."""
+        return html_table(
+            "Run",
+            {
+                "duration": f"{(self.samples - 1) / self.sample_rate:g} s",
+                "samples": f"{self.samples} at {self.sample_rate:g} Hz",
+                "servo": repr(self.servo),
+                "gap": f"{np.degrees(self.gap[0]):.3f} to {np.degrees(self.gap[-1]):.3f} deg",
+                "largest error": f"{1e3 * np.abs(self.reference - self.position).max():.4f} mm",
+                "events": str(len(self.events)),
+            },
+        )
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """Signals by name with their unit, as log files name them; each ``(N,)``."""
+        return {
+            "time_s": self.time,
+            "position_m": self.position,
+            "measured_position_m": self.measured_position,
+            "reference_m": self.reference,
+            "theta_m_rad": self.theta_m,
+            "theta_d_rad": self.theta_d,
+            "voltage_v": self.voltage,
+            "gap_rad": self.gap,
+            "tolerance_m": self.tolerance,
+            **{f"q{i + 1}_m": np.ascontiguousarray(self.q[:, i]) for i in range(self.servo.n)},
+        }
+
+    def plot(self) -> Figure:
+        """Figure of position, tracking error, gap and voltage over time.
+
+        Raises
+        ------
+        InvalidInput
+            matplotlib is not installed.
+        """
+        errors = {"error": 1e3 * (self.reference - self.position)}
+        if self.tolerance.any():
+            errors |= {"dead zone": 1e3 * self.tolerance, "_": -1e3 * self.tolerance}
+        panels = (
+            Panel("position, mm", {"reference": 1e3 * self.reference, "position": 1e3 * self.position}),
+            Panel(
+                "error, mm",
+                errors,
+            ),
+            Panel("total gap, deg", {"gap": np.degrees(self.gap)}),
+            Panel("voltage, V", {"voltage": self.voltage}),
+        )
+        return stacked_figure(repr(self).strip("<>"), self.time, panels)
+
+    def to_pandas(self) -> Any:
+        """``pandas.DataFrame`` of `columns`, one row per sample.
+
+        Raises
+        ------
+        InvalidInput
+            pandas is not installed.
+        """
+        return pandas_table(self.columns)
+
+    def to_arrow(self) -> Any:
+        """``pyarrow.Table`` of `columns`, one row per sample.
+
+        Raises
+        ------
+        InvalidInput
+            pyarrow is not installed.
+        """
+        return arrow_table(self.columns)
 
     def _column(self, name: str) -> Array:
         return self._get(name, lambda: self.channel(name, 0, self.samples))

@@ -3,7 +3,7 @@ the exact plant)."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_nonnegative, as_pieces
+from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.run import Inputs, Run, quantised
 from servotwin.simulation.sampled import SampledEngine
@@ -94,7 +94,7 @@ class Simulation:
         self.samples = round(duration * sample_rate) + 1
         self.inputs = Inputs(
             as_pieces(reference, duration),
-            as_nonnegative(gap, duration, "gap", "rad"),
+            as_gap(gap, duration),
             None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
             sample_rate,
             float(input_bias),
@@ -220,15 +220,73 @@ class Simulation:
         return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
 
 
-def simulate(servo: Servo, duration: float, **options: Any) -> Run:
-    """Run a servo from rest; the options are those of `Simulation`.
+def simulate(
+    servo: Servo,
+    duration: float,
+    *,
+    controller: Controller | None = None,
+    reference: SignalLike = 0.0,
+    gap: SignalLike = 0.0,
+    tolerance: SignalLike | None = None,
+    theta_d0: float = 0.0,
+    sample_rate: float = SAMPLE_RATE,
+    noise: Noise | None = None,
+    seed: int | np.random.Generator = 0,
+    input_bias: float = 0.0,
+    friction: float = 0.0,
+) -> Run:
+    """Simulate a servo from rest.
+
+    Parameters
+    ----------
+    servo : Servo
+    duration : float
+        s.
+    controller : Controller, optional
+        The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
+    reference : number or signal
+        Wanted position, m: a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic.
+    gap : number or signal
+        Total gap, rad, 0 to 2 pi.
+    tolerance : number, signal or None
+        Half-width of the dead zone, m; None: no dead zone.
+    theta_d0 : float
+        Angle of the screw at the start, rad, clamped into the gap around the motor, which starts at 0.
+    sample_rate : float
+        Hz, of the samples that are returned.
+    noise : Noise, optional
+        Noise on the measured position.
+    seed : int or numpy.random.Generator
+        Seed of the noise.
+    input_bias : float
+        Voltage added behind the controller and its limits, V.
+    friction : float
+        Coulomb friction on the motor's shaft, N m; needs a rigid screw.
 
     Returns
     -------
     Run
         ``round(duration * sample_rate) + 1`` samples, both ends included.
+
+    Raises
+    ------
+    InvalidInput
+        A gap above one turn, a negative gap, tolerance or friction, or rates that do not divide one another.
     """
-    simulation = Simulation(servo, duration, **options)
+    simulation = Simulation(
+        servo,
+        duration,
+        controller=controller,
+        reference=reference,
+        gap=gap,
+        tolerance=tolerance,
+        theta_d0=theta_d0,
+        sample_rate=sample_rate,
+        noise=noise,
+        seed=seed,
+        input_bias=input_bias,
+        friction=friction,
+    )
     simulation.advance(simulation.samples - 1)
     return simulation.run()
 

@@ -34,10 +34,9 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
-from servotwin.twin import settings_file as settingsfile
 from servotwin.twin.estimating import Estimator, estimator_of
 from servotwin.twin.policies import certified, policy_of
-from servotwin.twin.settings import TwinSettings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 from servotwin.twin.store import Store
 from servotwin.twin.twin import Twin
 
@@ -180,7 +179,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo = _servo(table, folder)
     law = part(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
-    settings = part(table, "twin", partial(settingsfile.twin, folder=folder))
+    settings = part(table, "twin", partial(read_twin_settings, folder=folder))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)
     if checked:

@@ -18,7 +18,7 @@ from servotwin.estimation.whitened.quick import Quick, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.twin.triage_settings import TriageSettings
+from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")
 """Reasons of windows that come anyway; any other says that something is new, or was asked for."""

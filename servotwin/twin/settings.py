@@ -1,72 +1,67 @@
-"""What a twin can be told."""
+"""Settings of a twin and of its triage."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from servotwin.config.table import did_you_mean
+from servotwin.config.keys import check, key, settings
+from servotwin.config.table import Table
+from servotwin.config.toml import part, read
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
-from servotwin.estimation.gap import settings_of
-from servotwin.estimation.trend import TrendSettings
+from servotwin.estimation.gap import METHODS, settings_of
+from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.triage_settings import TriageSettings
 
 POLICIES = ("certified", "margin", "hysteresis", "paper")
 _OWNERS = {"table": "certified", "k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
 
 
+@settings("triage")
+@dataclass(frozen=True)
+class TriageSettings:
+    """When a glance at a window is enough.
+
+    Raises
+    ------
+    InvalidInput
+        A value is not finite and above 0, or `every` is not a whole number.
+    """
+
+    gap: Annotated[float, key("gap_deg", above=0.0, help="A gap that moved by less is no news.")] = math.radians(0.1)
+    deviations: Annotated[
+        float, key(above=0.0, help="Standard deviations by which gap and input bias have to be off to have moved.")
+    ] = 3.0
+    widest: Annotated[
+        float, key("widest_deg", above=0.0, help="A glance with a larger spread does not show the gap.")
+    ] = math.radians(0.1)
+    misfit: Annotated[float, key(above=0.0, help="A misfit so many times the usual one is unusual.")] = 3.0
+    least_misfit: Annotated[float, key("least_misfit_um", above=0.0, help="No misfit below is unusual.")] = 1e-7
+    bias: Annotated[float, key("bias_mv", above=0.0, help="An input bias that moved by less is no news.")] = 2e-3
+    every: Annotated[int, key(minimum=1, help="At least every so many windows one is estimated.")] = 50
+    longest: Annotated[float, key("longest_s", above=0.0, help="At least once in so long a window is estimated.")] = (
+        3600.0
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@settings("twin")
 @dataclass(frozen=True)
 class TwinSettings:
     """How a twin estimates, redesigns and insists.
 
     Parameters
     ----------
-    enabled : bool
-        False: nobody answers the edge's windows.
-    method : str
-        Estimator, as `identify.estimate_gap` names them.
     estimator : object, optional
-        Settings of that estimator; None: its defaults. Those of "whitened" must leave `combine` off, as the trend joins
+        Settings of the estimator; None: its defaults. Those of "whitened" must leave `combine` off, as the trend joins
         the windows already; where their `gap_rate` is 0, it is taken from the trend.
-    policy : str
-        What makes a setting of an estimate: "certified" sends what it has proved, "margin" and "hysteresis" set a dead
-        zone, "paper" is Eq 21.
-    uncertainty : Uncertainty
-        How wrong the model may be, and the stated range of gaps, steps and input bias: what "certified" proves settings
-        for. "margin" needs the steps.
-    demands : Demands
-        What a certified setting must show.
-    table : str, optional
-        Of "certified": file of settings that were proved beforehand (`servotwin certify`). They are looked up, and the
-        proof for the exact evidence follows; None: it is made before anything is sent.
-    k_dz, smoothing : float, optional
-        Of "paper": the dead-zone gain of Eq 21, 1 unless given; the share of the previous gap that is kept at each
-        update, 0 unless given, below 1.
-    k_noise : float, optional
-        Of "margin": tolerances per standard deviation of the measurement's noise.
-    excitation : ExcitationSettings, optional
-        What is asked of the edge when windows tell too little of the gap; None: nothing.
-    triage : TriageSettings, optional
-        When a glance at a window is enough; None: every window is estimated.
-    initial_gap : float
-        rad; what is believed before the first estimate (section 4.2: zero).
-    trend : TrendSettings
-        What is assumed of wear.
-    gap_limit : float, optional
-        rad; the gap that is one too many: the time until then is told.
-    processing : float
-        s from a window's arrival to the update's departure; the acknowledgement does not wait for it.
-    validity : float
-        s after a window's first sample for which an update that stands on it may still be applied.
-    retry : float
-        s without a receipt after which an update is sent again; longer than a round trip, or each goes out twice.
-    attempts : int
-        How often one update is sent before the twin gives it up.
 
     Raises
     ------
@@ -75,58 +70,114 @@ class TwinSettings:
         method's or another policy's.
     """
 
-    enabled: bool = True
-    method: str = whitened.METHOD
+    enabled: Annotated[bool, key(help="Answer the edge's windows.")] = True
+    method: Annotated[
+        str, key(choices=tuple(METHODS), help="Estimator; its settings stand in the table [estimator].")
+    ] = whitened.METHOD
     estimator: Any = None
-    policy: str = POLICIES[0]
-    uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
-    demands: Demands = field(default_factory=Demands)
-    table: str | None = None
-    k_dz: float | None = None
-    smoothing: float | None = None
-    k_noise: float | None = None
-    excitation: ExcitationSettings | None = None
-    triage: TriageSettings | None = None
-    initial_gap: float = 0.0
-    trend: TrendSettings = field(default_factory=TrendSettings)
-    gap_limit: float | None = None
-    processing: float = 0.0
-    validity: float = 60.0
-    retry: float = 5.0
-    attempts: int = 4
+    policy: Annotated[
+        str,
+        key(
+            choices=POLICIES,
+            help="What makes a setting of an estimate: certified sends what it has verified, margin and hysteresis set "
+            "a dead zone, paper is Eq 21.",
+        ),
+    ] = POLICIES[0]
+    uncertainty: Annotated[
+        Uncertainty,
+        key(
+            help="How wrong the model may be, and the stated range of gaps, steps and input bias for which settings "
+            "are verified; the policy margin needs the steps."
+        ),
+    ] = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
+    demands: Annotated[Demands, key(help="What a certified setting must show.")] = field(default_factory=Demands)
+    table: Annotated[
+        str | None,
+        key(
+            relative=True,
+            help="File of settings verified beforehand (`servotwin certify`), for the policy certified. They "
+            "are looked up, and the verification for the exact evidence follows; else it precedes every update.",
+        ),
+    ] = None
+    k_dz: Annotated[
+        float | None, key(minimum=0.0, help="Dead-zone gain of Eq 21, for the policy paper; 1 where absent.")
+    ] = None
+    smoothing: Annotated[
+        float | None,
+        key(
+            minimum=0.0,
+            maximum=1.0,
+            help="Share of the previous gap that each update keeps, below 1, for the policy paper; 0 where absent.",
+        ),
+    ] = None
+    k_noise: Annotated[
+        float | None,
+        key(minimum=0.0, help="Tolerances per standard deviation of the measurement's noise, for the policy margin."),
+    ] = None
+    excitation: Annotated[
+        ExcitationSettings | None,
+        key(help="What is asked of the edge when windows tell too little of the gap; nothing where absent."),
+    ] = None
+    triage: Annotated[
+        TriageSettings | None,
+        key(help="When a glance at a window is enough; where absent every window is estimated."),
+    ] = None
+    initial_gap: Annotated[
+        float, key("initial_gap_deg", minimum=0.0, help="Gap before the first estimate (section 4.2: zero).")
+    ] = 0.0
+    trend: Annotated[TrendSettings, key(makers={"": wear}, select=trend_maker, help="Assumptions on wear.")] = field(
+        default_factory=TrendSettings
+    )
+    gap_limit: Annotated[
+        float | None,
+        key("gap_limit_deg", minimum=0.0, help="Gap that is one too many: the twin reports the time until then."),
+    ] = None
+    processing: Annotated[
+        float,
+        key(
+            "processing_s",
+            minimum=0.0,
+            help="Time from a window's arrival to the update's departure; the acknowledgement does not wait for it.",
+        ),
+    ] = 0.0
+    validity: Annotated[
+        float,
+        key(
+            "validity_s",
+            above=0.0,
+            help="Time after a window's first sample for which an update that stands on it may still be applied.",
+        ),
+    ] = 60.0
+    retry: Annotated[
+        float,
+        key(
+            "retry_s",
+            above=0.0,
+            help="Time without a receipt after which an update is sent again; longer than a round trip, or each goes "
+            "out twice.",
+        ),
+    ] = 5.0
+    attempts: Annotated[
+        int, key(minimum=1, help="Number of times that an update is sent before the twin gives it up.")
+    ] = 4
 
     def __post_init__(self) -> None:
-        self._check_policy()
-        for name, unit in {"initial_gap": " rad", "processing": " s"}.items():
-            _check(name, getattr(self, name), unit, "finite and 0 or more", lambda x: x >= 0.0)
-        for name, unit in {"validity": " s", "retry": " s"}.items():
-            _check(name, getattr(self, name), unit, "finite and greater than 0", lambda x: x > 0.0)
-        if isinstance(self.attempts, bool) or not isinstance(self.attempts, int) or self.attempts < 1:
-            raise InvalidInput(f"twin attempts = {self.attempts!r}: must be an integer of 1 or more")
-        if self.gap_limit is not None:
-            _check("gap_limit", self.gap_limit, " rad", "finite and 0 or more", lambda x: x >= 0.0)
+        check(self)
+        for name, owner in _OWNERS.items():
+            if getattr(self, name) is not None and owner != self.policy:
+                value = getattr(self, name)
+                raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False, as the trend already joins the windows")
-
-    def _check_policy(self) -> None:
-        """The policy exists, and has what is set of it."""
-        if self.policy not in POLICIES:
-            hint = did_you_mean(str(self.policy), POLICIES)
-            raise InvalidInput(f"twin policy = {self.policy!r} does not exist{hint}; give one of {', '.join(POLICIES)}")
-        for name, owner in _OWNERS.items():
-            value = getattr(self, name)
-            if value is None:
-                continue
-            if owner != self.policy:
-                raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
-            if name != "table":
-                _check(name, value, "", "finite and 0 or more", lambda x: x >= 0.0)
 
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""
         return replace(self, **changes)
 
 
-def _check(name: str, value: float, unit: str, allowed: str, accepts: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and accepts(value)):
-        raise InvalidInput(f"twin {name} = {value!r}{unit}: must be {allowed}")
+def read_twin_settings(table: Table, folder: Path = Path()) -> TwinSettings:
+    """[twin] with its inner tables; those of `estimator` are the method's."""
+    method = table.text("method", whitened.METHOD, choices=tuple(METHODS))
+    estimator = part(table, "estimator", METHODS[method].settings)
+    made: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
+    return made

@@ -19,8 +19,8 @@ from servotwin.plant.servo import Servo
 from servotwin.twin.decode import decode_window
 from servotwin.twin.glance import Glance, Watch, allowed, glance
 from servotwin.twin.requests import Requests
+from servotwin.twin.settings import TriageSettings
 from servotwin.twin.store import Store
-from servotwin.twin.triage_settings import TriageSettings
 from servotwin.twin.wear import Expectation
 
 _FADES = 0.95  # of the usual misfit, per window: steps to one side may leave more than those to the other

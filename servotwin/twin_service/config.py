@@ -13,8 +13,8 @@ from servotwin.config.table import Reader, Table, given, named, part
 from servotwin.errors import InvalidInput
 from servotwin.link.url import is_here
 from servotwin.messages import MAX_BYTES
+from servotwin.twin_service.auth import read_secret
 from servotwin.twin_service.mqtt_config import MqttConfig, mqtt
-from servotwin.twin_service.secret_file import read_secret
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
 """Environment variable with the password of the store."""

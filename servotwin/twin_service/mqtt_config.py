@@ -9,7 +9,7 @@ from pathlib import Path
 from servotwin.config.table import Table, named
 from servotwin.link.broker import Broker
 from servotwin.link.url import is_here
-from servotwin.twin_service.secret_file import read_secret
+from servotwin.twin_service.auth import read_secret
 
 PASSWORD = "SERVOTWIN_MQTT_PASSWORD"
 """Environment variable with the password of the service's user at the broker."""

@@ -6,6 +6,7 @@ import math
 import pytest
 from scenario_files import PAPER, SHORT, load, refusal
 
+from servotwin.config.keys import items_of
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.limits import Limits
@@ -13,14 +14,13 @@ from servotwin.edge.settings import Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.estimation import paper, whitened
-from servotwin.estimation import settings_file as settingsfile
 from servotwin.messages import Band, Gains, Setting
 from servotwin.plant.servo import Servo
 
 
 @pytest.mark.parametrize(("module", "without"), [(paper, set()), (whitened, {"combine"})])
 def test_every_setting_has_its_key(module, without):
-    keys = {name for name, _ in settingsfile.KEYS[module.METHOD].values()}
+    keys = {item.name for item in items_of(module.Settings) if item.key.in_file}
     assert keys == {f.name for f in dataclasses.fields(module.Settings)} - without
 
 

@@ -227,10 +227,10 @@ def test_what_cannot_be_is_said(channels, options, word):
     ("settings", "words"),
     [
         ({"spreads": {"k": 1.0}}, "allowed are k/m"),
-        ({"spreads": {"k/m": 0.0}}, "above 0"),
-        ({"inflation": math.nan}, "inflation = nan: must be a finite number of at least 0"),
-        ({"whitenings": 2.5}, "whitenings = 2.5: must be a whole number of at least 0"),
-        ({"noise_order": True}, "noise_order = True: must be a whole number of at least 0"),
+        ({"spreads": {"k/m": 0.0}}, "must be a positive number"),
+        ({"inflation": math.nan}, "inflation = nan: must be a number, at least 0, finite"),
+        ({"whitenings": 2.5}, "whitenings = 2.5: must be an integer, at least 0"),
+        ({"noise_order": True}, "noise_order = True: must be an integer, at least 0"),
     ],
 )
 def test_settings_are_checked(settings, words):
@@ -242,3 +242,45 @@ def test_an_elastic_screw_is_refused():
     signal = np.sin(np.arange(2000) / 300.0)
     with pytest.raises(InvalidInput, match="rigid"):
         estimate_jointly(Window(signal, theta_m=signal, sample_rate=5000.0), Servo.preset("paper").replace(k_d=1e6))
+
+
+@pytest.mark.parametrize("angle", [True, False])
+@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
+def test_a_gap_beyond_the_largest_is_a_lower_bound_with_its_reason(preset, angle):
+    """The search goes up to 60 deg; at the bound it used to be sure of it."""
+    servo = Servo.preset(preset)
+    for gap_deg in (60.5, 70.0, 85.0):
+        run = simulate(servo, 7.1, reference=SquareWave(1e-3, 10.0), gap=math.radians(gap_deg))
+        whole = Window.from_run(run, 5.0, 2.0)
+        position = whole.position + FLOOR * np.random.default_rng(4).standard_normal(whole.position.size)
+        channel = {"theta_m": whole.theta_m} if angle else {"voltage": whole.voltage}
+        found = estimate_jointly(Window(position, **channel, sample_rate=5000.0), servo).gap
+        assert not found.ok
+        assert found.interval[0] <= math.radians(gap_deg) < found.interval[1] == math.inf
+        assert found.reasons
+
+
+def test_a_window_at_the_bound_does_not_bend_the_other_windows():
+    servo = Servo.preset("paper")
+    far = simulate(servo, 7.1, reference=SquareWave(1e-3, 10.0), gap=math.radians(62.0))
+    at_bound, good = Window.from_run(far, 5.0, 2.0), windows(run_of("paper", 10.0, False, False))[0]
+    assert estimate_jointly(at_bound, servo).gap.status is GapStatus.LOWER_BOUND
+    together, alone = estimate_jointly([at_bound, good], servo), estimate_jointly(good, servo)
+    assert together.gap.gap == alone.gap.gap
+    assert together.gaps[0].status is GapStatus.LOWER_BOUND
+    assert "60 deg" in together.gaps[0].reasons[0]
+
+
+@pytest.mark.parametrize("rate", [16_000.0, 20_000.0, 50_000.0])
+def test_short_fast_windows_are_refused_in_one_sentence(rate):
+    """After the decimation there was nothing left, and numpy said so."""
+    servo = Servo.preset("paper")
+    for samples in (204 + 2 * math.ceil(2e-3 * rate), 600):
+        signal = np.sin(np.arange(samples) / 300.0)
+        for channel in ("theta_m", "voltage"):
+            window = Window(1e-3 * signal, **{channel: signal}, sample_rate=rate)
+            with pytest.raises(InvalidInput, match=f"needs at least .* at {rate:.6g} Hz"):
+                estimate_jointly(window, servo)
+    fewest = int(18 * (rate // 250)) + 250 + 2 * math.ceil(2e-3 * rate)
+    signal = np.sin(np.arange(fewest) / 300.0)
+    assert not estimate_jointly(Window(1e-3 * signal, theta_m=signal, sample_rate=rate), servo).gap.ok

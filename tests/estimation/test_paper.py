@@ -209,14 +209,14 @@ def test_the_motor_angle_is_needed():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"alpha": 0.0}, "alpha = 0.0: must be a finite number above 0"),
+        ({"alpha": 0.0}, "alpha = 0.0 rad/s: must be a positive number, finite"),
         ({"alpha": math.inf}, "alpha = inf"),
-        ({"settle_s": -1.0}, "settle_s = -1.0: must be a finite number of at least 0"),
-        ({"lowpass_order": 2.5}, "lowpass_order = 2.5: must be a whole number above 0"),
-        ({"reversals": True}, "reversals = True: must be a whole number of at least 0"),
+        ({"settle_s": -1.0}, "settle_s = -1.0 s: must be a number, at least 0, finite"),
+        ({"lowpass_order": 2.5}, "lowpass_order = 2.5: must be an integer, at least 1"),
+        ({"reversals": True}, "reversals = True: must be an integer, at least 0"),
         ({"rest_speed": None}, "rest_speed = None"),
-        ({"padding": "none"}, "padding = 'none': must be odd or even"),
-        ({"origin": "zero"}, "origin = 'zero': must be absolute or first"),
+        ({"padding": "none"}, "padding = 'none': must be one of odd, even"),
+        ({"origin": "zero"}, "origin = 'zero': must be one of absolute, first"),
     ],
 )
 def test_settings_are_checked(arguments, message):

@@ -19,7 +19,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import STILL, Trial, assess
+from servotwin.redesign.certified.assess import STILL, Trial, assess, nearness
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
@@ -91,9 +91,9 @@ def test_equal_calls_draw_equal_members() -> None:
     [
         ({"k": 1.0}, "uncertainty k = 1.0"),
         ({"gap": (2.0, 1.0)}, "uncertainty gap = \\(2.0, 1.0\\) rad"),
-        ({"step": (0.0, 1e-3)}, "steps greater than 0"),
+        ({"step": (0.0, 1e-3)}, "must be two numbers, each a positive number"),
         ({"input_bias": (0.0, math.inf)}, "input_bias = \\(0.0, inf\\) V"),
-        ({"friction": (-1e-3, 0.0)}, "friction must be 0 or more"),
+        ({"friction": (-1e-3, 0.0)}, "must be two numbers, each a number, at least 0"),
     ],
 )
 def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
@@ -101,6 +101,16 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
         Uncertainty(**changes)  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="no value named 'kk'"):
         Uncertainty().replace(kk=0.1)
+
+
+def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
+    """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
+    held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)
+    found = certify(held, Uncertainty(gap=gaps(0, 5)), SMALL, SHORT)
+    assert isinstance(found, Refusal)
+    assert "no gain crossover" in found.reason
+    assert found.best is not None
+    assert (found.best.crossover, found.best.phase_margin) == (0.0, math.pi)
 
 
 # --- measures
@@ -129,6 +139,11 @@ def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
         last = error[-round(SHORT.last * SHORT.rate) :]
         assert found.ripple[p, c] == pytest.approx(0.5 * np.ptp(last), rel=1e-6, abs=1e-13)
         assert found.tail[p, c] == pytest.approx(np.abs(last).max(), rel=1e-6, abs=1e-13)
+        beyond = max(last.mean() - error.min(), 0.0) / (step + 2.0 * abs(last.mean()))
+        assert found.overshoot[p, c] == pytest.approx(beyond, rel=1e-6, abs=1e-12)
+        near = nearness(setting, members.input_bias, members.step.max())[p, c]
+        arrived = 1 + np.max(np.flatnonzero(np.abs(error) > near), initial=-1)
+        assert found.settling[p, c] == pytest.approx(arrived / SHORT.rate, abs=1e-12)
         assert found.cost[p, c] == pytest.approx(np.abs(error).mean() * SHORT.duration / step, rel=1e-6)
         assert found.effort[p, c] == pytest.approx(
             np.sqrt(np.mean(run.voltage[-last.size :] ** 2)), rel=1e-6, abs=1e-12
@@ -344,3 +359,18 @@ def test_on_the_model_a_millimetre_step_is_quick_and_hardly_overshoots(degrees: 
     off = run.position / 1e-3 - 1.0
     assert off.max() <= 0.1
     assert run.time[np.flatnonzero(np.abs(off) > 0.02)[-1]] <= 2.0
+
+
+@pytest.mark.parametrize("horizon", [20.0, 200.0])
+def test_wear_until_the_horizon_widens_the_range_of_gaps(horizon: float) -> None:
+    """A setting is to hold until the horizon, while the gap grows at the fastest rate that the trend allows."""
+    trend = Trend.start()
+    for time in range(6):
+        trend = trend.update(replace(estimated(4.0 + 0.01 * time), time=10.0 * time))
+    assert trend.rate_interval[1] > 0.0
+    last = replace(estimated(4.05), time=50.0)
+    policy = CertifiedPolicy(SERVO, Uncertainty(gap=gaps(0.0, 4.06)), horizon=horizon)
+    high = gap_range(last)[1] + horizon * trend.rate_interval[1]
+    for one, most in ((replace(policy, horizon=horizon), high), (replace(policy, horizon=0.0), gap_range(last)[1])):
+        reason = one.redesign(Evidence(last, trend=trend)).reason
+        assert f"to {math.degrees(most):.3g} deg" in reason

@@ -162,10 +162,10 @@ def test_which_windows_are_long_enough() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"after": 0}, "after = 0: must be 1 or more"),
+        ({"after": 0}, "after = 0: must be an integer, at least 1"),
         ({"strokes": 0}, "strokes = 0"),
         ({"window": math.inf}, "window = inf s"),
-        ({"pre_trigger": 2.0}, "pre_trigger = 2.0 s: must be 0 or more, below window"),
+        ({"pre_trigger": 2.0}, "pre_trigger = 2.0 s: must be below window = 2.0 s"),
         ({"probe": -1e-4}, "probe = -0.0001 m"),
         ({"interval": 0.0}, "interval = 0.0 s"),
         ({"hold": math.nan}, "hold = nan s"),

@@ -96,7 +96,10 @@ def test_ranges_and_demands_carry_their_units(tmp_path):
         ("[twin]\npolicy = 'paper'\nk_noise = 2.0", "k_noise = 2.0: belongs to policy 'margin'"),
         ("[twin.uncertainty]\ngap_deg = 60", "gap_deg = 60 is not allowed; give two numbers"),
         ("[twin.uncertainty]\ngap_deg = [60, 0]", "uncertainty gap"),
-        ("[twin.uncertainty]\nk_percent = 100", "uncertainty k = 1.0"),
+        (
+            "[twin.uncertainty]\nk_percent = 100",
+            "k_percent = 100 is not allowed; give a number, at least 0, below 100",
+        ),
         ("[twin.uncertainty]\nk = 0.1", "unknown key 'twin.uncertainty.k'"),
         ("[twin.demands]\nMs = 0.5", "twin.demands.Ms = 0.5 is not allowed; give a number, at least 1"),
     ],

@@ -22,8 +22,7 @@ from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage,
 from servotwin.twin.fleet import Fleet, Model
 from servotwin.twin.lookups import Question, decode_question
 from servotwin.twin.policies import certified
-from servotwin.twin.settings import TwinSettings
-from servotwin.twin.triage_settings import TriageSettings
+from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
 DEG = math.pi / 180.0

@@ -28,14 +28,12 @@ from servotwin.estimation.window import Window
 from servotwin.messages import pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.twin import settings_file as settingsfile
 from servotwin.twin.decode import decode_window
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.glance import Glance, Watch, due, glance
-from servotwin.twin.settings import TwinSettings
+from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.store import MemoryStore
 from servotwin.twin.triage import Triage
-from servotwin.twin.triage_settings import TriageSettings
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Wear
 
@@ -332,11 +330,11 @@ def test_settings_in_toml() -> None:
     text = (
         "policy = 'paper'\n[triage]\ngap_deg = 0.2\nbias_mv = 3.0\nleast_misfit_um = 0.5\nevery = 20\nlongest_s = 60.0"
     )
-    found = settingsfile.twin(Table("x.toml", parse_toml(text, "x.toml").values)).triage
+    found = read_twin_settings(Table("x.toml", parse_toml(text, "x.toml").values)).triage
     assert found is not None
     assert (found.gap, found.bias, found.least_misfit) == pytest.approx((0.2 * DEG, 3e-3, 5e-7))
     assert (found.every, found.longest) == (20, 60.0)
-    assert settingsfile.twin(Table("x.toml", {})).triage is None
+    assert read_twin_settings(Table("x.toml", {})).triage is None
 
 
 @pytest.mark.parametrize("name", ["gap", "deviations", "widest", "misfit", "least_misfit", "bias", "every", "longest"])

@@ -11,6 +11,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import check_gap
 
 Values: TypeAlias = tuple[float, ...]
 MAX_CELLS = 1_000_000
@@ -53,6 +54,7 @@ class RatioAxes:
         _check("tolerance", self.tolerance, "p b", positive=False)
         _check("amplitude", self.amplitude, "p b", positive=True)
         _check("gap", (self.gap,), "rad", positive=True)
+        check_gap(self.gap)
         _check_size(self)
 
     @property
@@ -95,8 +97,10 @@ class PhysicalAxes:
 
     def __post_init__(self) -> None:
         _check("gap", self.gap, "rad", positive=False)
+        check_gap(max(self.gap))
         if self.estimate:
             _check("estimate", self.estimate, "rad", positive=False)
+            check_gap(max(self.estimate), "estimate")
         _check("k_dz", self.k_dz, "tolerances per gap", positive=False)
         _check("amplitude", self.amplitude, "m", positive=True)
         _check_size(self)

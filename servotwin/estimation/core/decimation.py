@@ -49,6 +49,11 @@ def decimation(factor: int) -> Decimation:
     return Decimation(factor, np.pad(taps, (0, _AVERAGES * factor - taps.size)))
 
 
+def shortest_for(factor: int, outputs: int) -> int:
+    """Fewest samples that a decimation by `factor` makes `outputs` samples of."""
+    return outputs if factor == 1 else factor * (outputs + _AVERAGES - 1)
+
+
 @bare
 def decimate(columns: Array, taps: Array, factor: int, out: Array) -> None:
     """`Decimation.rows` into `out` (k, m): the four blocks under one output are summed side by side."""

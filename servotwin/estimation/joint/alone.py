@@ -64,7 +64,11 @@ class Alone:
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> Alone:
     """Where a search would begin."""
-    known, reduce, noise = known_of(model, prior, settings), _reduction(model), Autoregression.white(1.0)
+    known, reduce, noise = (
+        known_of(model, prior, settings),
+        decimation(decimation_factor(model.rate)),
+        Autoregression.white(1.0),
+    )
     here = stand(model, start_of(model, prior), known, reduce.rows)
     return Alone(model, known, reduce, noise, (here,), here.evaluations, blocked)
 
@@ -103,8 +107,9 @@ def _descended(fit: Alone, known: Known, starts: Sequence[Stand]) -> Alone:
     return replace(fit, minima=minima, evaluations=fit.evaluations + sum(one.evaluations for one in found))
 
 
-def _reduction(model: JointModel) -> Decimation:
-    return decimation(max(1, int(model.rate / _SAMPLES_HZ)))
+def decimation_factor(rate: float) -> int:
+    """Factor by which a window sampled at `rate` (Hz) is decimated for the fit."""
+    return max(1, int(rate / _SAMPLES_HZ))
 
 
 def distinct(stands: Sequence[Stand]) -> tuple[Stand, ...]:

@@ -13,20 +13,30 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.core.decimation import shortest_for
 from servotwin.estimation.core.family import Hold
-from servotwin.estimation.joint.alone import RIVAL, Alone, searched, unsearched
+from servotwin.estimation.joint.alone import RIVAL, Alone, decimation_factor, searched, unsearched
 from servotwin.estimation.joint.knowledge import AnyPrior
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
 from servotwin.estimation.joint.together import Together
-from servotwin.estimation.joint.verdict import Found, JointEstimate, Parameter, estimate_of, mismatched, stated
+from servotwin.estimation.joint.verdict import (
+    Found,
+    JointEstimate,
+    Parameter,
+    at_bound,
+    estimate_of,
+    mismatched,
+    stated,
+)
 from servotwin.estimation.trend import Prior
 from servotwin.estimation.whitened.channels import faults, motor_angle
 from servotwin.estimation.whitened.settings import Settings as Whitened
-from servotwin.estimation.window import Window
+from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.plant.servo import Servo
 
 WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
+SHORTEST = 200  # samples beside the margins, as before the decimation; after it a window has MINIMUM_SAMPLES at least
 _SIGMAS = 4.0  # by how many standard deviations a gap may move when its window is fitted with others
 
 
@@ -67,7 +77,9 @@ def estimate_jointly(
     names = _free(windows[0], free)
     fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
     found = [_alone(fit) for fit in fits]
-    counted = [i for i, fit in enumerate(fits) if not fit.blocked and not mismatched(found[i], given)]
+    counted = [
+        i for i, one in enumerate(found) if not (fits[i].blocked or mismatched(one, given) or at_bound(one, given))
+    ]
     if len(counted) > 1:
         joined = _joined([fits[i] for i in counted], [found[i] for i in counted], given)
         found = [dict(zip(counted, joined, strict=True)).get(i, one) for i, one in enumerate(found)]
@@ -113,9 +125,13 @@ def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointS
         raise InvalidInput(f"servo k_d = {servo.k_d} N/m: the joint estimator needs a rigid screw (k_d = inf)")
     delay = ("delay",) if settings.largest_delay_s > 0.0 else ()
     motor = MOTOR_START if window.theta_m is None else ()
-    margin = margin_for(settings.largest_delay_s, window.sample_rate)
-    if window.position.size < 200 + 2 * margin:
-        raise InvalidInput(f"{window.where}the window has {window.position.size} samples: at least {200 + 2 * margin}")
+    margin, factor = margin_for(settings.largest_delay_s, window.sample_rate), decimation_factor(window.sample_rate)
+    fewest = max(SHORTEST, shortest_for(factor, MINIMUM_SAMPLES)) + 2 * margin
+    if window.position.size < fewest:
+        raise InvalidInput(
+            f"{window.where}the window has {window.position.size} samples: the joint estimator needs at least {fewest} "
+            f"at {window.sample_rate:.6g} Hz"
+        )
     hold = settings.hold or (Hold.LINEAR if servo.controller.sample_rate is None else Hold.CONSTANT)
     unsure = jumps(window.voltage) if motor and hold is Hold.LINEAR and window.voltage is not None else ()
     names = ("gap", "place", *delay, *free, *motor, *(f"{JUMP}{index}" for index in unsure))
@@ -136,10 +152,11 @@ def _still(window: Window) -> bool:
 
 def _fit(window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, settings: JointSettings) -> Alone:
     """One window by itself; not searched when its channels are useless."""
+    model = _model(window, servo, names, settings)
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
-        window = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, Whitened()))
-    model = _model(window, servo, names, settings)
+        smooth = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, Whitened()))
+        model = replace(model, window=smooth)
     silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
     if broken or silence:
         return unsearched(model, prior, settings, blocked=broken or silence)

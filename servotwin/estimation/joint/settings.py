@@ -1,21 +1,23 @@
-"""What the joint estimator can be told."""
+"""Settings of the joint estimator."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Annotated
 
+from servotwin.config.keys import check, settings, value
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.family import Hold
-from servotwin.estimation.settings_check import check_number
 
 SPREADS: Mapping[str, float] = MappingProxyType(
     {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_B": 0.1, "gap rate": math.radians(0.5)}
 )
 
 
+@settings("joint")
 @dataclass(frozen=True)
 class JointSettings:
     """Settings of the joint estimator.
@@ -25,58 +27,63 @@ class JointSettings:
     spreads : mapping
         What is known of each free parameter beforehand: standard deviation, of the logarithm for "k/m", "c/m", "pitch"
         and "k_B" (0.1: about 10 %), in rad/s for "gap rate". A parameter may move by four of them.
-    largest_delay_s : float
-        Position and angle (or voltage) may be out of step by up to this; 0: they are known to be in step.
-    largest_gap_rad : float
-        End of the search.
     hold : Hold, optional
-        What the voltage does between samples, where the angle is computed from it. By default it is held when the
+        Course of the voltage between samples, where the angle is computed from it. By default it is held when the
         servo's controller is sampled, and linear when it is continuous.
-    contact_travel_rad : float
-        How far the fitted screw must be pushed in each contact.
-    largest_std_rad : float
-        Estimates with a larger statistical spread are refused.
-    model_error_rad : float
-        What the model's remaining error is taken to add to the spread, in `std_total`.
-    numeric_error_rad : float
-        What sampling and rounding leave, in `std` already: it counts where there is next to no noise.
-    unexplained : float
-        Residual over variation of the position (rms both) above which the model does not belong to the window.
-    inflation : float
-        Standard deviations are multiplied by this: the noise's own model is estimated from the same window.
-    noise_order : int
-        Most coefficients of the autoregression that whitens.
-    whitenings : int
-        How often noise and parameters are estimated in turn.
     """
 
     spreads: Mapping[str, float] = field(default_factory=lambda: SPREADS)
-    largest_delay_s: float = 2e-3
-    largest_gap_rad: float = math.radians(60.0)
+    largest_delay_s: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="Position and angle (or voltage) may be out of step by up to this; 0: they are known to be in step.",
+        ),
+    ] = 2e-3
+    largest_gap_rad: Annotated[float, value(minimum=0.0, help="End of the search.")] = math.radians(60.0)
     hold: Hold | None = None
-    contact_travel_rad: float = math.radians(0.5)
-    largest_std_rad: float = math.radians(0.25)
-    model_error_rad: float = math.radians(0.02)
-    numeric_error_rad: float = math.radians(2e-4)
-    unexplained: float = 0.5
-    inflation: float = 1.2
-    noise_order: int = 30
-    whitenings: int = 3
+    contact_travel_rad: Annotated[
+        float, value(minimum=0.0, help="Least travel of the fitted screw in each contact.")
+    ] = math.radians(0.5)
+    largest_std_rad: Annotated[
+        float, value(minimum=0.0, help="Estimates with a larger statistical spread are refused.")
+    ] = math.radians(0.25)
+    model_error_rad: Annotated[
+        float, value(minimum=0.0, help="Standard deviation for what the model leaves out, in std_total.")
+    ] = math.radians(0.02)
+    numeric_error_rad: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="What sampling and rounding leave, in std already: it counts where there is next to no noise.",
+        ),
+    ] = math.radians(2e-4)
+    unexplained: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="Residual over variation of the position (rms both) above which the model does not fit the window.",
+        ),
+    ] = 0.5
+    inflation: Annotated[
+        float,
+        value(
+            minimum=0.0,
+            help="Factor on standard deviations: the noise's own model is estimated from the same window.",
+        ),
+    ] = 1.2
+    noise_order: Annotated[int, value(minimum=0, help="Most coefficients of the autoregression that whitens.")] = 30
+    whitenings: Annotated[int, value(minimum=0, help="Rounds of estimating noise and parameters in turn.")] = 3
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            if item.name not in ("spreads", "hold"):
-                check_number(f"joint {item.name}", getattr(self, item.name), item.name in _WHOLE)
-        for name, value in self.spreads.items():
+        check(self)
+        for name, spread in self.spreads.items():
             if name not in SPREADS:
                 raise InvalidInput(f"joint spreads {name!r}: allowed are {', '.join(SPREADS)}")
-            check_number(f"joint spreads {name!r}", value)
-            if value == 0.0:
-                raise InvalidInput(f"joint spreads {name!r} = 0: must be above 0; leave out of `free` what is known")
+            if isinstance(spread, bool) or not isinstance(spread, int | float) or not 0.0 < spread < math.inf:
+                allowed = "must be a positive number, finite; leave out of `free` what is known"
+                raise InvalidInput(f"joint spreads {name!r} = {spread!r}: {allowed}")
 
     def spread(self, name: str) -> float:
         """Of a free parameter."""
         return self.spreads.get(name, SPREADS[name])
-
-
-_WHOLE = ("noise_order", "whitenings")

@@ -150,7 +150,20 @@ def _verdict(found: Found, std: float, settings: JointSettings) -> tuple[GapStat
             f"the gap is known to {math.degrees(std):.3g} deg only" if math.isfinite(std) else "nothing shows the gap"
         )
         return GapStatus.UNIDENTIFIABLE, (f"{known}, and {math.degrees(settings.largest_std_rad):.3g} deg are allowed",)
-    return _by_contacts(found, settings.contact_travel_rad)
+    status, reasons = _by_contacts(found, settings.contact_travel_rad)
+    bound = at_bound(found, settings)
+    if not bound:
+        return status, reasons
+    return GapStatus.LOWER_BOUND if status is GapStatus.OK else status, (bound, *reasons)
+
+
+def at_bound(found: Found, settings: JointSettings) -> str:
+    """Reason why a fit says no more than that the gap is large: the search ended at its bound; empty otherwise."""
+    largest = settings.largest_gap_rad
+    # A search may stop a little before the bound, so that one standard deviation counts as there.
+    if found.values["gap"] < largest - math.hypot(found.std(settings), settings.model_error_rad):
+        return ""
+    return f"the best fit lies at largest_gap_rad = {math.degrees(largest):.6g} deg: the gap is probably larger"
 
 
 def mismatched(found: Found, settings: JointSettings) -> str:

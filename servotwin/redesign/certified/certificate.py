@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.redesign.design import Design
 
 
+@settings("demands")
 @dataclass(frozen=True)
 class Demands:
     """What a setting must show, and how hard it is looked for.
 
     Parameters
     ----------
-    Ms : float
-        Largest sensitivity peak of the loop without a gap on the model itself.
-    settled : float
-        Least share of the members that settle.
-    overshoot : float
-        Largest overshoot of a member, per step.
     tail, tolerance : float
         m: largest error of a member in the last part, widest dead zone.
     scales : tuple of float
@@ -38,9 +35,15 @@ class Demands:
         Candidates that are tried before none is found.
     """
 
-    Ms: float = 2.0
-    settled: float = 0.99
-    overshoot: float = 0.5
+    Ms: Annotated[
+        float, key(minimum=1.0, help="Largest sensitivity peak of the loop without a gap on the model itself.")
+    ] = 2.0
+    settled: Annotated[
+        float, key("settled_percent", minimum=0.0, maximum=1.0, help="Least share of the members that settle.")
+    ] = 0.99
+    overshoot: Annotated[
+        float, key("overshoot_percent", minimum=0.0, help="Largest overshoot of a member, per step.")
+    ] = 0.5
     tail: float = math.inf
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
@@ -53,6 +56,9 @@ class Demands:
     conditions: int = 8
     attempts: int = 4
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check(self, but=("overshoot",))  # inf where the fallback set is looked for: no demand
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ class Certificate:
     within : float
         m: that error, where it is largest.
     Ms, crossover, phase_margin : float
-        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad.
+        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain
+        is below one at every frequency has the crossover 0 and the margin pi.
     saturated : bool
         Whether the voltage limit was met by a member.
     looked_at : int

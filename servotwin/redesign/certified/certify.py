@@ -17,7 +17,7 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.margins import Margins
+from servotwin.plant.margins import GainCrossover, Margins
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import Outcome, Trial, assess, nearness
 from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
@@ -192,7 +192,7 @@ def _certificate(
     noise: float,
 ) -> Certificate:
     loop = _margins(servo, setting.controller.replace(feedforward=0.0, enter=1.0, leave=1.0))
-    crossover = loop.gain_crossovers[-1]
+    crossover = loop.gain_crossovers[-1] if loop.gain_crossovers else GainCrossover(0.0, math.pi)
     return Certificate(
         setting=setting,
         gap=uncertainty.gap,
@@ -220,7 +220,9 @@ def _certificate(
 
 
 def _shortcoming(tried: Certificate, demands: Demands) -> str:
-    """What is missing, in words; empty: nothing."""
+    """The demand that is not met, in words; empty where all are."""
+    if tried.crossover == 0.0:
+        return "has no gain crossover: its loop gain is below one at every frequency"
     if tried.settled < demands.settled:
         return f"settles on {100.0 * tried.settled:.1f} % of the members, and {100.0 * demands.settled:g} % are asked"
     if tried.tail > _ROUNDED * demands.tail:

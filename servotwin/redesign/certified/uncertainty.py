@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.stats import qmc
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
@@ -18,22 +20,10 @@ _PARAMETERS = ("k", "c", "k_B", "m")
 _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 
 
+@settings("uncertainty")
 @dataclass(frozen=True)
 class Uncertainty:
     """What is known of a machine: each value lies in its range, and nothing says where.
-
-    Parameters
-    ----------
-    k, c, k_B, m : float
-        Half-widths relative to the model's values.
-    gap : (float, float)
-        rad, total.
-    step : (float, float)
-        m, size of the steps that the reference makes; one is as likely as another on a logarithmic scale.
-    input_bias : (float, float)
-        V, added to the voltage behind the controller.
-    friction : (float, float)
-        N m, Coulomb's on the motor's shaft.
 
     Raises
     ------
@@ -41,26 +31,41 @@ class Uncertainty:
         A half-width is not in 0 .. 1, or a range is empty, not finite or, but for the bias, negative.
     """
 
-    k: float = 0.15
-    c: float = 0.5
-    k_B: float = 0.1
-    m: float = 0.1
-    gap: Range = (0.0, math.radians(60.0))
-    step: Range = (1e-4, 2.5e-3)
-    input_bias: Range = (0.0, 0.0)
-    friction: Range = (0.0, 0.0)
+    k: Annotated[
+        float, key("k_percent", minimum=0.0, below=1.0, help="Half-width of the stiffness, relative to the model's.")
+    ] = 0.15
+    c: Annotated[
+        float, key("c_percent", minimum=0.0, below=1.0, help="Half-width of the damping, relative to the model's.")
+    ] = 0.5
+    k_B: Annotated[
+        float, key("k_b_percent", minimum=0.0, below=1.0, help="Half-width of the back-EMF, relative to the model's.")
+    ] = 0.1
+    m: Annotated[
+        float, key("m_percent", minimum=0.0, below=1.0, help="Half-width of the mass, relative to the model's.")
+    ] = 0.1
+    gap: Annotated[Range, key("gap_deg", minimum=0.0, help="Range of the total gap.")] = (0.0, math.radians(60.0))
+    step: Annotated[
+        Range,
+        key(
+            "step_mm",
+            above=0.0,
+            help="Range of the steps that the reference makes; one size is as likely as another on a logarithmic "
+            "scale.",
+        ),
+    ] = (1e-4, 2.5e-3)
+    input_bias: Annotated[
+        Range, key("input_bias_v", help="Range of the voltage that is added behind the controller.")
+    ] = (0.0, 0.0)
+    friction: Annotated[
+        Range, key("friction_n_m", minimum=0.0, help="Range of the Coulomb friction on the motor's shaft.")
+    ] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in _PARAMETERS:
-            width = getattr(self, name)
-            if not 0.0 <= width < 1.0:
-                raise InvalidInput(f"uncertainty {name} = {width!r}: a relative half-width must be 0 or more, below 1")
+        check(self)
         for name, unit in _UNITS.items():
             low, high = getattr(self, name)
-            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be finite and in order")
-        if min(self.gap[0], self.friction[0]) < 0.0 or self.step[0] <= 0.0:
-            raise InvalidInput("uncertainty: gap and friction must be 0 or more, and steps greater than 0")
+            if not low <= high:
+                raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be in order")
 
     def replace(self, **changes: object) -> Uncertainty:
         """A copy with some values changed, validated again."""
@@ -129,7 +134,7 @@ def _plants(servo: Servo, widths: tuple[float, ...], count: int, seed: int) -> t
 
 
 def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
-    changes = {}
+    changes: dict[str, Any] = {}
     for name, factor in factors.items():
         value = getattr(servo, name)
         changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value

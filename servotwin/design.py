@@ -1,0 +1,147 @@
+"""Design of controllers in Python: tune for a crossover, and map which dead zones settle."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes
+from servotwin.analysis.maps.measures import joined, measured
+from servotwin.analysis.maps.result import StabilityMap
+from servotwin.analysis.maps.settings import MapSettings
+from servotwin.analysis.tuning.tune import Specification, Tuning
+from servotwin.analysis.tuning.tune import tune as tune_system
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.linear import LinearSystem, series
+from servotwin.plant.loop import loop_filter
+from servotwin.plant.servo import Servo
+
+
+def tune(
+    servo: Servo,
+    crossover: float,
+    phase_margin: float,
+    *,
+    kind: str = "PIDF",
+    Ms_max: float = math.inf,
+    prefer: str = "Ms",
+    delay: float = 0.0,
+) -> Tuning:
+    """Find a continuous controller with a given gain crossover and phase margin, for the servo without a gap.
+
+    Parameters
+    ----------
+    servo : Servo
+        Its own controller gives the loop filter, dead zone and limits of the result.
+    crossover : float
+        Gain crossover, rad/s.
+    phase_margin : float
+        Phase margin there, rad.
+    kind : str
+        P, PI, PD, PDF, PID or PIDF.
+    Ms_max : float
+        Largest sensitivity peak that is accepted.
+    prefer : str
+        "Ms": the smallest Ms, then the largest Ki; "Ki": the largest Ki within `Ms_max`.
+    delay : float
+        Delay in series with the plant, s.
+
+    Returns
+    -------
+    Tuning
+        ``controller``, ``margins``, and the factors and candidates of the search.
+
+    Raises
+    ------
+    InvalidInput
+        A value is out of its range, or no such controller exists; the sentence says what can be reached.
+    """
+    if phase_margin > math.pi:
+        raise InvalidInput(
+            f"phase_margin = {phase_margin:g} rad: must be above 0 and below pi; did you mean"
+            f" math.radians({phase_margin:g})?"
+        )
+    specification = Specification(crossover, phase_margin, kind, Ms_max, prefer)
+    law = servo.controller.replace(sample_rate=None)
+    return tune_system(tuned_system(servo), specification, delay, law)
+
+
+def tuned_system(servo: Servo) -> LinearSystem:
+    """System that `tune` closes the loop around: the plant with the controller's loop filter in series."""
+    return series(servo.plant(), loop_filter(servo.controller))
+
+
+def stability_map(
+    servo: Servo,
+    *,
+    controller: Controller | None = None,
+    tolerance: Sequence[float] | None = None,
+    gap: Sequence[float] | None = None,
+    k_dz: Sequence[float] = (1.0,),
+    estimate: Sequence[float] = (),
+    amplitude: Sequence[float] | None = None,
+    members: int = 16,
+    motion: float = 1.0,
+    seed: int = 0,
+    duration: float = 120.0,
+    window: float = 40.0,
+    still: float = 1e-6,
+    threads: int | None = None,
+) -> StabilityMap:
+    """Simulate every cell of a grid from many initial states and say which of them settle.
+
+    Give either `tolerance` (a map in ratios, which serves every gap) or `gap`.
+
+    Parameters
+    ----------
+    servo : Servo
+    controller : Controller, optional
+        Continuous; the servo's own by default.
+    tolerance : sequence of float, optional
+        Dead-zone half-width / (p b), b half the gap.
+    gap : sequence of float, optional
+        Total gap, rad.
+    k_dz, estimate : sequence of float
+        With `gap`: dead zone / (p estimate), and the estimate of the total gap, rad; without an estimate the true gap.
+    amplitude : sequence of float, optional
+        Reference step: in p b with `tolerance` (35 by default), in m with `gap` (1 mm by default).
+    members : int
+        Initial states in each cell.
+    motion : float
+        Extent of the motion that half of them start in.
+    seed : int
+        Seed of the initial states.
+    duration : float
+        Length of every run, s.
+    window : float
+        End of the run in which the position must rest, s.
+    still : float
+        Half the peak-to-peak below which the position rests, m.
+    threads : int, optional
+        As many as there are processors by default.
+
+    Returns
+    -------
+    StabilityMap
+        ``grid("settled")`` is the share of the members that settle, shaped as the axes.
+
+    Raises
+    ------
+    InvalidInput
+        Both or neither of `tolerance` and `gap` are given, or a value is out of its range.
+    """
+    if (tolerance is None) == (gap is None):
+        raise InvalidInput("stability map: give either tolerance (in p b) or gap (rad)")
+    axes: Axes
+    if tolerance is not None:
+        axes = RatioAxes(tuple(tolerance), tuple(amplitude or (35.0,)))
+    else:
+        assert gap is not None
+        axes = PhysicalAxes(tuple(gap), tuple(k_dz), tuple(amplitude or (1e-3,)), tuple(estimate))
+    settings = MapSettings(servo, axes, controller, members, motion, seed, duration, window, still)
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+        parts = list(executor.map(lambda cells: measured(settings, cells), settings.chunks))
+    return StabilityMap(settings, joined(parts))

@@ -1,1 +1,0 @@
-"""Decide at the edge which windows are worth sending."""

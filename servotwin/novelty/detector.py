@@ -1,0 +1,282 @@
+"""Novelty detector: state and cut window in, state and verdict out.
+
+It measures the change of the gap since the last window that the twin got as news, which begins a new baseline. After an
+accepted update the baseline counts as a few windows only, and where the update stands on a window that did not show the
+gap here, the baseline moves with the update's gap. A window that does not show the gap changes no baseline.
+"""
+
+from math import hypot, inf, sqrt
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct, structs
+
+from servotwin.edge.cut import Cut
+from servotwin.errors import InvalidInput
+from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
+from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, score
+from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+
+PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
+LOST_MOTION, SCORE, CUSUM = "novelty: lost motion", "novelty: score", "novelty: cusum"
+NEWS = LOST_MOTION, SCORE, CUSUM
+
+# Names under which the states of earlier versions are stored.
+_STORED = {
+    "unconditional": "owed",
+    "update_gap": "told",
+    "last_sent": "sent",
+    "uninformative": "silent",
+    "reported_lost_motion": "bound",
+}
+_RECENT = 8  # windows that an update may stand on
+_WIDEST = 1.0  # rad: a larger spread is no estimate
+_STILL = 0.2  # of the margin: what moves less rests
+
+
+class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
+    """State of the detector, which the link process stores.
+
+    Attributes
+    ----------
+    gap : float
+        rad, where the next score begins.
+    unconditional : int
+        Windows still to be sent whatever they show.
+    chart : Chart
+    version : int
+        Of the parameters in force.
+    update_gap : float or None
+        rad, the last update's gap.
+    last_sent : float or None
+        s of this boot, end of the last window sent.
+    uninformative : int
+        Windows in a row that did not show the gap.
+    recent : tuple of int
+        Sequences of the last windows that showed the gap.
+    low, high : float
+        rad, leads at rest; high below low: none yet.
+    reported_lost_motion : float
+        rad, lost motion of the windows that were sent.
+    offset : (float, float) or None
+        rad, the encoder's, and its standard deviation; None: no window of this boot has shown it.
+    noise : float
+        m, residual (rms) of the last fit; 0: not known.
+    """
+
+    gap: float
+    unconditional: int
+    chart: Chart = Chart()
+    version: int = 0
+    update_gap: float | None = None
+    last_sent: float | None = None
+    uninformative: int = 0
+    recent: tuple[int, ...] = ()
+    low: float = inf
+    high: float = -inf
+    reported_lost_motion: float = 0.0
+    offset: tuple[float, float] | None = None
+    noise: float = 0.0
+
+
+class NoveltyVerdict(NamedTuple):
+    """Reason to send a window, and what the detector read off it.
+
+    Attributes
+    ----------
+    reason : str
+        Empty: it is not to be sent.
+    score : Score or None
+        None: the window does not show the gap.
+    change : float
+        From the baseline, standard deviations.
+    lost_motion : float
+        rad, since the boot or the last update.
+    """
+
+    reason: str
+    score: Score | None
+    change: float
+    lost_motion: float
+
+
+def start(settings: NoveltySettings) -> NoveltyState:
+    """Return the state of an edge that has seen no window."""
+    return NoveltyState(settings.gap, settings.rules.learn)
+
+
+def booted(state: NoveltyState, rules: NoveltyRules) -> NoveltyState:
+    """Return the state after a restart: the baseline stays; what counts samples or turns of the encoder begins anew."""
+    return NoveltyState(state.gap, rules.learn, state.chart, state.version, state.update_gap)
+
+
+def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[NoveltyState, NoveltyVerdict]:
+    """Decide about a cut window.
+
+    Parameters
+    ----------
+    state : NoveltyState
+    cut : Cut
+        Its `reason` is why it was cut.
+    settings : NoveltySettings
+    """
+    rules, model = settings.rules, settings.model
+    leads = leads_at_rest(cut.signals["theta_m"], cut.signals["position"], model.rate, model.static_gain, _still(rules))
+    state = _rested(_updated(state, cut, rules), leads)
+    found = _read(state, cut, settings)
+    if found is None:
+        return _without_score(state, cut, settings)
+    seen = add_window(state.chart, found.gap, found.std, rules)
+    far = abs(found.gap - state.chart.anchor) > rules.outlier
+    news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
+    state = structs.replace(_after_score(state, cut, found, rules), chart=seen.chart)
+    reason = _reason(state, cut, settings, news)
+    if news:
+        state = structs.replace(state, unconditional=rules.confirm if far else 0)
+    elif state.unconditional and reason:
+        state = structs.replace(state, unconditional=state.unconditional - 1)
+    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, found, seen.change, _range(state))
+
+
+def _after_score(state: NoveltyState, cut: Cut, found: Score, rules: NoveltyRules) -> NoveltyState:
+    """Update all but the chart with a window's score."""
+    return structs.replace(
+        state,
+        gap=max(0.0, found.gap),
+        uninformative=0,
+        recent=(*state.recent, cut.sequence)[-_RECENT:],
+        offset=_carried(state.offset, found.offset, rules),
+        noise=found.noise,
+    )
+
+
+def _read(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Score | None:
+    """Score a window by itself, or else with the encoder's offset from earlier ones; None: it does not show the gap."""
+    signals, least = (cut.signals["theta_m"], cut.signals["position"]), settings.rules.travel
+    alone = score(*signals, settings.model, state.gap, usual=state.noise)
+    if alone is not None and min(alone.travel) >= least and alone.std < _WIDEST:
+        return alone
+    if state.offset is None:
+        return None
+    carried = score(*signals, settings.model, state.gap, EncoderOffset(*state.offset), state.noise)
+    return carried if carried is not None and max(carried.travel) >= least and carried.std < _WIDEST else None
+
+
+def _carried(known: tuple[float, float] | None, read: EncoderOffset, rules: NoveltyRules) -> tuple[float, float] | None:
+    """Combine the offset with one more reading; it may have moved by the resolution since the last."""
+    if not read.std < inf:
+        return known
+    if known is None:
+        return read.value, hypot(read.std, rules.resolution)
+    before, new = (std * std + rules.resolution * rules.resolution for std in (known[1], read.std))
+    share = before / (before + new)
+    return known[0] + share * (read.value - known[0]), sqrt(share * new)
+
+
+def _without_score(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[NoveltyState, NoveltyVerdict]:
+    """Decide about a window that shows at most the lost motion at rest."""
+    rules = settings.rules
+    news = LOST_MOTION if _lost(state, rules) else ""
+    patient = state.uninformative >= rules.patience
+    reason = _reason(structs.replace(state, unconditional=0) if patient else state, cut, settings, news)
+    state = structs.replace(state, uninformative=state.uninformative + 1)
+    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, None, 0.0, _range(state))
+
+
+def _reason(state: NoveltyState, cut: Cut, settings: NoveltySettings, news: str) -> str:
+    """Reason to send, the most important first; empty: none."""
+    if cut.reason == PROBE:
+        return PROBE
+    if news or state.unconditional:
+        return news or FIRST
+    late = cut.last / settings.model.rate - (state.last_sent or 0.0) >= settings.rules.period_s
+    return PERIODIC if late else ""
+
+
+def _sent(state: NoveltyState, cut: Cut, settings: NoveltySettings, reason: str) -> NoveltyState:
+    """Update the state with a window that is sent, if there is a reason."""
+    if not reason:
+        return state
+    reported = max(state.reported_lost_motion, _range(state))
+    return structs.replace(state, last_sent=cut.last / settings.model.rate, reported_lost_motion=reported)
+
+
+def _updated(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> NoveltyState:
+    """Update the state with the parameters accepted since the last window."""
+    if cut.parameter_version == state.version:
+        return state
+    state = structs.replace(state, version=cut.parameter_version)
+    if cut.gap is None:
+        return state
+    return structs.replace(state, chart=_relearnt(state, cut, rules), update_gap=cut.gap, unconditional=0)
+
+
+def _relearnt(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:
+    """Give the baseline the weight of few windows; move it with the update's gap if that window was not scored here."""
+    if cut.basis in state.recent or state.chart.weight == 0.0:
+        return with_fewer_windows(state.chart, rules.relearn)
+    if state.update_gap is None or cut.gap is None:
+        return restarted(state.chart)
+    return restarted(state.chart, state.chart.gap + cut.gap - state.update_gap, 1.0 / (rules.settle * rules.settle))
+
+
+def _rested(state: NoveltyState, leads: list[float]) -> NoveltyState:
+    return structs.replace(state, low=min(state.low, *leads), high=max(state.high, *leads)) if leads else state
+
+
+def _still(rules: NoveltyRules) -> float:
+    return _STILL * rules.margin
+
+
+def _range(state: NoveltyState) -> float:
+    return max(0.0, state.high - state.low)
+
+
+def _lost(state: NoveltyState, rules: NoveltyRules) -> bool:
+    """Tell whether the lost motion exceeds the gap and the lost motion that the twin knows of."""
+    known = state.update_gap if state.update_gap is not None else max(0.0, state.chart.gap)
+    return _range(state) > max(known, state.reported_lost_motion) + max(rules.margin, rules.worth)
+
+
+def dumps(state: NoveltyState) -> bytes:
+    """Encode the state (MessagePack, which holds infinities)."""
+    return msgspec.msgpack.encode(state)
+
+
+def loads(data: bytes) -> NoveltyState:
+    """Decode a state.
+
+    Raises
+    ------
+    InvalidInput
+        The bytes are not a state.
+    """
+    try:
+        return msgspec.msgpack.decode(data, type=NoveltyState)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise InvalidInput(f"not the state of a novelty detector: {error}") from None
+
+
+class NoveltyDetector:
+    """Window filter that keeps the detector's state.
+
+    Parameters
+    ----------
+    settings : NoveltySettings
+    state : NoveltyState, optional
+        From an earlier boot; None: no window has been seen.
+    """
+
+    def __init__(self, settings: NoveltySettings, state: NoveltyState | None = None) -> None:
+        self.settings = settings
+        self.state = start(settings) if state is None else booted(state, settings.rules)
+        self.verdict: NoveltyVerdict | None = None
+
+    def dumps(self) -> bytes:
+        """Encode the state."""
+        return dumps(self.state)
+
+    def __call__(self, cut: Cut) -> Cut | None:
+        """Return the window with the reason to send it; None: it is not sent."""
+        self.state, self.verdict = judge(self.state, cut, self.settings)
+        return cut._replace(reason=self.verdict.reason) if self.verdict.reason else None

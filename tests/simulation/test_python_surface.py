@@ -1,0 +1,136 @@
+"""The Python surface: typed keywords, ranges that catch degrees, short reprs, figures and tables."""
+
+import math
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servotwin as st
+from servotwin.control.controller import ControllerChanges
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import ServoChanges
+from servotwin.simulation.ensemble import simulate_ensemble
+
+ROOT = Path(__file__).parents[2]
+TEN_DEGREES = math.radians(10.0)
+
+
+@pytest.fixture(scope="module")
+def servo():
+    return st.Servo.preset("paper")
+
+
+@pytest.fixture(scope="module")
+def run(servo):
+    return st.simulate(
+        servo,
+        2.0,
+        reference=st.Step(1e-3),
+        gap=TEN_DEGREES,
+        tolerance=servo.tolerance_for(TEN_DEGREES),
+        sample_rate=1000.0,
+    )
+
+
+WRONG = {
+    "st.simulate(servo, 1.0, reffff=1e-3)": "reffff",
+    'st.simulate(servo, 1.0, gap="ten")': "gap",
+    'st.simulate(servo, "1 s")': "float",
+    "st.simulate(servo, 1.0, controller=servo)": "controller",
+    "servo.replace(Kii=500.0)": "Kii",
+    'servo.replace(k="9e3")': "k",
+    "servo.replace(n=2.5)": "n",
+    "servo.controller.replace(reffff=1.0)": "reffff",
+    'servo.controller.replace(sample_rate="fast")': "sample_rate",
+    'st.limit_cycle(servo, gap="ten")': "gap",
+    "st.tune(servo, 10.0, 0.25, kin='PI')": "kin",
+    "st.stability_map(servo, gaap=(0.1,))": "gaap",
+    "st.certify(servo, gap=0.1)": "gap",
+}
+RIGHT = (
+    "run: st.Run = st.simulate(servo, 1.0, gap=0.1, reference=st.Step(1e-3), tolerance=None, seed=1)",
+    "other: st.Servo = servo.replace(k=(9e3, 9e3, 9e3), Ki=500.0, sample_rate=None)",
+    "law: st.Controller = servo.controller.replace(voltage_limit=24.0, sample_rate=5000.0)",
+    "gains: st.Controller = st.tune(servo, 10.0, 0.25).controller",
+)
+
+
+@pytest.mark.slow
+def test_mypy_finds_misspelt_keywords_and_wrong_types(tmp_path):
+    lines = ["import servotwin as st", 'servo = st.Servo.preset("paper")', *WRONG, *RIGHT]
+    (tmp_path / "snippet.py").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml")]
+    done = subprocess.run(
+        [*command, "--no-error-summary", str(tmp_path / "snippet.py")], cwd=ROOT, capture_output=True, text=True
+    )
+    found = {int(line.split(":")[1]): line for line in done.stdout.splitlines() if ": error: " in line}
+    for number, (snippet, named) in enumerate(WRONG.items(), start=3):
+        assert number in found, f"mypy accepts {snippet}"
+        assert named in found[number]
+    assert len(found) == len(WRONG), done.stdout
+
+
+def test_replace_knows_every_field_and_no_other():
+    assert set(ControllerChanges.__annotations__) == {f.name for f in fields(st.Controller)}
+    own = {f.name for f in fields(st.Servo)}
+    assert set(ServoChanges.__annotations__) == own | set(ControllerChanges.__annotations__)
+
+
+@pytest.mark.parametrize("gap", [10.0, st.SCurve(0.0, 20.0, duration=1.0)])
+def test_a_gap_in_degrees_is_refused_with_a_hint(servo, gap):
+    with pytest.raises(InvalidInput, match=r"rad .*did you mean math\.radians\((10|20)\)\?"):
+        st.simulate(servo, 1.0, gap=gap)
+    with pytest.raises(InvalidInput, match="did you mean"):
+        st.Scenario(servo, 2.0, gap=gap)
+
+
+def test_a_gap_in_degrees_is_refused_everywhere(servo):
+    for call in (
+        lambda: servo.tolerance_for(10.0),
+        lambda: st.limit_cycle(servo, 10.0),
+        lambda: simulate_ensemble(servo, 1.0, gap=[0.1, 10.0]),
+    ):
+        with pytest.raises(InvalidInput, match=r"573 deg.*math\.radians\(10\)"):
+            call()
+
+
+def test_a_gap_of_a_whole_turn_is_accepted(servo):
+    assert servo.tolerance_for(2.0 * math.pi) == 2.0 * math.pi * servo.p
+
+
+def test_reprs_fit_on_few_lines(servo, run):
+    window = st.Window.from_run(run, 0.5, 1.0)
+    estimate = st.estimate_gap(window, servo)
+    trend = st.Trend.start().update(estimate)
+    scenario = st.Scenario(servo, 10.0)
+    for value in (servo, servo.controller, run, window, estimate, trend, scenario):
+        assert len(repr(value)) < 400, repr(value)
+        assert "array(" not in repr(value)
+        assert value._repr_html_().startswith("<table>")
+    assert repr(servo).startswith(f"<Servo 'paper', model {servo.version}: 3 masses, rigid screw, Controller(Kp=")
+    assert repr(servo.replace(k=9e3, k_d=1e6)).startswith("<Servo other, model")
+    assert eval(repr(servo.controller), {"Controller": st.Controller}) == servo.controller
+    assert repr(run) == f"<Run 2 s, 2001 samples at 1000 Hz, model {servo.version}>"
+    assert repr(window) == "<Window 0.5 .. 1.5 s at 1000 Hz: position, theta_m, voltage, reference>"
+    assert repr(estimate).startswith(f"<GapEstimate {estimate.status.value}: ")
+
+
+def test_a_run_and_a_window_plot_themselves(run):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    figure = run.plot()
+    assert [ax.get_ylabel() for ax in figure.axes] == ["position, mm", "error, mm", "total gap, deg", "voltage, V"]
+    assert np.array_equal(figure.axes[0].lines[1].get_ydata(), 1e3 * run.position)
+    assert len(st.Window.from_run(run, 0.5, 1.0).plot().axes) == 4
+    pyplot.close("all")
+
+
+def test_a_run_becomes_an_arrow_table(run):
+    table = run.to_arrow()
+    assert table.column_names[:3] == ["time_s", "position_m", "measured_position_m"]
+    assert table.num_rows == run.samples
+    assert np.array_equal(table["position_m"].to_numpy(), run.position)
