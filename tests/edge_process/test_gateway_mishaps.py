@@ -37,7 +37,7 @@ CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
 class FailingFilter:
     longest_pause_s = math.inf
 
-    def check_rate(self, sample_rate: float) -> None:
+    def check(self, sample_rate: float) -> None:
         """Any rate will do."""
 
     def start(self, _saved: bytes | None = None) -> "FailingFilter":
