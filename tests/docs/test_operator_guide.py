@@ -132,7 +132,7 @@ def test_every_metric_is_explained(system: TwinService) -> None:
     explained = named("Metrics of the twin")
     assert {name for name in explained if name.startswith("servotwin_")} == told
     assert {name for name in explained if not name.startswith("servotwin_")} == calls(
-        "twin_service/dispatcher.py", "counts.add", ".add"
+        "twin_service", "counts.add", ".add"
     )
     everywhere = re.findall(r"\bservotwin_[a-z_]+", ALARM + GUIDE)
     assert set(everywhere) - told <= {"servotwin_version"}

@@ -66,7 +66,7 @@ def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -
 def test_a_lie_about_the_gap_alone_cannot_leave_the_band() -> None:
     """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be."""
     policy = CertifiedPolicy(hostile.model())
-    candidates = candidates_of(policy.servo, policy.held(), 0.0, disturbed=True, noisy=False)
+    candidates = candidates_of(policy.servo, policy.demands_within_band(), 0.0, disturbed=True, noisy=False)
     known = policy.uncertainty.replace(input_bias=(-policy.bias_floor, policy.bias_floor))
     for outcome in assess(candidates, members_of(policy.servo, known, 16, 8, seed=3), Trial()):
         assert outcome.tail.max() < hostile.band().error

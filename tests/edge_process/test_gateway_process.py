@@ -34,7 +34,7 @@ BLOCKER = """
 import sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("numpy", "scipy", "numba", "matplotlib", "typer", "rich", "fastapi", "sqlalchemy"):
+        if name.split(".")[0] in ("numpy", "scipy", "numba", "matplotlib", "typer", "rich", "uvicorn", "sqlalchemy"):
             raise ModuleNotFoundError(f"{name} is not installed here")
 sys.meta_path.insert(0, Absent())
 """
