@@ -28,7 +28,7 @@ from servotwin.messages import (
     encode,
     finite,
 )
-from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
@@ -89,7 +89,7 @@ class VerificationRecord(NamedTuple):
     """Result of verifying the setting that an update carries."""
 
     request: VerificationRequest
-    result: Certificate | Refusal
+    result: Certificate | NotVerified
 
 
 class WithdrawalRecord(NamedTuple):

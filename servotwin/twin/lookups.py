@@ -13,9 +13,9 @@ from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting, Update
-from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
-from servotwin.redesign.certified.region import Region
+from servotwin.redesign.certified.uncertainty import Region
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
@@ -46,10 +46,10 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
     @classmethod
     def of(cls, update: Update, redesign: Redesign) -> VerificationRequest | None:
         """The verification that an update still needs; None: none."""
-        if redesign.unverified is None:
+        if redesign.to_verify is None:
             return None
         assert redesign.certificate is not None
-        return cls(update.servo, update.version, update.window, redesign.unverified, redesign.certificate.setting)
+        return cls(update.servo, update.version, update.window, redesign.to_verify, redesign.certificate.setting)
 
 
 class LookupState(Struct, frozen=True):
@@ -88,7 +88,7 @@ class Lookups:
 
     def verify(
         self, state: LookupState, request: VerificationRequest, current: Sequence[Setting | None]
-    ) -> tuple[LookupState, Certificate | Refusal, str]:
+    ) -> tuple[LookupState, Certificate | NotVerified, str]:
         """Verify a setting for the evidence that it was sent on.
 
         Parameters
@@ -100,14 +100,14 @@ class Lookups:
 
         Returns
         -------
-        LookupState, Certificate or Refusal, str
+        LookupState, Certificate or NotVerified, str
             The last: why the setting is withdrawn; empty where it is not.
         """
         sent = request.setting.setting()
         if not any(setting is not None and sent.same_loop(setting) for setting in current):
-            return state, Refusal("not verified: another setting is in force by now"), ""
+            return state, NotVerified("not verified: another setting is in force by now"), ""
         result = self.policy.policy.confirm(request.region, request.setting)
-        if not isinstance(result, Refusal):
+        if not isinstance(result, NotVerified):
             return state, result, ""
         why = f"the verification of version {request.version} failed: {result.reason}"
         return LookupState(why, misled=True), result, why

@@ -16,8 +16,8 @@ from servotwin.redesign.excitation import (
     ExcitationPolicy,
     ExcitationSettings,
     ExcitationState,
-    WindowSummary,
     Stage,
+    WindowSummary,
     long_enough,
 )
 
@@ -28,7 +28,9 @@ SHORT = WindowSummary(0.0, GapStatus.UNIDENTIFIABLE, long=False, upper=20.0 * DE
 LONG = replace(SHORT, long=True)
 
 
-def run(settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None) -> list[Decision]:
+def run(
+    settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None
+) -> list[Decision]:
     policy, state, found = ExcitationPolicy(PITCH, settings), state or ExcitationState(), list[Decision]()
     for each in seen:
         found.append(policy.decide(state, each))
@@ -36,7 +38,9 @@ def run(settings: ExcitationSettings, seen: list[WindowSummary], state: Excitati
     return found
 
 
-def asks(settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None) -> list[Ask | None]:
+def asks(
+    settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None
+) -> list[Ask | None]:
     return [decision.ask for decision in run(settings, seen, state)]
 
 
