@@ -1,4 +1,4 @@
-"""The pieces of a map shared among processes: a pool on this machine, or a Dask cluster. Written once, for joblib."""
+"""Tasks shared among processes by joblib: a pool on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _R = TypeVar("_R")
 
 @contextmanager
 def workplace(workers: int | None = None, scheduler: str | None = None) -> Iterator[None]:
-    """Where `shared` finds its processes inside this block.
+    """Provide the processes of `shared` inside this block.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ def workplace(workers: int | None = None, scheduler: str | None = None) -> Itera
 
 
 def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple[_T, _R], None, None]:
-    """Each task with what `function` makes of it, as they come; close it to leave the rest undone.
+    """Apply `function` to every task; yield (task, result) in order of completion, until closed.
 
     Parameters
     ----------
     function : callable
-        Picklable; what it gives depends on the task alone.
+        Picklable; its result depends on the task alone.
     tasks : iterable
         Picklable.
     """
