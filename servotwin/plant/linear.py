@@ -15,6 +15,7 @@ from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import require
 from servotwin.plant.signals import Array
 
 Complex = NDArray[np.complex128]
@@ -144,10 +145,7 @@ class LinearSystem:
         InvalidInput
             python-control is not installed.
         """
-        try:
-            import control
-        except ImportError:
-            raise InvalidInput("python-control is not installed; give: pip install 'servotwin[interop]'") from None
+        control = require("control", "a python-control system")
         return control.ss(self.A, self.B[:, None], self.C[None, :], [[self.D]])
 
 
