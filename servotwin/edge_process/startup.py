@@ -13,8 +13,8 @@ from servotwin.edge.switch import Rules
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput
-from servotwin.runtime.extras import check_extra
 from servotwin.link.url import is_encrypted
+from servotwin.runtime.extras import check_extra
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import locked
 

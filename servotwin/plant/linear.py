@@ -15,8 +15,8 @@ from numpy.polynomial import polynomial as poly
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
-from servotwin.runtime.extras import require
 from servotwin.plant.signals import Array
+from servotwin.runtime.extras import require
 
 Complex = NDArray[np.complex128]
 # Rounding error of a fraction of polynomials, relative, beyond which the response is computed from the matrices: the
