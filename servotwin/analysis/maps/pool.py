@@ -17,6 +17,7 @@ from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import require
 
 CONNECT_TIMEOUT = 5.0
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?([^\s/:\[\]]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
@@ -109,12 +110,7 @@ def _cluster(address: str) -> Iterator[None]:
 
 
 def _connected(address: str) -> Any:
-    try:
-        import distributed
-    except ImportError:
-        raise InvalidInput(
-            f"--scheduler {address}: needs Dask, which is not installed; install it with pip install 'servotwin[dask]'"
-        ) from None
+    distributed = require("distributed", f"--scheduler {address}:")
     for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what they have to say is said once, by us
     connect: Any = distributed.Client
