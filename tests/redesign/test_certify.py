@@ -20,7 +20,7 @@ from servotwin.estimation.trend import Trend
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import STILL, Trial, assess, nearness
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
@@ -107,7 +107,7 @@ def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
     """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
     held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)
     found = certify(held, Uncertainty(gap=gaps(0, 5)), SMALL, SHORT)
-    assert isinstance(found, Refusal)
+    assert isinstance(found, NotVerified)
     assert "no gain crossover" in found.reason
     assert found.best is not None
     assert (found.best.crossover, found.best.phase_margin) == (0.0, math.pi)
@@ -227,8 +227,8 @@ def test_no_candidate_is_one_sentence() -> None:
 
 def test_what_cannot_be_proved_is_refused_with_the_best_found() -> None:
     found = certify(SERVO, Uncertainty(gap=gaps(29, 31)), replace(SMALL, overshoot=1e-6), SHORT)
-    assert isinstance(found, Refusal)
-    assert "candidates is proved: the best overshoots by" in found.reason
+    assert isinstance(found, NotVerified)
+    assert "candidates is verified: the best overshoots by" in found.reason
     assert found.best is not None
     assert found.best.overshoot > 1e-6
 
@@ -315,9 +315,9 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
     wide = rule.redesign(Evidence(estimated(10.0)))
     unit = SERVO.tolerance_for(gap_range(estimated(10.0))[1])
-    assert wide.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
+    assert wide.setting.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
     noisy = rule.redesign(Evidence(estimated(0.1), at_rest(0.0, noise=1e-3)))
-    assert noisy.tolerance == pytest.approx(3e-3)
+    assert noisy.setting.tolerance == pytest.approx(3e-3)
     assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 
