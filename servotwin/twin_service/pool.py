@@ -14,7 +14,7 @@ from servotwin.runtime.child_process import ChildProcess
 from servotwin.runtime.frames import receive_frame
 from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease
-from servotwin.twin_service import config, mqtt_config
+from servotwin.twin_service import config
 from servotwin.twin_service.job import Done, Job, Start, done_of, framed
 
 log = logging.getLogger(__name__)
@@ -176,6 +176,6 @@ class Pool:
 
 def _environment() -> Mapping[str, str]:
     """The service's, without what no worker has to know."""
-    secret = config.PASSWORD, mqtt_config.PASSWORD
+    secret = config.PASSWORD, config.MQTT_PASSWORD
     mine = {key: value for key, value in os.environ.items() if key not in secret}
     return {**mine, "OPENBLAS_NUM_THREADS": "1"}
