@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes
-from servotwin.analysis.maps.measures import joined, measured
+from servotwin.analysis.maps.measures import compute_cells
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.analysis.tuning.tune import Specification, Tuning
@@ -142,6 +140,4 @@ def stability_map(
         assert gap is not None
         axes = PhysicalAxes(tuple(gap), tuple(k_dz), tuple(amplitude or (1e-3,)), tuple(estimate))
     settings = MapSettings(servo, axes, controller, members, motion, seed, duration, window, still)
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
-        parts = list(executor.map(lambda cells: measured(settings, cells), settings.chunks))
-    return StabilityMap(settings, joined(parts))
+    return StabilityMap(settings, compute_cells(settings, threads))

@@ -18,9 +18,9 @@ import msgspec
 from servotwin.cli.audit_text import SERVOS, Told, lines_of, servo_line
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
-from servotwin.twin_service.command import present_store
-from servotwin.twin_service.read_api import MOST, shown, told
-from servotwin.twin_service.secret_file import read_secret
+from servotwin.twin_service.auth import read_secret
+from servotwin.twin_service.command import open_existing_store
+from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
 from servotwin.twin_service.twin_file import service_of
 
 TIMEOUT_S = 30.0
@@ -95,9 +95,9 @@ def servos(source: Source, json: bool) -> None:
     """
     if source.url is not None:
         ask = _asking(source)
-        found = _pages(lambda after: ask(f"/v1/servos?limit={MOST}&after={quote(after, safe='')}"))
+        found = _pages(lambda after: ask(f"/v1/servos?limit={MAX_ROWS}&after={quote(after, safe='')}"))
     else:
-        store = present_store(service_of(source.config))
+        store = open_existing_store(service_of(source.config))
         try:
             found = _pages(lambda after: [each._asdict() for each in store.servos(after)])
         finally:
@@ -119,13 +119,15 @@ def _pages(page: Callable[[str], list[Told]]) -> list[Told]:
 
 
 def _of_store(servo: str, config: Path, limit: int) -> Story:
-    store = present_store(service_of(config))
+    store = open_existing_store(service_of(config))
     try:
         links, found = store.audit(servo, limit=limit), store.servo(servo)
         if found is None or not links:
             return Story({}, [], [])
-        events = store.events(servo, _since(links[-1].window.received), MOST)
-        return Story(found._asdict(), [told(link) for link in links], [shown(each) for each in events])
+        events = store.events(servo, _since(links[-1].window.received), MAX_ROWS)
+        return Story(
+            found._asdict(), [trace_as_json(link) for link in links], [evidence_as_json(each) for each in events]
+        )
     finally:
         store.close()
 
@@ -136,7 +138,7 @@ def _of_service(servo: str, source: Source, limit: int) -> Story:
     if not links:
         return Story({}, [], [])
     since = _since(links[-1]["window"]["received"])
-    return Story(ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MOST}"))
+    return Story(ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}"))
 
 
 def _since(oldest: float) -> float:

@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
-from servotwin.analysis.limit_cycles.describing import Prediction, predictions
+from servotwin.analysis.limit_cycles.describing import Prediction, limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
-from servotwin.analysis.limit_cycles.predicted import limit_cycle_near
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 

@@ -16,7 +16,7 @@ from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.fleet import Model
 from servotwin.twin.replay import Replayed, replay
-from servotwin.twin_service.command import present_store
+from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of
 
 DEG = 180.0 / math.pi
@@ -71,7 +71,7 @@ def tell(servo: str, config: Path, window: str | None, present: bool) -> bool:
     """
     only, model = _identity(window), read_twin(config).fleet.model_of(servo) if present else None
     counts, differing = Counter[str](), Counter[str]()
-    store = present_store(service_of(config))
+    store = open_existing_store(service_of(config))
     try:
         for again in replayed(store, servo, model, only):
             counts[again.result] += 1

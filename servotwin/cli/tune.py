@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.analysis.tuning.setpoint import overshoot
-from servotwin.analysis.tuning.tune import Tuning, judged
+from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.controller import Controller
 from servotwin.design import tune, tuned_system
 from servotwin.plant.margins import Margins
@@ -59,7 +59,7 @@ def tell(request: Request, as_json: bool) -> None:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
         return
     console = Console()
-    present = judged(tuned_system(servo), servo.controller, delay)
+    present = evaluate(tuned_system(servo), servo.controller, delay)
     _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))

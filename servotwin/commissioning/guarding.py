@@ -73,7 +73,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
 
 def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Every candidate's gains and dead zone, and the middle between them."""
-    own, demands = policy.servo.controller, policy.held()
+    own, demands = policy.servo.controller, policy.demands_within_band()
     scales = [setting.controller.Kp / own.Kp for setting in candidates_of(policy.servo, demands, 0.0, True, False)]
     middle, factor = math.sqrt(min(scales) * max(scales)), math.sqrt(max(scales) / min(scales)) * _ROUNDING
     leave = max((leave for _, leave in demands.hysteresis), default=1.0)

@@ -1,4 +1,6 @@
-"""The servo as a piecewise-affine automaton: backlash times friction times controller zone, inputs as exosystem states.
+"""The servo as a piecewise-affine automaton: contact times stick-slip times controller zone.
+
+Inputs are exosystem states.
 
 With a continuous controller the zones are dead zone {-, inside, +} times optional saturation {low, linear, high}; with
 a sampled one there is a single zone and the voltage is a state that the tick sets. Friction modes, and the states of
@@ -7,25 +9,25 @@ what is constant, exist only where they are asked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array, Automaton, Guard, Mode
-from servotwin.plant.basis import Basis, input_names, plant_names
-from servotwin.plant.mechanics import OPEN, Grip, Play, flow_of, grip_endings, grips, play_endings, plays
+from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, screw_rate
+from servotwin.plant.basis import Basis, GuardRow, input_names, plant_names
+from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.plant.zones import Zone, controller_zones
 
 INPUTS = ("reference", "gap", "tolerance")
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What decides which states and modes exist.
+    """Switches and degrees that decide which states and modes exist.
 
     Parameters
     ----------
@@ -62,19 +64,19 @@ class ServoAutomaton:
         Output name to (M, n) rows: q1..qn, position, theta_m, theta_d, voltage, reference, gap, tolerance, error.
     zones : tuple of str
         Names of the controller's zones.
-    grips : int
-        Number of modes of the friction, the first at rest; mode = (mode of the backlash * grips + mode of the friction)
-        * len(zones) + zone.
+    frictions : int
+        Number of stick-slip modes, the first at rest; mode = (contact mode * frictions + stick-slip mode) * len(zones)
+        + zone.
     """
 
     automaton: Automaton
     rows: dict[str, Array]
     zones: tuple[str, ...]
-    grips: int = 1
+    frictions: int = 1
     opened: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        count = self.grips * len(self.zones)
+        count = self.frictions * len(self.zones)
         # Where the gap jumps, contact is lost unless the open mode finds it again.
         object.__setattr__(
             self, "opened", tuple(OPEN * count + mode % count for mode in range(len(self.automaton.modes)))
@@ -82,7 +84,7 @@ class ServoAutomaton:
 
     def mode(self, zone: str) -> int:
         """The open mode, the motor at rest, in a zone of the controller."""
-        return OPEN * self.grips * len(self.zones) + self.zones.index(zone)
+        return OPEN * self.frictions * len(self.zones) + self.zones.index(zone)
 
     def input_values(self, name: str, coefficients: Array) -> dict[int, float]:
         """States of an input at the start of a cubic piece with ascending `coefficients`: its value and derivatives."""
@@ -113,10 +115,10 @@ def _continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Serv
     sensed = basis.positions(servo)[-1] + basis.row("noise")
     measured = basis.row("filtered") if controller.loop_filter_hz else sensed
     error = basis.row("reference") - measured
-    system = _System(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
+    system = _System(servo, basis, _controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
-    for play, grip, zone in system.places:
-        flow = flow_of(servo, basis, play, grip, zone.voltage)
+    for contact, stick_slip, zone in system.places:
+        flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
         flow[basis["integral"]], flow[basis["derivative"]] = zone.integral, zone.derivative
         if controller.loop_filter_hz:
             rate = 2.0 * np.pi * controller.loop_filter_hz
@@ -134,7 +136,92 @@ def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: b
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
     system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero),), friction)
-    return system.assembled([flow_of(servo, basis, play, grip, zone.voltage) for play, grip, zone in system.places])
+    return system.assembled(
+        [
+            mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
+            for contact, stick_slip, zone in system.places
+        ]
+    )
+
+
+def mechanical_flow(
+    servo: Servo, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
+) -> Array:
+    """(N, N) flow of motor, screw, chain and input chains in one mode; other rows are zero."""
+    flow = np.zeros((len(basis.names), len(basis.names)))
+    chain, (A, B, E) = servo.chain(), servo.motor()
+    size, first, screw = chain.A.shape[0], basis["chain0"], basis["theta_d"]
+    states = slice(first, first + size)
+    flow[:3, :3] = A
+    flow[:3] += np.outer(B, voltage + basis.row("input bias")) - np.outer(E, stick_slip.side * basis.row("friction"))
+    flow[screw] = screw_rate(basis, contact)
+    flow[states, states] = chain.A
+    flow[states] += servo.p * (
+        np.outer(chain.B_position, basis.row("theta_d")) + np.outer(chain.B_velocity, flow[screw])
+    )
+    if contact.resting:
+        flow[basis["speed"]] = 0.5 * contact.side * basis.row("gap''")
+    elif contact.side:
+        force = chain.reaction_position * servo.p * basis.row("theta_d")
+        force[states] += chain.reaction
+        flow[:3] -= servo.p * np.outer(E, force)
+    if stick_slip.stuck:
+        flow[basis["speed"]] = 0.0
+    for name in basis.names:
+        if name + "'" in basis:
+            flow[basis[name]] = basis.row(name + "'")
+    return flow
+
+
+@dataclass(frozen=True)
+class Zone:
+    """One linear piece of the controller: rows of the voltage and of its states' derivatives, and its guards."""
+
+    name: str
+    voltage: Array
+    integral: Array
+    derivative: Array
+    guards: tuple[GuardRow, ...] = ()
+
+
+def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
+    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added."""
+    always = basis.row("feedforward") + basis.row("offset")
+    slope = error - basis.row("derivative")
+    unlimited = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
+    tolerance = basis.row("tolerance")
+    back_calculation = 1.0 / max(controller.tracking, controller.Tf * 1e-3)
+    zones: list[Zone] = []
+    for side in (-1, 1) if dead_zone else (0,):
+        name = {-1: "-", 0: "on", 1: "+"}[side]
+        guards = (GuardRow(controller.enter * tolerance - side * error, "inside", None, "enter", side),) if side else ()
+        linear = Zone(name, unlimited, controller.Ki * error, slope / controller.Tf, guards)
+        zones += _saturated(linear, basis, back_calculation)
+    if dead_zone:
+        leave = tuple(
+            GuardRow(s * error - controller.leave * tolerance, "+" if s > 0 else "-", None, "leave", s) for s in (1, -1)
+        )
+        zero = np.zeros(len(basis.names))
+        inside = Zone("inside", always, zero, -basis.row("derivative") / controller.Tf, leave)
+        zones += _saturated(inside, basis, 0.0) if always.any() else [inside]
+    return tuple(zones)
+
+
+def _saturated(zone: Zone, basis: Basis, rate: float) -> list[Zone]:
+    """A linear zone, and with a voltage limit its two saturated ones with back-calculation at a rate (1/s)."""
+    if "voltage limit" not in basis:
+        return [zone]
+    limit, unlimited = basis.row("voltage limit"), zone.voltage
+    ends = tuple(
+        GuardRow(side * unlimited - limit, zone.name + suffix, None, "saturate", side)
+        for side, suffix in ((1, " high"), (-1, " low"))
+    )
+    zones = [replace(zone, guards=(*zone.guards, *ends))]
+    for side, suffix in ((1, " high"), (-1, " low")):
+        leave = (*zone.guards, GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0))
+        integral = zone.integral + rate * (side * limit - unlimited)
+        zones.append(Zone(zone.name + suffix, side * limit, integral, zone.derivative, leave))
+    return zones
 
 
 def _loop_names(servo: Servo, controller: Controller, shape: Shape) -> list[str]:
@@ -151,39 +238,48 @@ def _constants(bias: bool, friction: bool) -> list[str]:
 
 
 class _System:
-    """Every combination of backlash, friction and zone, in the order of the modes."""
+    """Every combination of contact mode, stick-slip mode and zone, in the order of the modes."""
 
     def __init__(self, servo: Servo, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
         self.servo, self.basis, self.zones = servo, basis, zones
-        self.plays, self.grips = plays(servo), grips(servo, friction)
-        self.places = [(play, grip, zone) for play in self.plays for grip in self.grips for zone in zones]
-        self.names = [(play.name, grip.name, zone.name) for play, grip, zone in self.places]
+        self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
+        self.places = [
+            (contact, stick_slip, zone) for contact in self.contacts for stick_slip in self.frictions for zone in zones
+        ]
+        self.names = [(contact.name, stick_slip.name, zone.name) for contact, stick_slip, zone in self.places]
 
     def assembled(self, flows: list[Array], **rows: Array) -> ServoAutomaton:
         """The automaton with these flows, and `rows` among its outputs."""
         modes = tuple(
-            Mode(flow, self._guards(*place), "/".join(filter(None, names)))
-            for flow, place, names in zip(flows, self.places, self.names, strict=True)
+            Mode(flow, self._guards(contact, stick_slip, zone), "/".join(filter(None, names)))
+            for flow, (contact, stick_slip, zone), names in zip(flows, self.places, self.names, strict=True)
         )
         outputs = self._outputs() | {name: np.tile(row, (len(modes), 1)) for name, row in rows.items()}
         names = tuple(zone.name for zone in self.zones)
-        return ServoAutomaton(Automaton(modes, self.basis.names), outputs, names, len(self.grips))
+        return ServoAutomaton(Automaton(modes, self.basis.names), outputs, names, len(self.frictions))
 
-    def _guards(self, play: Play, grip: Grip, zone: Zone) -> tuple[Guard, ...]:
-        found = [
-            Guard(row, self.names.index((play.name, grip.name, target)), None, label, side)
-            for row, target, label, side in zone.guards
-        ]
+    def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> tuple[Guard, ...]:
+        ends = [(guard, (contact.name, stick_slip.name, guard.target)) for guard in zone.guards]
         # Friction first: where the motor stops on a flank, the screw stays in contact.
-        found += [
-            Guard(row, self.names.index((play.name, target, zone.name)), reset, label, side)
-            for row, target, reset, label, side in grip_endings(self.servo, self.basis, grip)
+        ends += [
+            (guard, (contact.name, guard.target, zone.name))
+            for guard in stick_slip_guards(self.servo, self.basis, stick_slip)
         ]
-        found += [
-            Guard(row, self.names.index((target, grip.name, zone.name)), reset, label, side)
-            for row, target, reset, label, side in play_endings(self.servo, self.basis, play, grip, zone.voltage)
+        stopping = stopping_speed(self.servo, self.basis, stick_slip)
+        sides = (0, contact.side) if contact.resting else ()
+        accelerations = [self._acceleration(side, zone) for side in sides]
+        ends += [
+            (guard, (guard.target, stick_slip.name, zone.name))
+            for guard in contact_guards(self.servo, self.basis, contact, stopping, accelerations)
         ]
-        return tuple(found)
+        return tuple(
+            Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
+        )
+
+    def _acceleration(self, side: int, zone: Zone) -> Array:
+        """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
+        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), StickSlipMode(""), zone.voltage)
+        return np.asarray(flow[self.basis["speed"]])
 
     def _outputs(self) -> dict[str, Array]:
         rows = {f"q{i + 1}": row for i, row in enumerate(self.basis.positions(self.servo))}

@@ -1,5 +1,7 @@
 """The gap of the lead screw as a play operator: the screw rests until the motor's side of the gap pushes it.
 
+Sample by sample (`play`), and as the contact modes {-, open, +} of the servo's automaton.
+
 theta_d is clamped to [theta_m - b, theta_m + b], b half the TOTAL gap. This is Eqs 16-18 read as the results need them:
 theta_b there is the total gap (errata E2, E3 and E4): nothing jumps at a reversal, a growing gap
 never moves the screw, and a shrinking one pushes it.
@@ -7,11 +9,16 @@ never moves the screw, and a shrinking one pushes it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
+from servotwin.plant.basis import Basis, GuardRow
+from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 
@@ -69,3 +76,79 @@ def play(theta_m: ArrayLike, gap: ArrayLike, theta_d0: float = 0.0) -> Array:
         first = int(np.argmax(half < 0.0))
         raise InvalidInput(f"gap = {2.0 * half[first]:.6g} rad at sample {first} is negative; it must be 0 rad or more")
     return play_samples(angles, half, float(theta_d0))
+
+
+@dataclass(frozen=True)
+class ContactMode:
+    """A mode of the backlash: pressed against the flank of a side, resting there under part of the load, or open (side
+    0)."""
+
+    name: str
+    side: int
+    resting: bool = False
+
+
+_RIGID = (ContactMode("-", -1), ContactMode("open", 0), ContactMode("+", 1))
+# A load that acts back would push a slow motor off its flank, and nothing would keep it off: between the two it rests
+# there under part of the load (the sliding mode of this automaton).
+_ELASTIC = (*_RIGID, ContactMode("held -", -1, resting=True), ContactMode("held +", 1, resting=True))
+OPEN = 1
+"""Index of the open mode."""
+
+
+def contact_modes(servo: Servo) -> tuple[ContactMode, ...]:
+    """All modes of the backlash."""
+    return _RIGID if servo.rigid else _ELASTIC
+
+
+def screw_rate(basis: Basis, contact: ContactMode) -> Array:
+    """theta_d' of the play operator: in contact with the motor, less the half gap's own rate; zero in the gap and at
+    rest on a flank (facts E3, E4)."""
+    if contact.side == 0 or contact.resting:
+        return np.zeros(len(basis.names))
+    return basis.row("speed") - 0.5 * contact.side * basis.row("gap'")
+
+
+def contact_guards(
+    servo: Servo, basis: Basis, contact: ContactMode, stopping: Array | float, accelerations: Sequence[Array]
+) -> list[GuardRow]:
+    """Guards that end a mode of the backlash.
+
+    Parameters
+    ----------
+    stopping : (N,) row or 0.0
+        Speed at which a sliding motor has stopped.
+    accelerations : sequence of (N,) rows
+        Of the motor free of the load, and under all of it; needed at rest on a flank only.
+    """
+    side = contact.side
+    if side == 0:
+        apart = basis.row("theta_m") - basis.row("theta_d")
+        return [
+            GuardRow(
+                s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", _contact_reset(servo, basis, s), "contact", s
+            )
+            for s in (1, -1)
+        ]
+    flank = "+" if side > 0 else "-"
+    if contact.resting:
+        # Away from the flank's own acceleration.
+        free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
+        return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
+    reset = _contact_reset(servo, basis, side)
+    release = -side * screw_rate(basis, contact) - stopping
+    if servo.rigid:
+        return [GuardRow(release, "open", reset, "release", side)]
+    reset[basis["speed"]] = 0.5 * side * basis.row("gap'")
+    return [GuardRow(release, f"held {flank}", reset, "hold", side)]
+
+
+def _contact_reset(servo: Servo, basis: Basis, side: int) -> Array:
+    """Put the screw on its flank; the chain's damper turns a jump of the screw into one of velocity (Eq 10)."""
+    reset = np.eye(len(basis.names))
+    moved = basis.row("theta_m") - 0.5 * side * basis.row("gap") - basis.row("theta_d")
+    chain = servo.chain()
+    reset[basis["theta_d"]] += moved
+    first = basis["chain0"]
+    reset[first : first + chain.A.shape[0]] += servo.p * np.outer(chain.B_velocity, moved)
+    return reset

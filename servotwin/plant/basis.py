@@ -1,6 +1,8 @@
-"""Names of the states of the servo's automaton, and the rows that pick them."""
+"""Names of the states of the servo's automaton, the rows that pick them, and guards made of such rows."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,8 +10,18 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 
+class GuardRow(NamedTuple):
+    """A guard of one component of the automaton: its row, the component's mode entered, reset, label and side."""
+
+    row: Array
+    target: str
+    reset: Array | None
+    label: str
+    side: int
+
+
 class Basis:
-    """The states by name."""
+    """States of an automaton by name."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         # Spare states that never move: the kernel's products run over whole vectors of the machine.

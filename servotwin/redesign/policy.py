@@ -10,7 +10,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.region import Region
+from servotwin.redesign.certified.uncertainty import Region
 from servotwin.redesign.evidence import Evidence
 
 
@@ -27,16 +27,16 @@ class Redesign:
     reason : str
         Why the controller is left as it is; empty otherwise.
     certificate : Certificate, optional
-        What the setting showed in simulation.
-    owed : Region, optional
-        What the setting is still to be proved for; None: nothing is. The certificate is of a wider one then.
+        Results of the setting in simulation.
+    to_verify : Region, optional
+        Region for which the setting is still to be verified exactly, its certificate being of a wider one; None: none.
     """
 
     setting: Setting | None
     gap: float
     reason: str
     certificate: Certificate | None = None
-    owed: Region | None = None
+    to_verify: Region | None = None
 
 
 class Policy(Protocol):

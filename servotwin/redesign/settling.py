@@ -7,15 +7,14 @@ settled too.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.analysis.maps.axes import RatioAxes
-from servotwin.analysis.maps.measures import joined, measured
+from servotwin.analysis.maps.measures import compute_cells
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
@@ -71,6 +70,5 @@ def settling_map(servo: Servo) -> SettlingMap:
     axes = RatioAxes(tuple((_UNITS * _K_DZ).tolist()), tuple((_UNITS * _STEPS).tolist()), _GAP)
     still = _STILL * servo.p * _GAP
     settings = MapSettings(servo, axes, members=_STARTS, motion=0.0, duration=_DURATION, window=_LAST, still=still)
-    with ThreadPoolExecutor() as pool:
-        found = joined(list(pool.map(partial(measured, settings), settings.chunks)))
+    found = compute_cells(settings)
     return SettlingMap(_K_DZ, _STEPS, (found.settled == 1.0).reshape(axes.shape))

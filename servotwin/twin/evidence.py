@@ -25,7 +25,7 @@ from servotwin.messages import (
     encode,
     finite,
 )
-from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
@@ -152,7 +152,7 @@ class Rows:
         """A proof that is still to come."""
         self.questions.append(question)
 
-    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+    def add_proof(self, question: Question, found: Certificate | NotVerified) -> None:
         """What a proof showed of the setting that an update carries."""
         shown = found if isinstance(found, Certificate) else found.best
         body = {"question": question, "certificate": shown and _timeless(shown)}

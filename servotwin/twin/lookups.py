@@ -10,9 +10,9 @@ from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting, Update
-from servotwin.redesign.certified.certificate import Refusal
+from servotwin.redesign.certified.certificate import NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
-from servotwin.redesign.certified.region import Region
+from servotwin.redesign.certified.uncertainty import Region
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
@@ -96,11 +96,11 @@ class Lookups:
         """
         wanted = question.setting.setting()
         if not any(one is not None and wanted.same_loop(one) for one in running):
-            store.add_proof(question, Refusal("not proved: another setting is in force by now"))
+            store.add_proof(question, NotVerified("not proved: another setting is in force by now"))
             return ""
         found = self.policy.policy.confirm(question.region, question.setting)
         store.add_proof(question, found)
-        if not isinstance(found, Refusal):
+        if not isinstance(found, NotVerified):
             return ""
         why = f"the proof of version {question.version} failed: {found.reason}"
         self.memory = Memory(why, misled=True)
@@ -110,9 +110,9 @@ class Lookups:
 
 def question_of(update: Update, redesign: Redesign) -> Question:
     """What is to be proved of an update that was made of a redesign with a proof owed."""
-    assert redesign.owed is not None
+    assert redesign.to_verify is not None
     assert redesign.certificate is not None
-    return Question(update.servo, update.version, update.window, redesign.owed, redesign.certificate.setting)
+    return Question(update.servo, update.version, update.window, redesign.to_verify, redesign.certificate.setting)
 
 
 def encode_question(question: Question) -> bytes:

@@ -9,7 +9,7 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Answer, Fallback, Hello, Receipt, Request, Update, Window
-from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.twin.glance import Glance
@@ -79,7 +79,7 @@ class Store(Protocol):
         """Keep that a proof is still to come, and see to it."""
         ...
 
-    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+    def add_proof(self, question: Question, found: Certificate | NotVerified) -> None:
         """Keep what a proof showed."""
         ...
 
@@ -106,7 +106,7 @@ class MemoryStore:
     requests: list[Request] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
     questions: list[Question] = field(default_factory=list)
-    proofs: list[tuple[Question, Certificate | Refusal]] = field(default_factory=list)
+    proofs: list[tuple[Question, Certificate | NotVerified]] = field(default_factory=list)
     withdrawn: list[tuple[Question, str]] = field(default_factory=list)
 
     def add_window(self, window: Window) -> bool:
@@ -167,7 +167,7 @@ class MemoryStore:
         """Keep a question."""
         self.questions.append(question)
 
-    def add_proof(self, question: Question, found: Certificate | Refusal) -> None:
+    def add_proof(self, question: Question, found: Certificate | NotVerified) -> None:
         """Keep a proof."""
         self.proofs.append((question, found))
 

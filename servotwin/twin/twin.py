@@ -229,7 +229,7 @@ class Twin:
         self._tuned_for = redesign.gap
         update = self._versions.issue(draft(message, estimate, redesign, self.settings.validity))
         sent = self._send(update, now)
-        if redesign.owed is not None:
+        if redesign.to_verify is not None:
             self._store.add_question(question_of(update, redesign))
         return sent + asked
 

@@ -1,31 +1,62 @@
-"""Who may do what: a servo's token speaks for that servo, an operator's reads everything."""
+"""Authentication and authorisation: tokens, the file of their digests, and files that only their owner may read.
+
+A servo's token speaks for that servo; an operator's token reads everything.
+"""
 
 from __future__ import annotations
 
 import hmac
 import logging
+import re
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from servotwin.config.table import Table, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
-from servotwin.messages import Refusal
-from servotwin.twin_service.refused import Refused
-from servotwin.twin_service.tokens import Verifiers, read_tokens
+from servotwin.messages import NAME_PATTERN, Refusal
+from servotwin.runtime.files import replace_file
+from servotwin.runtime.locks import lock_beside, locked
+from servotwin.twin_service.limits import RateLimiter, RequestRejected
 
 log = logging.getLogger(__name__)
 
-NOBODY = bytes(32)
-"""No token has this verifier: compared with where there is none, so that a guess takes as long."""
-OPEN = verifier_of("")
+PRIVATE = 0o600
+"""Mode of files that only their owner may read."""
+_HEAD = "# Digests of tokens, as precious as the tokens themselves: for the service's own eyes.\n"
+_VERIFIER = re.compile(r"[0-9a-f]{64}")
+_NO_VERIFIER = bytes(32)
+"""Verifier of no token: compared with where a servo has none, so that a guess takes as long."""
+_OPEN = verifier_of("")
 """Seals messages where there are no tokens: an edge without a token has the empty one."""
-LONGEST = 1024
-"""Characters of a token at most."""
+_MAX_TOKEN = 1024
+"""Characters."""
 _MISSING = "a token is needed: Authorization: Bearer TOKEN"
 _WRONG = "the token is not that of this servo"
 _FOREIGN = "the token belongs to another name: it may not do this"
 
 
-class Authority:
+@dataclass(frozen=True)
+class Verifiers:
+    """Digests of the tokens that count.
+
+    Attributes
+    ----------
+    servos, operators : mapping of str to bytes
+        Name to `link.seal.verifier_of` its token.
+    """
+
+    servos: Mapping[str, bytes] = field(default_factory=dict)
+    operators: Mapping[str, bytes] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Verifiers({len(self.servos)} servos, {len(self.operators)} operators)"
+
+
+class AccessControl:
     """Checks tokens.
 
     Parameters
@@ -35,70 +66,109 @@ class Authority:
     """
 
     def __init__(self, verifiers: Verifiers | None) -> None:
-        self.adopt(verifiers)
+        self.replace(verifiers)
 
-    def adopt(self, verifiers: Verifiers | None) -> None:
-        """From now on these count."""
+    def replace(self, verifiers: Verifiers | None) -> None:
+        """Replace the verifiers."""
         self._verifiers = verifiers
         known = [] if verifiers is None else [*verifiers.servos.values(), *verifiers.operators.values()]
         self._known = frozenset(known)
 
-    def admit_servo(self, servo: str, token: bytes | None) -> None:
-        """Let a servo's own token speak for it.
+    def check_servo(self, servo: str, token: bytes | None) -> None:
+        """Check that a token is that of a servo.
 
         Raises
         ------
-        Refused
+        RequestRejected
             401 without a token or with an unknown one, 403 with another's.
         """
         if self._verifiers is None:
             return
         verifier = _digest(token)
-        if not hmac.compare_digest(verifier, self._verifiers.servos.get(servo, NOBODY)):
-            raise self._refused(verifier, _WRONG)
+        if not hmac.compare_digest(verifier, self._verifiers.servos.get(servo, _NO_VERIFIER)):
+            raise self._rejected(verifier, _WRONG)
 
-    def admit_operator(self, token: bytes | None) -> None:
-        """Let an operator's token read everything; raises Refused as `admit_servo` does."""
+    def check_operator(self, token: bytes | None) -> None:
+        """Check that a token is an operator's; raises RequestRejected as `check_servo` does."""
         if self._verifiers is None:
             return
         verifier = _digest(token)
         matches = [hmac.compare_digest(verifier, known) for known in self._verifiers.operators.values()]
         if not any(matches):
-            raise self._refused(verifier, "the token is not an operator's")
+            raise self._rejected(verifier, "the token is not an operator's")
 
     def verifier(self, servo: str) -> bytes | None:
-        """With which messages to a servo are sealed; None where it has no token any more."""
-        return OPEN if self._verifiers is None else self._verifiers.servos.get(servo)
+        """Verifier with which messages to a servo are sealed; None: its token was revoked."""
+        return _OPEN if self._verifiers is None else self._verifiers.servos.get(servo)
 
-    def _refused(self, verifier: bytes, wrong: str) -> Refused:
-        known = verifier in self._known
-        return Refused(Refusal.BAD_TOKEN, _FOREIGN if known else wrong, 403 if known else 401)
+    def _rejected(self, verifier: bytes, detail: str) -> RequestRejected:
+        if verifier in self._known:
+            return RequestRejected(Refusal.BAD_TOKEN, _FOREIGN, 403)
+        return RequestRejected(Refusal.BAD_TOKEN, detail, 401)
+
+
+class EdgeGate:
+    """Checks of a request for a servo that come before its body is read: token, name and message rate.
+
+    Parameters
+    ----------
+    access : AccessControl
+    knows : callable
+        Test whether a servo of that name belongs to this twin.
+    limiter : RateLimiter
+    """
+
+    def __init__(self, access: AccessControl, knows: Callable[[str], bool], limiter: RateLimiter) -> None:
+        self._access, self._knows, self._limiter = access, knows, limiter
+
+    def admit(self, servo: str, token: bytes | None, *, limited: bool = True) -> None:
+        """Check the token, the name and, if `limited`, the message rate of a servo; raises RequestRejected."""
+        self._access.check_servo(servo, token)
+        self.admit_authenticated(servo, limited=limited)
+
+    def admit_authenticated(self, servo: str, *, limited: bool = True) -> None:
+        """`admit` for a servo whose seal was checked already."""
+        if not self._knows(servo):
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo[:64]!r} is not looked after here")
+        if limited:
+            self._limiter.take(servo)
+
+    def find_verifier(self, servo: str) -> bytes | None:
+        """Verifier of a servo's token; None: it has none."""
+        return self._access.verifier(servo)
+
+    def verifier(self, servo: str) -> bytes:
+        """Verifier with which messages to the servo are sealed; raises RequestRejected where its token was revoked."""
+        found = self._access.verifier(servo)
+        if found is None:
+            raise RequestRejected(Refusal.BAD_TOKEN, "the token of this servo was taken away")
+        return found
 
 
 class TokenFile:
-    """Follows the file of tokens, so that `servotwin enroll` needs no restart; a broken one changes nothing."""
+    """Watches the file of tokens, so that `servotwin enroll` needs no restart; an invalid file changes nothing."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # First: what is written while it is read is then read again.
-        self._seen = self._stamp()
-        self.authority = Authority(read_tokens(path))
+        # Before reading: a file that is replaced meanwhile is then read again.
+        self._stamp = self._stat()
+        self.access = AccessControl(read_tokens(path))
 
     def refresh(self) -> bool:
-        """Read the file again if it was replaced; whether it counts now."""
-        stamp = self._stamp()
-        if stamp == self._seen:
+        """Read the file again if it was replaced; returns whether its tokens were adopted."""
+        stamp = self._stat()
+        if stamp == self._stamp:
             return False
-        self._seen = stamp
+        self._stamp = stamp
         try:
-            self.authority.adopt(read_tokens(self.path))
+            self.access.replace(read_tokens(self.path))
         except (InvalidInput, OSError) as error:
             log.error("tokens not read again: the former ones stay", extra={"why": str(error)})
             return False
         log.info("tokens read again")
         return True
 
-    def _stamp(self) -> tuple[int, int, int] | None:
+    def _stat(self) -> tuple[int, int, int] | None:
         try:
             found = self.path.stat()
         except OSError:
@@ -106,8 +176,8 @@ class TokenFile:
         return found.st_ino, found.st_mtime_ns, found.st_size
 
 
-def bearer(header: bytes | None) -> bytes | None:
-    """The token in an Authorization header; None: there is none."""
+def bearer_token(header: bytes | None) -> bytes | None:
+    """Token in an Authorization header; None: there is none."""
     if header is None or header[:7].lower() != b"bearer ":
         return None
     return header[7:].strip() or None
@@ -115,7 +185,103 @@ def bearer(header: bytes | None) -> bytes | None:
 
 def _digest(token: bytes | None) -> bytes:
     if token is None:
-        raise Refused(Refusal.BAD_TOKEN, _MISSING)
-    if len(token) > LONGEST or not token.isascii():
-        raise Refused(Refusal.BAD_TOKEN, "the token is not one that this service gives out")
+        raise RequestRejected(Refusal.BAD_TOKEN, _MISSING)
+    if len(token) > _MAX_TOKEN or not token.isascii():
+        raise RequestRejected(Refusal.BAD_TOKEN, "the token is not one that this service gives out")
     return verifier_of(token.decode("ascii"))
+
+
+def read_tokens(path: Path) -> Verifiers:
+    """Read the verifiers in a file of mode 0600.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, is readable by others, or holds something that is not a name or not a verifier. The
+        message does not repeat its content.
+    """
+    if not path.exists():
+        raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
+    check_private(path)
+    if not path.read_bytes().strip():
+        return Verifiers()
+    table = read_toml(path)
+    found = Verifiers(_read_verifiers(table.table("servos")), _read_verifiers(table.table("operators")))
+    table.done()
+    owner: dict[bytes, str] = {}
+    for name, verifier in [*found.servos.items(), *found.operators.items()]:
+        if verifier in owner:
+            raise InvalidInput(f"{path}: {owner[verifier]!r} and {name!r} have the same token")
+        owner[verifier] = name
+    return found
+
+
+def write_tokens(path: Path, verifiers: Verifiers) -> None:
+    """Replace the file atomically, mode 0600; raises InvalidInput where that fails."""
+    tables = {"servos": verifiers.servos, "operators": verifiers.operators}
+    parts = [
+        f"[{name}]\n" + "".join(f'"{key}" = "{value.hex()}"\n' for key, value in sorted(entries.items()))
+        for name, entries in tables.items()
+    ]
+    write_private(path, _HEAD + "\n".join(parts))
+
+
+@contextmanager
+def tokens_locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a file of tokens, to read and replace it; raises InvalidInput where no lock can be made."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked(lock_beside(path), wait=True))
+        except OSError as error:
+            raise InvalidInput(f"{lock_beside(path)}: cannot be made ({error.strerror})") from None
+        yield
+
+
+def _read_verifiers(table: Table) -> dict[str, bytes]:
+    return {name: _read_verifier(table, name) for name in table.values}
+
+
+def _read_verifier(table: Table, name: str) -> bytes:
+    if re.fullmatch(NAME_PATTERN, name) is None:
+        raise InvalidInput(
+            f"{table.source}: [{table.name}] has an entry {name[:80]!r}: a name has 1 to 64 letters, digits, . _ or -"
+        )
+    value = table.values[name]
+    if not isinstance(value, str) or _VERIFIER.fullmatch(value) is None:
+        raise InvalidInput(
+            f"{table.source}: {table.path(name)} is no verifier: `servotwin enroll` writes 64 hex digits"
+        )
+    return bytes.fromhex(value)
+
+
+def read_secret(path: Path) -> str:
+    """Read a private file, without surrounding white space.
+
+    Raises
+    ------
+    InvalidInput
+        It cannot be read, or others than its owner may read it.
+    """
+    check_private(path)
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput(f"{path}: cannot be read ({error})") from None
+
+
+def check_private(path: Path) -> None:
+    """Refuse a file that others than its owner may read or write; raises InvalidInput."""
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
+    if mode & 0o077:
+        raise InvalidInput(f"{path}: has mode {mode:04o}, so that others may open it; make it 0600: chmod 600 {path}")
+
+
+def write_private(path: Path, text: str) -> None:
+    """Write a file of mode 0600 atomically and durably; raises InvalidInput where that fails."""
+    try:
+        replace_file(path, text.encode(), durable=True, mode=PRIVATE)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be written ({error.strerror or error})") from None

@@ -16,7 +16,7 @@ from servotwin.errors import InvalidInput
 from servotwin.link.broker import Broker
 from servotwin.link.url import is_here
 from servotwin.messages import MAX_BYTES
-from servotwin.twin_service.secret_file import read_secret
+from servotwin.twin_service.auth import read_secret
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
 """Environment variable with the password of the store."""

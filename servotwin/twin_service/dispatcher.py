@@ -1,7 +1,7 @@
-"""Who works on what: servos with something to do are claimed, worked on by a pool, and their outcomes committed.
+"""Dispatcher: leases servos with pending work, has workers process them, commits the results.
 
-A claim is a loan. Whatever happens to a worker, or to this process, a message stays unprocessed until an outcome that
-covers it is committed, and that happens once.
+Whatever happens to a worker, or to this process, a message stays unprocessed until a result that covers it is
+committed, and that happens once.
 """
 
 from __future__ import annotations
@@ -11,253 +11,304 @@ import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import EvidenceRecord, Lease, MessageKind, WorkResult
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.job import Done
-from servotwin.twin_service.metrics import Metrics
-from servotwin.twin_service.pool import Pool, Worker, WorkerLost
-from servotwin.twin_service.proofs import Allowance
-from servotwin.twin_service.shelf import Shelf
+from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.worker import LeaseResult
+from servotwin.twin_service.worker_pool import WorkerLost, WorkerPool, WorkerProcess
 
 log = logging.getLogger(__name__)
 
-LEASE_S, REST_S, PAUSE_S = 120.0, 0.5, 1.0
-SERVOS, MESSAGES = 16, 16
+LEASE_S, _POLL_S, _RETRY_S = 120.0, 0.5, 1.0
+_SERVOS, _MESSAGES = 16, 16
 """Servos in one job, and messages of each."""
+_MAX_STEPS = 64
+"""Results that one lock-step request may lead to."""
 QUIET = ("glance", "trend", "disturbance", "excitation")
-"""Evidence that comes with every window."""
+"""Evidence of every window: logged at level debug."""
 ALARMS = ("failed", "fallback", "withdrawn")
-"""What somebody should look at."""
+"""Evidence that somebody should look at: logged as warnings."""
 
 
-class Parts(NamedTuple):
-    """What a dispatcher works with.
-
-    Attributes
-    ----------
-    store : Store
-    shelf : Shelf
-    pool : Pool
-    commit : callable
-        Outcome -> whether it was valid, once that is committed; raises StoreUnavailable.
-    posted : callable
-        Told the servo for which there are new messages.
-    metrics : Metrics
-    clocks : Clocks
-    """
-
-    store: Store
-    shelf: Shelf
-    pool: Pool
-    commit: Callable[[WorkResult], Awaitable[bool]]
-    posted: Callable[[str], None]
-    metrics: Metrics
-    clocks: Clocks
+class NoResult(Exception):
+    """A worker failed, or its result could not be committed; the messages stay unprocessed."""
 
 
-class Dispatcher:
-    """Keeps the pool busy.
+class VerificationQuota:
+    """Token bucket for verifications, two at most.
 
     Parameters
     ----------
-    parts : Parts
-    owner : str
-        Borrows under this name.
-    proofs : Allowance
-        How many proofs may be begun.
+    per_minute : float
+        0: none is started.
     """
 
-    def __init__(self, parts: Parts, owner: str, proofs: Allowance) -> None:
-        self._parts, self._owner, self._proofs = parts, owner, proofs
-        self._came = asyncio.Event()
+    MAX = 2.0
+
+    def __init__(self, per_minute: float) -> None:
+        self._rate = per_minute / 60.0
+        self._level, self._at = (self.MAX if per_minute else 0.0), 0.0
+
+    def refill(self, now: float) -> bool:
+        """Refill up to `now` (s, monotonic); returns whether a verification may be started."""
+        passed, self._at = (max(0.0, now - self._at) if self._at else 0.0), now
+        self._level = min(self.MAX, self._level + self._rate * passed)
+        return self._level >= 1.0
+
+    def take(self) -> None:
+        """Count a verification that was started."""
+        self._level -= 1.0
+
+
+class Dispatcher:
+    """Keeps the worker pool busy.
+
+    Parameters
+    ----------
+    store, executor : Store, StoreExecutor
+    pool : WorkerPool
+    commit : callable
+        Commits a WorkResult; False: it is void. Raises StoreUnavailable.
+    notify : callable
+        Called with a servo that has new outgoing messages.
+    metrics : Metrics
+    clocks : Clocks
+    owner : str
+        Of the leases.
+    quota : VerificationQuota
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        executor: StoreExecutor,
+        pool: WorkerPool,
+        commit: Callable[[WorkResult], Awaitable[bool]],
+        notify: Callable[[str], None],
+        metrics: Metrics,
+        clocks: Clocks,
+        owner: str,
+        quota: VerificationQuota,
+    ) -> None:
+        self._store, self._executor, self._pool = store, executor, pool
+        self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
+        self._owner, self._quota = owner, quota
+        self._work_pending = asyncio.Event()
         self._stopping = False
         self._tasks: set[asyncio.Task[None]] = set()
-        self._returns: set[str] = set()
-        self._faults: Counter[tuple[str, bool]] = Counter()
+        self._to_release: set[str] = set()
+        self._failures: Counter[tuple[str, bool]] = Counter()
 
-    def poke(self) -> None:
-        """Something new is to be worked on."""
-        self._came.set()
+    def wake(self) -> None:
+        """Look for work now."""
+        self._work_pending.set()
 
     async def run(self) -> None:
-        """Until `stop`."""
+        """Dispatch until `stop`."""
         while not self._stopping:
-            worker = await self._parts.pool.lend()
-            claims = await self._next()
-            if not claims:
-                self._parts.pool.take_back(worker)
+            worker = await self._pool.acquire()
+            leases = await self._next_leases()
+            if not leases:
+                self._pool.release(worker)
                 continue
-            task = asyncio.create_task(self._employ(worker, claims))
+            task = asyncio.create_task(self._employ(worker, leases))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
     async def stop(self) -> None:
-        """Begin nothing new, finish what is begun, give back what is borrowed."""
+        """Start nothing new, finish what is running, release the leases."""
         self._stopping = True
-        self._came.set()
+        self._work_pending.set()
         while self._tasks:
             await asyncio.wait(self._tasks)
         try:
-            await self._parts.shelf.ask(partial(self._parts.store.release, self._owner))
+            await self._executor.run(partial(self._store.release, self._owner))
         except StoreUnavailable as error:
             log.warning("leases not given back", extra={"why": str(error)})
 
-    async def finish(self, claim: Lease, now: float, worker: Worker) -> WorkResult | None:
-        """One claim, to its commit; None where there is no outcome, and the servo is free again."""
-        outcome: WorkResult | None = None
-        async for done in worker.work([claim], now):
-            outcome = await self._settle(claim, done, now)
-        return outcome
+    async def process(self, servo: str, now: float) -> list[bytes]:
+        """Work on one servo until nothing is pending, for lock-step; returns its outgoing messages.
 
-    async def _next(self) -> list[Lease]:
-        """Claims, as soon as there are some; none when it is time to stop."""
+        Raises
+        ------
+        NoResult, StoreUnavailable, WorkerLost
+        """
+        sent: list[bytes] = []
+        worker = await self._pool.acquire()
+        try:
+            for _ in range(_MAX_STEPS):
+                leases = await self._executor.run(
+                    lambda: self._store.lease(self._owner, 1, LEASE_S, now, tuple(MessageKind), servo=servo)
+                )
+                if not leases:
+                    break
+                result: WorkResult | None = None
+                async for done in worker.work(leases[:1], now):
+                    result = await self._complete(leases[0], done, now)
+                if result is None:
+                    raise NoResult(f"servo {servo!r}: no result was committed")
+                sent += result.outgoing
+        except WorkerLost as lost:
+            await self._pool.replace(worker, str(lost))
+            raise
+        except BaseException:
+            self._pool.release(worker)
+            raise
+        self._pool.release(worker)
+        return sent
+
+    async def _next_leases(self) -> list[Lease]:
+        """Wait for pending work; returns nothing when the dispatcher is to stop."""
         while not self._stopping:
-            self._came.clear()
+            self._work_pending.clear()
             try:
-                await self._give_back()
-                claims = await self._claim()
+                await self._release_failed()
+                leases = await self._lease_next()
             except StoreUnavailable as error:
                 log.error("store not available", extra={"why": str(error)})
-                await self._rest(PAUSE_S)
+                await self._rest(_RETRY_S)
                 continue
-            if claims:
-                return claims
-            await self._rest(REST_S)
+            if leases:
+                return leases
+            await self._rest(_POLL_S)
         return []
 
-    async def _claim(self) -> list[Lease]:
-        now = self._parts.clocks.wall()
-        if self._proofs.may(self._parts.clocks.monotonic()):
-            proofs = await self._borrow(now, 1, (MessageKind.VERIFICATION,))
-            if proofs:
-                self._proofs.take()
-                return proofs
-        return await self._borrow(now, SERVOS, WORK_KINDS)
+    async def _lease_next(self) -> list[Lease]:
+        """Lease a verification if the quota allows one, otherwise messages."""
+        now = self._clocks.wall()
+        if self._quota.refill(self._clocks.monotonic()):
+            verifications = await self._lease(now, 1, (MessageKind.VERIFICATION,))
+            if verifications:
+                self._quota.take()
+                return verifications
+        return await self._lease(now, _SERVOS, WORK_KINDS)
 
-    async def _borrow(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
-        store = self._parts.store
-        return await self._parts.shelf.ask(
-            lambda: store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=MESSAGES)
+    async def _lease(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
+        return await self._executor.run(
+            lambda: self._store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=_MESSAGES)
         )
 
     async def _rest(self, seconds: float) -> None:
         try:
             async with asyncio.timeout(seconds):
-                await self._came.wait()
+                await self._work_pending.wait()
         except TimeoutError:
             return
 
-    async def _employ(self, worker: Worker, claims: Sequence[Lease]) -> None:
-        """Let a worker work on claims; those that failed before each alone, so that the fault is found."""
-        claims = [claim._replace(attempts=1 + self._faults[_queue(claim)]) for claim in claims]
+    async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease]) -> None:
+        """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault."""
+        leases = [lease._replace(attempts=1 + self._failures[_queue(lease)]) for lease in leases]
         jobs = [
-            [claim for claim in claims if claim.attempts == 1],
-            *([claim] for claim in claims if claim.attempts > 1),
+            [lease for lease in leases if lease.attempts == 1],
+            *([lease] for lease in leases if lease.attempts > 1),
         ]
-        left = dict.fromkeys(claim.servo for job in jobs for claim in job)
+        left = dict.fromkeys(lease.servo for job in jobs for lease in job)
         commits: list[asyncio.Task[WorkResult | None]] = []
-        now = self._parts.clocks.wall()
+        now = self._clocks.wall()
         try:
             for job in filter(None, jobs):
                 waiting = iter(job)
                 async for done in worker.work(job, now):
-                    claim = next(waiting)
-                    del left[claim.servo]
-                    commits.append(asyncio.create_task(self._settle(claim, done, now)))
+                    lease = next(waiting)
+                    del left[lease.servo]
+                    commits.append(asyncio.create_task(self._complete(lease, done, now)))
         except WorkerLost as lost:
-            await self._lost(worker, claims, list(left), str(lost))
+            await self._lost(worker, leases, list(left), str(lost))
         else:
-            self._parts.pool.take_back(worker)
+            self._pool.release(worker)
         await asyncio.gather(*commits)
 
-    async def _lost(self, worker: Worker, claims: Sequence[Lease], left: Sequence[str], why: str) -> None:
-        """A worker is gone: whom it was at is suspect, and all that it did not come to is free again."""
-        self._parts.metrics.workers_lost.add()
-        at = next(claim for claim in claims if claim.servo == left[0]) if left else None
-        if at is not None:
-            self._failed(at, why)
-        self._returns.update(left[1:])
-        await self._parts.pool.replace(worker, why)
-        self.poke()
+    async def _lost(self, worker: WorkerProcess, leases: Sequence[Lease], left: Sequence[str], why: str) -> None:
+        """Replace a lost worker: the lease that it was processing failed, those after it are released."""
+        self._metrics.workers_lost.add()
+        current = next(lease for lease in leases if lease.servo == left[0]) if left else None
+        if current is not None:
+            self._fail(current, why)
+        self._to_release.update(left[1:])
+        await self._pool.replace(worker, why)
+        self.wake()
 
-    async def _settle(self, claim: Lease, done: Done, now: float) -> WorkResult | None:
-        """Commit what a worker made."""
-        self._parts.metrics.work.observe(done.seconds)
-        if done.outcome is None:
-            self._failed(claim, done.error)
+    async def _complete(self, lease: Lease, done: LeaseResult, now: float) -> WorkResult | None:
+        """Commit a worker's result; None: there is none, and the servo is to be released."""
+        self._metrics.work.observe(done.seconds)
+        if done.result is None:
+            self._fail(lease, done.error)
             return None
-        if not await self._committed(done.outcome):
+        if not await self._committed(done.result):
             return None
-        self._faults.pop(_queue(claim), None)
-        self._tell(claim, done.outcome, done.seconds, now)
-        return done.outcome
+        self._failures.pop(_queue(lease), None)
+        self._report(lease, done.result, done.seconds, now)
+        return done.result
 
-    async def _committed(self, outcome: WorkResult) -> bool:
-        counts = self._parts.metrics.outcomes
+    async def _committed(self, result: WorkResult) -> bool:
+        counts = self._metrics.results
         try:
-            valid = await self._parts.commit(outcome)
+            valid = await self._commit(result)
         except StoreUnavailable as error:
             counts.add("not committed")
-            log.error("outcome not committed", extra={"servo": outcome.servo, "why": str(error)})
-            self._returns.add(outcome.servo)
+            log.error("outcome not committed", extra={"servo": result.servo, "why": str(error)})
+            self._to_release.add(result.servo)
             return False
-        # A void one has no lease to give back: the outcome before it ended that, and whoever has one now needs it.
+        # A void result has no lease to release: the result before it ended that, and its present owner needs it.
         counts.add("committed" if valid else "void")
-        if valid and outcome.outgoing:
-            self._parts.metrics.posted.add(by=len(outcome.outgoing))
-            self._parts.posted(outcome.servo)
+        if valid and result.outgoing:
+            self._metrics.sent.add(by=len(result.outgoing))
+            self._notify(result.servo)
         if valid:
-            self.poke()
+            self.wake()
         return valid
 
-    def _failed(self, claim: Lease, why: str) -> None:
-        """A worker found no outcome: the next one is told how many did, and gives a message up at last."""
-        self._faults[_queue(claim)] += 1
-        self._parts.metrics.outcomes.add("failed")
-        about = {"servo": claim.servo, "message_id": claim.messages[0].id if claim.messages else 0}
-        log.error("work failed", extra={**about, "faults": self._faults[_queue(claim)], "why": why})
-        self._returns.add(claim.servo)
+    def _fail(self, lease: Lease, why: str) -> None:
+        """Count a failure: the next worker learns the number of attempts, and finally gives the message up."""
+        self._failures[_queue(lease)] += 1
+        self._metrics.results.add("failed")
+        about = {"servo": lease.servo, "message_id": lease.messages[0].id if lease.messages else 0}
+        log.error("work failed", extra={**about, "faults": self._failures[_queue(lease)], "why": why})
+        self._to_release.add(lease.servo)
 
-    async def _give_back(self) -> None:
-        """Free the servos without an outcome."""
-        servos = frozenset(self._returns)
+    async def _release_failed(self) -> None:
+        """Release the servos that have no result."""
+        servos = frozenset(self._to_release)
         if servos:
-            await self._parts.shelf.ask(partial(self._parts.store.release, self._owner, servos))
-            self._returns -= servos
+            await self._executor.run(partial(self._store.release, self._owner, servos))
+            self._to_release -= servos
 
-    def _tell(self, claim: Lease, outcome: WorkResult, seconds: float, now: float) -> None:
-        """Count it, and log what was found."""
-        metrics = self._parts.metrics
-        for message in claim.messages:
-            metrics.age.observe(max(0.0, now - message.received))
-        kinds = Counter(map(_what, outcome.evidence))
-        for kind, number in kinds.items():
-            metrics.evidence.add(kind, by=number)
-        about = {"servo": claim.servo, "serial": claim.serial, "seconds": round(seconds, 6)}
-        windows = {message.id: message.key for message in claim.messages if message.kind is MessageKind.WINDOW}
-        for found in outcome.evidence:
-            what = _what(found)
-            level = logging.WARNING if what in ALARMS else logging.DEBUG if what in QUIET else logging.INFO
+    def _report(self, lease: Lease, result: WorkResult, seconds: float, now: float) -> None:
+        """Count and log a committed result."""
+        for message in lease.messages:
+            self._metrics.age.observe(max(0.0, now - message.received))
+        for kind, number in Counter(map(_log_kind, result.evidence)).items():
+            self._metrics.evidence.add(kind, by=number)
+        about = {"servo": lease.servo, "serial": lease.serial, "seconds": round(seconds, 6)}
+        windows = {message.id: message.key for message in lease.messages if message.kind is MessageKind.WINDOW}
+        for record in result.evidence:
+            kind = _log_kind(record)
+            level = logging.WARNING if kind in ALARMS else logging.DEBUG if kind in QUIET else logging.INFO
             if log.isEnabledFor(level):
-                log.log(level, what, extra={**about, **_ids(found, windows)})
+                log.log(level, kind, extra={**about, **_identifiers(record, windows)})
 
 
-def _queue(claim: Lease) -> tuple[str, bool]:
-    """Where its faults are counted: of a proof that kills its workers, windows that succeed meanwhile say nothing."""
-    return claim.servo, any(message.kind is MessageKind.VERIFICATION for message in claim.messages)
+def _queue(lease: Lease) -> tuple[str, bool]:
+    """Key of the failure count: windows that succeed do not reset the count of a verification that kills workers."""
+    return lease.servo, any(message.kind is MessageKind.VERIFICATION for message in lease.messages)
 
 
-def _what(found: EvidenceRecord) -> str:
-    """Its kind; where nothing could be made of a message, whatever its kind, that."""
-    return "failed" if found.status.startswith("failed") else found.kind
+def _log_kind(record: EvidenceRecord) -> str:
+    """Kind of evidence in logs and metrics: "failed" for any message that could not be processed."""
+    return "failed" if record.status.startswith("failed") else record.kind
 
 
-def _ids(found: EvidenceRecord, windows: Mapping[int, str]) -> dict[str, object]:
-    """Of which window, under which version, in which context. An estimate is known by the message it was made of."""
-    of = {"message_id": found.message, "window": windows.get(found.message)}
-    known = {**of, "version": found.version, "status": found.status, "context": found.context}
+def _identifiers(record: EvidenceRecord, windows: Mapping[int, str]) -> dict[str, object]:
+    """Window, version and context of evidence, as far as it has them; an estimate is known by its message."""
+    known = {
+        "message_id": record.message,
+        "window": windows.get(record.message),
+        "version": record.version,
+        "status": record.status,
+        "context": record.context,
+    }
     return {key: value for key, value in known.items() if value not in (None, "")}

@@ -1,4 +1,4 @@
-"""What comes in, over any transport: checked, made an `Incoming`, committed; only then it counts as taken."""
+"""Ingest of messages from edges, over any transport: check, decode, commit; only then is a message acknowledged."""
 
 from __future__ import annotations
 
@@ -24,42 +24,40 @@ from servotwin.messages import (
 from servotwin.messages.compression import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, MessageKind, PutResult
-from servotwin.twin_service.future import Boots
-from servotwin.twin_service.metrics import Metrics
-from servotwin.twin_service.refused import Refused
+from servotwin.twin_service.limits import RequestRejected, SampleTimeLimiter
+from servotwin.twin_service.monitoring import Metrics
 
 LETTERS = (Hello, Receipt, Fallback, Answer)
-
-
-_PIECE = 2047
+_CHUNK = 2047
+"""Bytes; see `_digest`."""
 
 
 class Clocks(NamedTuple):
-    """Time as the service sees it: since the epoch, and the one that never steps, both in s."""
+    """Clocks of the service, s: since the epoch, and monotonic."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
 
     @classmethod
     def of_machine(cls) -> Clocks:
-        """The machine's, where a step of its clock while the service runs changes nothing.
+        """Clocks of the machine, unaffected by steps of its clock while the service runs.
 
-        Leases and times to wake lie on this clock: set back by an hour, it would let them lie for that hour.
+        Leases and wake-ups are on this clock: set back by an hour, it would delay them by that hour.
         """
         zero = time.time() - time.monotonic()
         return cls(lambda: zero + time.monotonic())
 
 
 class Ingest:
-    """Takes messages of edges.
+    """Checks and stores messages of edges.
 
     Parameters
     ----------
     put : callable
-        Commits, and returns then; raises StoreBusy when too much waits, and StoreUnavailable.
+        Returns once the message is committed; raises StoreBusy where the queue is full, and StoreUnavailable.
     knows : callable
-        Whether a servo of that name is looked after here.
-    boots : Boots
+        Test whether a servo of that name belongs to this twin.
+    sample_times : SampleTimeLimiter
     metrics : Metrics
     limit : int
         Bytes of a message, decompressed.
@@ -70,85 +68,98 @@ class Ingest:
         self,
         put: Callable[[Incoming], Awaitable[PutResult]],
         knows: Callable[[str], bool],
-        boots: Boots,
+        sample_times: SampleTimeLimiter,
         metrics: Metrics,
         limit: int = MAX_BYTES,
         clocks: Clocks | None = None,
     ) -> None:
-        self._put, self._knows, self._boots, self._metrics, self._limit = put, knows, boots, metrics, limit
+        self._put, self._knows, self._sample_times = put, knows, sample_times
+        self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
 
     def read_window(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, Window]:
-        """A window of that servo, ready to be put; raises Refused as `read` does."""
+        """Decode a window of that servo; raises RequestRejected as `read` does."""
         incoming, message = self.read(servo, body, encoding)
         if not isinstance(message, Window):
-            raise Refused(Refusal.NOT_UNDERSTOOD, f"a window is expected here, not {_kind(message)}")
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"a window is expected here, not {_kind(message)}")
         return incoming, message
 
     def read_letter(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, Message]:
-        """A hello, receipt, fallback or answer of that servo, ready to be put; raises Refused as `read` does."""
+        """Decode a hello, receipt, fallback or answer of that servo; raises RequestRejected as `read` does."""
         incoming, message = self.read(servo, body, encoding)
         if isinstance(message, Window):
-            raise Refused(Refusal.NOT_UNDERSTOOD, "a hello, receipt, fallback or answer is expected here, not window")
+            raise RequestRejected(
+                Refusal.NOT_UNDERSTOOD, "a hello, receipt, fallback or answer is expected here, not window"
+            )
         return incoming, message
 
     def read(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, Message]:
-        """A message of that servo, ready to be put.
+        """Check and decode a message of that servo.
 
         Parameters
         ----------
         servo : str
-            Whoever sent it has shown to be this one.
+            Authenticated.
         body : bytes
-            As it came, compressed as `encoding` says: "", "deflate" or "zstd".
+            As received, compressed as `encoding` says: "", "deflate" or "zstd".
 
         Raises
         ------
-        Refused
-            It is not for a twin, or no good; the reason is its code.
+        RequestRejected
+            The message is not for a twin, or invalid; `refusal` is the reason.
         """
         data, message = self._decoded(servo, body, encoding)
         now, digest = self._clocks.monotonic(), _digest(data)
         if isinstance(message, Window):
-            self._boots.check(servo, message.boot, end_of(message), now)
-            of_window = message.boot, message.sequence, message.start
-            whose = servo, MessageKind.WINDOW, f"{message.boot}/{message.sequence}"
-            return Incoming(*whose, body, encoding, digest, self._clocks.wall(), *of_window), message
+            self._sample_times.check(servo, message.boot, end_of(message), now)
+            incoming = Incoming(
+                servo=servo,
+                kind=MessageKind.WINDOW,
+                key=f"{message.boot}/{message.sequence}",
+                body=body,
+                encoding=encoding,
+                digest=digest,
+                received=self._clocks.wall(),
+                boot=message.boot,
+                sequence=message.sequence,
+                start=message.start,
+            )
+            return incoming, message
         if not isinstance(message, LETTERS):
-            raise Refused(Refusal.NOT_UNDERSTOOD, f"a twin does not receive {_kind(message)} messages")
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"a twin does not receive {_kind(message)} messages")
         if isinstance(message, Hello):
-            self._boots.hello(servo, message.boot, message.time, now)
+            self._sample_times.hello(servo, message.boot, message.time, now)
         return Incoming(servo, MessageKind.LETTER, digest.hex(), body, encoding, digest, self._clocks.wall()), message
 
     async def commit(self, incoming: Incoming) -> PutResult:
-        """Commit; returns when it is safe.
+        """Commit a message; returns when it is on the disk.
 
         Raises
         ------
-        Refused
-            CONFLICT: something else was committed under this identity. UNAVAILABLE: it may be taken later.
+        RequestRejected
+            CONFLICT: another message was committed under this key. UNAVAILABLE: it may succeed later.
         """
         begun = self._clocks.monotonic()
         try:
             put = await self._put(incoming)
         except (StoreBusy, StoreUnavailable) as error:
-            raise Refused(Refusal.UNAVAILABLE, _unavailable(error)) from None
+            raise RequestRejected(Refusal.UNAVAILABLE, _unavailable(error)) from None
         if put is PutResult.CONFLICT:
-            raise Refused(Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another one is kept")
+            raise RequestRejected(Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another one is kept")
         self._metrics.commit.observe(self._clocks.monotonic() - begun)
-        self._metrics.taken.add(incoming.kind.value, put.value)
+        self._metrics.stored.add(incoming.kind.value, put.value)
         return put
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
         if not self._knows(servo):
-            raise Refused(Refusal.UNKNOWN_SERVO, f"servo {servo!r} is not looked after here")
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} is not looked after here")
         try:
             data = decompress(body, encoding, self._limit)
             message = decode(data, self._limit)
         except InvalidMessage as error:
-            raise Refused(error.refusal, str(error)[:400]) from None
+            raise RequestRejected(error.refusal, str(error)[:400]) from None
         if message.servo != servo:
-            raise Refused(Refusal.OTHER_NAME, f"the message is of servo {message.servo!r}, not of {servo!r}")
+            raise RequestRejected(Refusal.OTHER_NAME, f"the message is of servo {message.servo!r}, not of {servo!r}")
         return data, message
 
 
@@ -158,19 +169,19 @@ def end_of(window: Window) -> float:
 
 
 def acknowledgement(window: Window) -> bytes:
-    """What tells the edge that its window is safe."""
+    """Message that tells the edge that its window is safe."""
     return encode(Acknowledge(window.servo, window.boot, window.sequence))
 
 
 def _digest(data: bytes) -> bytes:
-    """Of the whole, in pieces so small that hashlib keeps the interpreter to itself.
+    """Digest of a message, in chunks so small that hashlib does not release the interpreter lock.
 
-    With larger ones it lets another thread in, and the event loop gets its turn again after that thread's: 270 us
-    instead of 25 for 20 kB while commits are being written.
+    With larger ones another thread takes the lock, and the event loop waits for that thread: 270 us instead of 25 for
+    20 kB while commits are being written.
     """
     whole, digest = memoryview(data), blake2b(digest_size=16)
-    for begin in range(0, len(data), _PIECE):
-        digest.update(whole[begin : begin + _PIECE])
+    for begin in range(0, len(data), _CHUNK):
+        digest.update(whole[begin : begin + _CHUNK])
     return digest.digest()
 
 

@@ -1,65 +1,110 @@
-"""What one client may cost: the size and time of a body, and how many messages of a servo in how long."""
+"""Limits on what a client may send: size and time of a body, message rate, sample time; and the rejection."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from typing import Any, NamedTuple
 
 from servotwin.messages import Refusal
-from servotwin.twin_service.refused import Refused
 
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 """ASGI's: the next event of a request."""
-REMEMBERED = 50_000
-"""Servos."""
-MEMORY = 256 * 1024 * 1024
-"""Bytes of all bodies that are being read at once."""
+MAX_SERVOS = 50_000
+"""Servos and boots that are remembered; a forgotten one counts as new."""
+_BODY_MEMORY = 256 * 1024 * 1024
+"""Bytes of all bodies that are being received at once."""
+_MAX_UPTIME_S = 20.0 * 365.25 * 86400.0
+"""s; no edge runs longer without a restart."""
+
+STATUS: Mapping[Refusal, int] = {
+    Refusal.NOT_UNDERSTOOD: 400,
+    Refusal.UNKNOWN_SCHEMA: 400,
+    Refusal.BAD_CHECKSUM: 400,
+    Refusal.OTHER_NAME: 400,
+    Refusal.BAD_TOKEN: 401,
+    Refusal.UNKNOWN_SERVO: 404,
+    Refusal.CONFLICT: 409,
+    Refusal.TOO_LARGE: 413,
+    Refusal.FUTURE: 422,
+    Refusal.TOO_MANY: 429,
+    Refusal.UNAVAILABLE: 503,
+}
+"""HTTP status of each reason."""
+
+
+class RequestRejected(Exception):
+    """Rejection of a request, over any transport.
+
+    Parameters
+    ----------
+    refusal : Refusal
+    detail : str
+        One sentence for the sender: no secret, nothing about the service's inside.
+    status : int, optional
+        Of HTTP; as in `STATUS` by default.
+    close : bool
+        Close the connection.
+    """
+
+    def __init__(self, refusal: Refusal, detail: str, status: int | None = None, close: bool = False) -> None:
+        super().__init__(detail)
+        self.refusal, self.detail, self.close = refusal, detail, close
+        self.status = STATUS[refusal] if status is None else status
 
 
 class Disconnected(Exception):
-    """The client has gone before its body was whole."""
+    """The client closed the connection before its body was complete."""
 
 
-class Bodies:
-    """Reads bodies whole, within limits that hold before anything is parsed.
+class BodyReader:
+    """Receives bodies within limits that hold before anything is parsed.
 
     Parameters
     ----------
     limit : int
         Bytes of one body, as sent.
     timeout : float
-        s within which it has to be there.
+        s within which it has to arrive.
     memory : int
-        Bytes of all bodies that are being read; more are refused for the moment.
+        Bytes of all bodies that are being received; beyond that bodies are rejected for the moment.
+
+    Attributes
+    ----------
+    held : int
+        Bytes of incomplete bodies in memory.
     """
 
-    def __init__(self, limit: int, timeout: float, memory: int = MEMORY) -> None:
+    def __init__(self, limit: int, timeout: float, memory: int = _BODY_MEMORY) -> None:
         self.limit, self.timeout, self._memory = limit, timeout, memory
         self.held = 0
 
     async def read(self, length: str | None, receive: Receive) -> bytes:
-        """One request's body; `length` is its Content-Length, where it has one.
+        """Receive the body of one request; `length` is its Content-Length, where it has one.
 
         Raises
         ------
-        Refused
-            TOO_LARGE, or UNAVAILABLE where it comes too slowly or too much is being read.
+        RequestRejected
+            TOO_LARGE, or UNAVAILABLE where it arrives too slowly or too many bodies are being received.
         Disconnected
         """
         if length is not None and (not length.isdecimal() or len(length) > 12 or int(length) > self.limit):
             raise self._too_large()
         try:
             async with asyncio.timeout(self.timeout):
-                return await self._whole(receive)
+                return await self._receive_all(receive)
         except TimeoutError:
-            raise Refused(Refusal.UNAVAILABLE, f"the body did not come within {self.timeout:g} s", close=True) from None
+            detail = f"the body did not come within {self.timeout:g} s"
+            raise RequestRejected(Refusal.UNAVAILABLE, detail, close=True) from None
 
-    async def _whole(self, receive: Receive) -> bytes:
+    async def _receive_all(self, receive: Receive) -> bytes:
         event = await receive()
         if event["type"] == "http.request" and not event.get("more_body", False):
-            return self._within(event.get("body", b""))
+            body: bytes = event.get("body", b"")
+            if len(body) > self.limit:
+                raise self._too_large()
+            return body
         parts, size = [], 0
         try:
             while True:
@@ -80,21 +125,16 @@ class Bodies:
         if size > self.limit:
             raise self._too_large()
         if self.held > self._memory:
-            raise Refused(Refusal.UNAVAILABLE, "too many bodies are being received now", close=True)
+            raise RequestRejected(Refusal.UNAVAILABLE, "too many bodies are being received now", close=True)
 
-    def _within(self, body: bytes) -> bytes:
-        if len(body) > self.limit:
-            raise self._too_large()
-        return body
-
-    def _too_large(self) -> Refused:
-        return Refused(Refusal.TOO_LARGE, f"the body is larger than {self.limit} bytes", close=True)
+    def _too_large(self) -> RequestRejected:
+        return RequestRejected(Refusal.TOO_LARGE, f"the body is larger than {self.limit} bytes", close=True)
 
 
-class Buckets:
-    """For each servo a bucket of tokens: one is taken per message, `rate` are put in per s, `burst` at most lie there.
+class RateLimiter:
+    """Token bucket per servo: a message takes one token, `rate` tokens per s are added up to `burst`.
 
-    Only so many are remembered; one that was forgotten is full.
+    The least recently used buckets are forgotten; a forgotten bucket is full.
     """
 
     def __init__(self, rate: float, burst: float, monotonic: Callable[[], float]) -> None:
@@ -102,19 +142,85 @@ class Buckets:
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, servo: str) -> None:
-        """One token of a servo.
+        """Take a token of a servo.
 
         Raises
         ------
-        Refused
-            TOO_MANY: none is left.
+        RequestRejected
+            TOO_MANY: the bucket is empty.
         """
         now = self._now()
         level, at = self._levels.get(servo, (self._burst, now))
         level = min(self._burst, level + self._rate * (now - at))
         self._levels[servo] = (level if level < 1.0 else level - 1.0), now
         self._levels.move_to_end(servo)
-        if len(self._levels) > REMEMBERED:
+        if len(self._levels) > MAX_SERVOS:
             self._levels.popitem(last=False)
         if level < 1.0:
-            raise Refused(Refusal.TOO_MANY, f"more than {self._rate:g} messages per s of servo {servo!r}")
+            raise RequestRejected(Refusal.TOO_MANY, f"more than {self._rate:g} messages per s of servo {servo!r}")
+
+
+class _SampleTime(NamedTuple):
+    """Sample time (s) that a boot reported, and when (s, monotonic)."""
+
+    at: float
+    sample_time: float
+
+
+class SampleTimeLimiter:
+    """Rejects windows from the future: the sample time of a boot passes at most `speed` times as fast as time.
+
+    The first message of a boot gives its sample time. A hello may advance it: it reports the edge's time when it was
+    sent, while a window may be old.
+
+    Parameters
+    ----------
+    speed : float
+        Sample time per time.
+    slack : float
+        s of sample time allowed beyond that.
+    """
+
+    def __init__(self, speed: float, slack: float) -> None:
+        self._speed, self._slack = speed, slack
+        self._boots: OrderedDict[tuple[str, str], _SampleTime] = OrderedDict()
+
+    def hello(self, servo: str, boot: str, sample_time: float, now: float) -> None:
+        """Note the sample time that an edge reports; raises RequestRejected (FUTURE) where no edge runs that long."""
+        _check_possible(sample_time)
+        known = self._boots.get((servo, boot))
+        if known is None or sample_time > self._reached(known, now):
+            self._note(servo, boot, _SampleTime(now, sample_time))
+
+    def check(self, servo: str, boot: str, end: float, now: float) -> None:
+        """Check a window whose last sample was taken at `end` (s of sample time), received at `now` (s).
+
+        Raises
+        ------
+        RequestRejected
+            FUTURE.
+        """
+        _check_possible(end)
+        known = self._boots.get((servo, boot))
+        if known is None:
+            self._note(servo, boot, _SampleTime(now, end))
+            return
+        reached = self._reached(known, now) + self._slack
+        if end > reached:
+            raise RequestRejected(
+                Refusal.FUTURE,
+                f"the window ends at {end:.3f} s of sample time; its boot can have reached {reached:.3f} s by now",
+            )
+
+    def _reached(self, known: _SampleTime, now: float) -> float:
+        return known.sample_time + self._speed * (now - known.at)
+
+    def _note(self, servo: str, boot: str, reported: _SampleTime) -> None:
+        self._boots[servo, boot] = reported
+        if len(self._boots) > MAX_SERVOS:
+            self._boots.popitem(last=False)
+
+
+def _check_possible(sample_time: float) -> None:
+    if sample_time > _MAX_UPTIME_S:
+        raise RequestRejected(Refusal.FUTURE, f"sample time {sample_time:.3g} s: no edge runs that long")

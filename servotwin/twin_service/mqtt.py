@@ -1,4 +1,7 @@
-"""The service's end of the link over MQTT 5: one of a group of twins among whom the broker divides what edges ask."""
+"""MQTT 5 end of the service: one of a group of twins among whom the broker distributes the requests of edges.
+
+The same checks, in the same order, as over HTTP.
+"""
 
 from __future__ import annotations
 
@@ -8,56 +11,147 @@ from collections.abc import Callable
 from uuid import uuid4
 
 from servotwin.link.broker import Broker, Connection, Events, Wanted
-from servotwin.link.exchange import GONE, UP, Asked, Listen, down, servo_of
-from servotwin.twin_service.broker_desk import Desk
+from servotwin.link.exchange import (
+    GONE,
+    UP,
+    Answer,
+    Asked,
+    Heard,
+    Listen,
+    NotTaken,
+    Taken,
+    answer,
+    asked,
+    down,
+    servo_of,
+    stranger,
+)
+from servotwin.link.seal import key_of
+from servotwin.messages import InvalidMessage, Refusal
+from servotwin.store.records import PutResult
+from servotwin.twin_service.auth import EdgeGate
+from servotwin.twin_service.ingest import Ingest
+from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.long_poll import LongPolls, seal_messages
+from servotwin.twin_service.monitoring import Metrics
 
 log = logging.getLogger(__name__)
 
-SESSION_S = 0
-"""Otherwise the broker would go on giving its share to a twin that is gone; now edges hear of it and ask again."""
-RECEIVE = 1000
-"""Questions under way to one twin."""
-ANSWER_S = 60.0
-"""An answer that nobody fetched is worth nothing after that: the question has been asked again."""
+_RETRY_AFTER_S = 1.0
+"""Wait that an edge is asked for when nothing is accepted for the moment."""
+_SESSION_S = 0
+"""No session outlives its connection: the broker would send a share of the requests to a twin that is gone."""
+_MAX_IN_FLIGHT = 1000
+"""Unacknowledged requests to one twin."""
+_RESPONSE_EXPIRY_S = 60.0
+"""A response that was not fetched by then is worthless: its edge has repeated the request."""
 
 
-class Bridge:
-    """Takes questions from a broker, and acknowledges each to it only when it is answered for good.
+class MqttRequestHandler:
+    """Decodes requests of edges and makes the responses.
+
+    Parameters
+    ----------
+    gate : EdgeGate
+    ingest : Ingest
+    polls : LongPolls
+    wake : callable
+        Wakes the dispatcher after a new message.
+    metrics : Metrics
+    """
+
+    def __init__(
+        self, gate: EdgeGate, ingest: Ingest, polls: LongPolls, wake: Callable[[], None], metrics: Metrics
+    ) -> None:
+        self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
+
+    def decode(self, servo: str, data: bytes) -> Asked | bytes | None:
+        """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
+        verifier = self._gate.find_verifier(servo)
+        try:
+            if verifier is None:
+                raise InvalidMessage(f"servo {servo!r} has no token", Refusal.BAD_TOKEN)
+            return asked(key_of(verifier), servo, data)
+        except InvalidMessage as error:
+            too_large = error.refusal is Refusal.TOO_LARGE
+            self._count(servo, Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, str(error))
+            return None if too_large else stranger(data)
+
+    async def respond(self, request: Asked) -> bytes | None:
+        """Handle a request; returns the bytes of the response, or None where its token was revoked."""
+        try:
+            response = await self._handle(request)
+        except RequestRejected as rejected:
+            self._count(request.servo, rejected.refusal, rejected.detail)
+            busy = rejected.refusal in (Refusal.TOO_MANY, Refusal.UNAVAILABLE)
+            response = NotTaken(rejected.refusal, rejected.detail, _RETRY_AFTER_S if busy else 0.0)
+        verifier = self._gate.find_verifier(request.servo)
+        return None if verifier is None else answer(key_of(verifier), request.servo, request.serial, response)
+
+    async def _handle(self, request: Asked) -> Answer:
+        servo, question = request.servo, request.question
+        if isinstance(question, Listen):
+            self._gate.admit_authenticated(servo, limited=False)
+            messages = await self._polls.messages(servo, question.after, question.wait)
+            return Heard(seal_messages(self._gate.verifier(servo), servo, messages))
+        self._gate.admit_authenticated(servo)
+        incoming, _ = self._ingest.read(servo, question.body, question.encoding)
+        if await self._ingest.commit(incoming) is PutResult.NEW:
+            self._wake()
+        return Taken()
+
+    def _count(self, servo: str, code: Refusal, why: str) -> None:
+        self._metrics.rejected.add(code.value)
+        log.info("refused", extra={"servo": servo, "code": code.value, "why": why})
+
+
+class MqttServer:
+    """Receives requests from a broker; acknowledges each to the broker only once it is handled.
 
     Parameters
     ----------
     broker : Broker
-    desk : Desk
+    handler : MqttRequestHandler
     group : str
-        Twins of one group share the questions.
+        Twins of one group share the requests.
+
+    Attributes
+    ----------
+    connected : bool
     """
 
-    def __init__(self, broker: Broker, desk: Desk, group: str) -> None:
-        self._broker, self._desk, self._group = broker, desk, group
+    def __init__(self, broker: Broker, handler: MqttRequestHandler, group: str) -> None:
+        self._broker, self._handler, self._group = broker, handler, group
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
         self.connected = False
 
-    async def begin(self) -> None:
-        """Connect, and stay connected."""
+    async def start(self) -> None:
+        """Connect, and reconnect whenever the connection is lost."""
         loop = asyncio.get_running_loop()
 
-        def message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-            loop.call_soon_threadsafe(self._take, topic, payload, acknowledge)
+        def on_message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
+            loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
 
-        wanted = Wanted(f"servotwin-{uuid4().hex}", (f"$share/{self._group}/{UP}",), SESSION_S, RECEIVE, GONE)
-        self._connection = Connection(self._broker, wanted, Events(message, self._ready, self._lost))
+        wanted = Wanted(
+            client_id=f"servotwin-{uuid4().hex}",
+            topics=(f"$share/{self._group}/{UP}",),
+            session_s=_SESSION_S,
+            receive=_MAX_IN_FLIGHT,
+            will=GONE,
+        )
+        self._connection = Connection(self._broker, wanted, Events(on_message, self._on_connected, self._on_lost))
 
-    async def end(self) -> None:
-        """Take nothing more, answer what was asked, let go."""
+    async def stop(self) -> None:
+        """Accept nothing more, finish the running requests, disconnect."""
         connection, self._connection = self._connection, None
         while self._tasks:
             await asyncio.wait(self._tasks)
         if connection is not None:
             await asyncio.to_thread(connection.close)
 
-    def _take(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        """What came, on the event loop; unacknowledged where it is not taken, so that another twin gets it."""
+    def _receive(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
+        """Start handling a request, on the event loop; an ignored one stays unacknowledged and goes to another twin."""
         servo = servo_of(topic)
         if servo is None or self._connection is None:
             return
@@ -66,25 +160,25 @@ class Bridge:
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, connection: Connection, servo: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        asked = self._desk.read(servo, payload)
-        polls = isinstance(asked, Asked) and isinstance(asked.question, Listen)
+        request = self._handler.decode(servo, payload)
+        polls = isinstance(request, Asked) and isinstance(request.question, Listen)
         if polls:
-            acknowledge()  # it waits for news, and must not keep others from being asked meanwhile
+            acknowledge()  # a long poll waits, and must not count as in flight meanwhile
         try:
-            said = await self._desk.answer(asked) if isinstance(asked, Asked) else asked
+            response = await self._handler.respond(request) if isinstance(request, Asked) else request
         except Exception:
             log.exception("question not answered", extra={"servo": servo})
-            said = None
+            response = None
         if not polls:
             acknowledge()
-        if said is not None and connection.publish(down(servo), said, ANSWER_S) is None:
+        if response is not None and connection.publish(down(servo), response, _RESPONSE_EXPIRY_S) is None:
             log.warning("answer not sent: too much waits for the broker", extra={"servo": servo})
 
-    def _ready(self, _forgotten: bool) -> None:
+    def _on_connected(self, _session_lost: bool) -> None:
         self.connected = True
         log.info("broker connected", extra={"broker": self._broker.url, "group": self._group})
 
-    def _lost(self, why: str) -> None:
+    def _on_lost(self, why: str) -> None:
         if self.connected:
             log.warning("broker lost", extra={"broker": self._broker.url, "why": why})
         self.connected = False

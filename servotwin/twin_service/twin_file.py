@@ -9,7 +9,7 @@ from servotwin.config.table import read_inner, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.twin.fleet import Fleet
 from servotwin.twin_service.config import ServiceConfig, read_service
-from servotwin.twin_service.job import Start
+from servotwin.twin_service.worker import WorkerStart
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class TwinFile:
     text: str
 
     @property
-    def start(self) -> Start:
+    def start(self) -> WorkerStart:
         """What a worker is told."""
-        return Start(self.text, str(self.path), str(self.path.parent))
+        return WorkerStart(self.text, str(self.path), str(self.path.parent))
 
 
 def read_twin(path: Path) -> TwinFile:

@@ -1,7 +1,7 @@
-"""A worker: a process that does what it is asked over one socket, and ends when that closes.
+"""Worker process, and the frames (`runtime.frames`) of MessagePack that it exchanges with the service; no pickles.
 
-Started as `python -m servotwin.twin_service.worker DESCRIPTOR`. It has no access to the store and keeps nothing but
-caches.
+Started as `python -m servotwin.twin_service.worker DESCRIPTOR`. It works on what it receives over that one socket and
+ends when the socket closes. It has no access to the store and keeps nothing but caches.
 """
 
 from __future__ import annotations
@@ -13,47 +13,100 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
 
 from servotwin.runtime.frames import frame, read_frame
 from servotwin.store.records import Lease, WorkResult
-from servotwin.twin_service.job import Done, framed, job_of, start_of
 
+
+class WorkerStart(NamedTuple):
+    """First message to a worker.
+
+    Attributes
+    ----------
+    text : str
+        Text of the twin's file.
+    source, folder : str
+        Its name in messages; the folder that its relative paths start from.
+    """
+
+    text: str
+    source: str
+    folder: str
+
+
+class WorkerJob(NamedTuple):
+    """Leases to be processed in order; `now` in s: since the epoch, or sample time in lock-step."""
+
+    leases: tuple[Lease, ...]
+    now: float
+
+
+class LeaseResult(NamedTuple):
+    """Result of one lease.
+
+    Attributes
+    ----------
+    result : WorkResult or None
+    error : str
+        Why there is none.
+    seconds : float
+        Time that it took.
+    """
+
+    result: WorkResult | None
+    error: str
+    seconds: float
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decode_start = msgspec.msgpack.Decoder(WorkerStart).decode
+_decode_job = msgspec.msgpack.Decoder(WorkerJob).decode
+decode_result = msgspec.msgpack.Decoder(LeaseResult).decode
 Work = Callable[[Lease, float], WorkResult]
 
 
+def encode_frame(message: WorkerStart | WorkerJob | LeaseResult) -> bytes:
+    """Frame of a message."""
+    return frame(_encoder.encode(message))
+
+
 def main(descriptor: int) -> None:
-    """Work until nobody asks any more."""
+    """Process jobs until the socket closes."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the service ends its workers: by closing the socket
-    with socket.socket(fileno=descriptor) as line, line.makefile("rb") as incoming:
-        start = read_frame(incoming)
+        signal.signal(number, signal.SIG_IGN)  # the service ends its workers by closing the socket
+    with socket.socket(fileno=descriptor) as line, line.makefile("rb") as stream:
+        start = read_frame(stream)
         if start is None:
             return
-        work = _work_of(start)
+        work = _load_work(start)
         line.sendall(frame(b""))
-        while (body := read_frame(incoming)) is not None:
-            job = job_of(body)
-            for claim in job.claims:
-                line.sendall(framed(attempt(work, claim, job.now)))
+        while (body := read_frame(stream)) is not None:
+            job = _decode_job(body)
+            for lease in job.leases:
+                line.sendall(encode_frame(_attempt(work, lease, job.now)))
 
 
-def attempt(work: Work, claim: Lease, now: float) -> Done:
-    """Do it, whatever happens: an error is told, not raised."""
+def _attempt(work: Work, lease: Lease, now: float) -> LeaseResult:
+    """Process a lease; an exception becomes the result's error."""
     begun = time.perf_counter()
+    result, error = None, ""
     try:
-        outcome, error = work(claim, now), ""
+        result = work(lease, now)
     except Exception as failure:
-        outcome, error = None, f"{type(failure).__name__}: {failure}"
-    return Done(outcome, error, time.perf_counter() - begun)
+        error = f"{type(failure).__name__}: {failure}"
+    return LeaseResult(result, error, time.perf_counter() - begun)
 
 
-def _work_of(start: bytes) -> Work:
+def _load_work(start: bytes) -> Work:
     from servotwin.twin.fleet import Fleet
     from servotwin.twin.work import work
 
-    given = start_of(start)
+    given = _decode_start(start)
     fleet = Fleet.loads(given.text, given.source, Path(given.folder))
-    return lambda claim, now: work(fleet, claim, now)
+    return lambda lease, now: work(fleet, lease, now)
 
 
 if __name__ == "__main__":

@@ -21,10 +21,8 @@ from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN
 from servotwin.plant.noise import Noise
 from servotwin.runtime.files import make_directory, write_text
-from servotwin.twin_service.alone import in_turn
+from servotwin.twin_service.auth import PRIVATE, Verifiers, read_tokens, tokens_locked, write_private, write_tokens
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.secret_file import PRIVATE, write_private
-from servotwin.twin_service.tokens import Verifiers, read_tokens, write_tokens
 from servotwin.twin_service.twin_file import TwinFile, read_twin
 
 TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
@@ -115,7 +113,7 @@ def revoke(path: Path, name: str) -> Path:
         Nobody of that name has a token.
     """
     tokens = _tokens_file(read_twin(path))
-    with in_turn(tokens):
+    with tokens_locked(tokens):
         known = read_tokens(tokens)
         everybody = [*known.servos, *known.operators]
         if name not in everybody:
@@ -208,7 +206,7 @@ def _tokens_file(twin: TwinFile) -> Path:
 
 def _add(tokens: Path, role: str, name: str, token: str, again: bool) -> None:
     """To the file as it is now: others may have been enrolled meanwhile."""
-    with in_turn(tokens):
+    with tokens_locked(tokens):
         known = _known(tokens)
         there: Mapping[str, bytes] = getattr(known, role)
         _check_name(name, there, again)

@@ -19,7 +19,7 @@ from servotwin.errors import InvalidInput
 from servotwin.runtime.files import write_text
 from servotwin.runtime.locks import locked
 from servotwin.runtime.retry import Retry
-from servotwin.twin_service.tokens import Verifiers, write_tokens
+from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.up import enrolment
 from servotwin.up.pacing import FASTEST
 from servotwin.up.plan import PRE_TRIGGER_S, RATE, SERVOS, WINDOW_S, ServoPlan, machine_toml, twin_toml

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from servotwin.drives.simulated.diary import MachineState, read_state
 from servotwin.drives.simulated.settings import MachineSettings
-from servotwin.edge_process.status import read_status
+from servotwin.edge_process.monitoring import read_status
 from servotwin.errors import InvalidInput
 from servotwin.up.folder import MACHINE
 from servotwin.up.plan import ServoPlan

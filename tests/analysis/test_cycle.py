@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from servotwin.analysis.limit_cycles.cycle import CycleStatus, limit_cycle
 from servotwin.analysis.limit_cycles.orbit import Orbit
-from servotwin.analysis.limit_cycles.poincare import Section, fired
-from servotwin.analysis.limit_cycles.scaled import scaled_loop
-from servotwin.analysis.limit_cycles.symmetry import shift
+from servotwin.analysis.limit_cycles.poincare import Section, guard_events
+from servotwin.analysis.limit_cycles.scaled import scaled_loop, shift
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory
 from servotwin.plant.servo import Servo
@@ -86,7 +85,7 @@ def test_the_derivative_of_the_map_against_differences(share):
     start, mode = (found.start - loop.displacement) / loop.unit, found.start_mode
     run = Trajectory(loop.loop.automaton, start, mode, loop.sample_step)
     run.advance(1)
-    first = fired(run)[1][0]
+    first = guard_events(run)[1][0]
     section = Section(loop.loop.automaton, first, first, 1, loop.sample_step, 3.0 * found.period)
     shot = section.shoot(start)
     row = np.asarray(loop.loop.automaton.modes[first.mode].guards[first.guard].row)

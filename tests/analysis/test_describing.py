@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.analysis.limit_cycles.cycle import limit_cycle
-from servotwin.analysis.limit_cycles.describing import play_function, predictions
-from servotwin.analysis.limit_cycles.predicted import limit_cycle_near
+from servotwin.analysis.limit_cycles.describing import limit_cycle_near, play_function, predictions
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory
 from servotwin.plant.backlash import play

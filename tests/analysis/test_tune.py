@@ -9,10 +9,10 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from servotwin.analysis.tuning.factors import KINDS, Factors, factorised
-from servotwin.analysis.tuning.response import FrequencyData, Plant, circled
+from servotwin.analysis.tuning.candidates import CONTROLLER_TYPES, Factors, factored
+from servotwin.analysis.tuning.response import FrequencyData, Plant, nyquist_stable
 from servotwin.analysis.tuning.setpoint import overshoot, prefilter, shaped
-from servotwin.analysis.tuning.tune import Specification, judged, tune
+from servotwin.analysis.tuning.tune import Specification, evaluate, tune
 from servotwin.cli import app as cli
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
@@ -25,7 +25,7 @@ FIRST = PAPER.margins().gain_crossovers[0]
 
 
 def test_the_printed_gains_factor_as_stated():
-    found = factorised(PAPER.controller, 10.0)
+    found = factored(PAPER.controller, 10.0)
     assert math.degrees(found.phz) == pytest.approx(59.833, abs=5e-4)
     assert math.degrees(found.be) == pytest.approx(0.470, abs=5e-4)
     assert math.degrees(found.al) == pytest.approx(45.0, abs=1e-9)
@@ -56,7 +56,7 @@ def lag_plant() -> linear.LinearSystem:
     return linear.series(linear.lag(2.0, 0.5), linear.series(linear.lag(1.0, 0.1), linear.lag(1.0, 0.02)))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "P"])
+@pytest.mark.parametrize("kind", [kind for kind in CONTROLLER_TYPES if kind != "P"])
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 def test_every_type_meets_its_specification(kind, gain):
     system = linear.series(linear.gain(gain), lag_plant())
@@ -67,7 +67,7 @@ def test_every_type_meets_its_specification(kind, gain):
     assert nearest.phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
     assert found.margins.stable
     law = found.controller
-    assert (law.Ki != 0.0) is KINDS[kind].integral
+    assert (law.Ki != 0.0) is CONTROLLER_TYPES[kind].integral
     assert math.copysign(1.0, law.Kp) == gain or kind == "PDF"
     if kind == "PI":
         assert law.Kd == 0.0
@@ -107,16 +107,16 @@ def test_nyquist_agrees_with_the_poles(wc, phz, share, al):
     poles = PAPER.closed_loop(factors.controller()).poles()
     assume(abs(np.max(poles.real)) > 1e-3)
     plant = Plant(PAPER.plant())
-    omega = plant.looks(wc)
+    omega = plant.search_frequencies(wc)
     loops = (factors.response(omega) * plant.response(omega))[None, :]
-    assert bool(circled(loops, plant.integrators + 1)[0]) is bool(np.max(poles.real) < 0.0)
+    assert bool(nyquist_stable(loops, plant.integrators + 1)[0]) is bool(np.max(poles.real) < 0.0)
 
 
 def test_a_double_zero_is_factored():
     """(s + 2)^2: rounding may make it a complex pair or two that differ by the square root of it."""
     for Tf in np.linspace(0.01, 0.3, 50):
         law = Controller(Kp=4.0 - 4.0 * Tf, Ki=4.0, Kd=1.0 - (4.0 - 4.0 * Tf) * Tf, Tf=Tf)
-        found = factorised(law, 3.0)
+        found = factored(law, 3.0)
         assert found.phz == pytest.approx(math.atan2(3.0, 2.0), abs=1e-6)
         assert found.be == pytest.approx(found.phz, abs=1e-6)
 
@@ -126,7 +126,7 @@ def test_a_double_zero_is_factored():
 )
 def test_zeros_that_are_not_real_and_stable_have_no_factors(law, said):
     with pytest.raises(InvalidInput, match=said):
-        factorised(law, 1.0)
+        factored(law, 1.0)
 
 
 @given(st.floats(0.5, 20.0), st.floats(0.05, 1.5), st.floats(0.0, 1.0), st.floats(0.05, 1.5))
@@ -135,7 +135,7 @@ def test_zeros_that_are_not_real_and_stable_have_no_factors(law, said):
 @example(1.0, 1.0, 1e-300, 1.0)
 def test_factors_and_gains_are_inverse(wc, phz, share, al):
     factors = Factors(3.0, wc, phz, share * phz, al, True)
-    found = factorised(factors.controller(), wc)
+    found = factored(factors.controller(), wc)
     np.testing.assert_allclose(found[:5], factors[:5], rtol=1e-9, atol=1e-6)
     omega = np.logspace(-1, 3, 20)
     np.testing.assert_allclose(loop.pidf(factors.controller()).response(omega), factors.response(omega), rtol=1e-9)
@@ -155,17 +155,17 @@ def test_frequency_data_give_what_the_system_gives():
 def test_a_delay_is_a_turn_of_the_phase_and_stays_stable():
     delay, wanted = 0.02, Specification(4.2, math.radians(60.0))
     found = tune(PAPER.plant(), wanted, delay)
-    without = judged(PAPER.plant(), found.controller).gain_crossovers[0]
+    without = evaluate(PAPER.plant(), found.controller).gain_crossovers[0]
     assert without.phase_margin == pytest.approx(wanted.phase_margin + 4.2 * delay, abs=1e-9)
     assert found.margins.gain_crossovers[0].phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
     assert found.margins.stable
     long = min(x.phase_margin / x.omega for x in found.margins.gain_crossovers if x.phase_margin > 0.0)
-    assert not judged(PAPER.plant(), found.controller, delay + 1.05 * long).stable
-    assert judged(PAPER.plant(), found.controller, delay + 0.95 * long).stable
+    assert not evaluate(PAPER.plant(), found.controller, delay + 1.05 * long).stable
+    assert evaluate(PAPER.plant(), found.controller, delay + 0.95 * long).stable
 
 
 def test_margins_without_polynomials_against_those_with():
-    near, exact = judged(PAPER.plant(), PAPER.controller, delay=1e-12), PAPER.margins()
+    near, exact = evaluate(PAPER.plant(), PAPER.controller, delay=1e-12), PAPER.margins()
     assert [x.omega for x in near.gain_crossovers] == pytest.approx([x.omega for x in exact.gain_crossovers], rel=1e-8)
     assert near.phase_crossovers[0].gain_margin == pytest.approx(exact.phase_crossovers[0].gain_margin, rel=1e-6)
     assert near.Ms == pytest.approx(exact.Ms, rel=1e-6)

@@ -13,10 +13,10 @@ from dask_cluster import Cluster
 from matplotlib import image
 from typer.testing import CliRunner
 
-from servotwin.analysis.maps import pieces
+from servotwin.analysis.maps import store as pieces
 from servotwin.analysis.maps.measures import measured
 from servotwin.analysis.maps.result import StabilityMap
-from servotwin.analysis.maps.store import Store
+from servotwin.analysis.maps.store import MapStore
 from servotwin.cli import app as cli
 from servotwin.cli.map import table
 from servotwin.cli.map.command import stability_map
@@ -88,9 +88,9 @@ def test_an_interrupted_map_goes_on_to_the_same_bytes(finished, tmp_path, monkey
         kept.append(number)
         keep(self, number, measures)
 
-    keep = Store.keep
+    keep = MapStore.keep
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "keep", interrupted)
+        patch.setattr(MapStore, "keep", interrupted)
         result = run("paper", *SMALL, "--out", out, "--workers", "1")
     assert result.exit_code == 130
     assert result.stderr == f"interrupted: 4 of 9 pieces are in {out}; the same command goes on from there\n"

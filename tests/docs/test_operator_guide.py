@@ -27,9 +27,9 @@ from servotwin.messages import Cause, Outcome, Reason, Refusal
 from servotwin.store.records import Backlog
 from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import ALARMS
-from servotwin.twin_service.pool import Pool
-from servotwin.twin_service.system import System
+from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
+from servotwin.twin_service.worker_pool import WorkerPool
 
 ROOT = Path(__file__).parents[2]
 OPERATOR = ROOT / "docs/operator"
@@ -60,10 +60,14 @@ def named(title: str) -> list[str]:
     return [name for cells in rows(title) for name in NAME.findall(cells[0])]
 
 
-def calls(folder: str, *functions: str) -> set[str]:
-    """First arguments, where they are texts, of calls of these names in a package or a file."""
-    found = (ROOT / "servotwin" / folder).rglob("*.py") if not folder.endswith(".py") else [ROOT / "servotwin" / folder]
-    nodes = [node for path in found for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+def trees(package: str) -> list[ast.Module]:
+    """Parse every module of a package, so that a moved function is still found."""
+    return [ast.parse(path.read_text()) for path in sorted((ROOT / "servotwin" / package).rglob("*.py"))]
+
+
+def calls(package: str, *functions: str) -> set[str]:
+    """First arguments, where they are texts, of calls of these names in a package."""
+    nodes = [node for tree in trees(package) for node in ast.walk(tree) if isinstance(node, ast.Call)]
     first = [node.args[0] for node in nodes if node.args and _last(node.func) in functions]
     either = [each for node in first if isinstance(node, ast.IfExp) for each in (node.body, node.orelse)]
     texts = [node.value for node in (*first, *either) if isinstance(node, ast.Constant)]
@@ -77,19 +81,20 @@ def _last(node: ast.expr) -> str:
     return node.id if isinstance(node, ast.Name) else ""
 
 
-def keys(file: str, function: str) -> set[str]:
-    """Texts that are keys in a function's dictionaries, or of what it sets."""
-    tree = ast.parse((ROOT / "servotwin" / file).read_text())
-    (body,) = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == function]
-    made = [key for node in ast.walk(body) if isinstance(node, ast.Dict) for key in node.keys]
-    put = [node.slice for node in ast.walk(body) if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)]
+def keys(package: str, function: str) -> set[str]:
+    """Texts that are keys in the dictionaries of a function, or that it sets."""
+    nodes = [node for tree in trees(package) for node in ast.walk(tree)]
+    bodies = [node for node in nodes if isinstance(node, ast.FunctionDef) and node.name == function]
+    assert bodies, f"{package} has no function {function}"
+    inside = [node for body in bodies for node in ast.walk(body)]
+    made = [key for node in inside if isinstance(node, ast.Dict) for key in node.keys]
+    put = [node.slice for node in inside if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)]
     return {key.value for key in (*made, *put) if isinstance(key, ast.Constant) and isinstance(key.value, str)}
 
 
-def counted(file: str, *names: str) -> set[str]:
+def counted(package: str, *names: str) -> set[str]:
     """Texts under which something is counted: counts["..."] += 1."""
-    tree = ast.parse((ROOT / "servotwin" / file).read_text())
-    places = [node.target for node in ast.walk(tree) if isinstance(node, ast.AugAssign)]
+    places = [node.target for tree in trees(package) for node in ast.walk(tree) if isinstance(node, ast.AugAssign)]
     inside = [node.slice for node in places if isinstance(node, ast.Subscript) and _last(node.value) in names]
     return {node.value for node in inside if isinstance(node, ast.Constant) and isinstance(node.value, str)}
 
@@ -108,73 +113,67 @@ def test_every_answer_and_every_cause_is_explained(title: str, names: Any) -> No
 
 
 @pytest.fixture
-def system(tmp_path: Path) -> Iterator[System]:
+def system(tmp_path: Path) -> Iterator[TwinService]:
     """A service that has not begun, with a broker, so that it has every metric."""
     twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n', tokens=False))
     store = open_store(twin.service.store)
-    made = System(twin, store, pool=Pool(0, twin.start, 1.0))
+    made = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
     try:
-        _ = made.app
+        made.http_app()
         yield made
     finally:
         made.commits.close()
-        made.shelf.close()
+        made.executor.close()
         store.close()
 
 
-def test_every_metric_is_explained(system: System) -> None:
+def test_every_metric_is_explained(system: TwinService) -> None:
     told = set(re.findall(r"^# TYPE (\S+)", system.metrics.text(), re.MULTILINE))
     explained = named("Metrics of the twin")
     assert {name for name in explained if name.startswith("servotwin_")} == told
     assert {name for name in explained if not name.startswith("servotwin_")} == calls(
-        "service/dispatcher.py", "counts.add", ".add"
+        "twin_service", "counts.add", ".add"
     )
     everywhere = re.findall(r"\bservotwin_[a-z_]+", ALARM + GUIDE)
     assert set(everywhere) - told <= {"servotwin_version"}
 
 
-def test_every_field_of_health_is_explained(system: System) -> None:
+def test_every_field_of_health_is_explained(system: TwinService) -> None:
     assert set(named("Health of the twin")) == {*system.health(), "waiting"}
     assert all(f"`{name}`" in section("Health of the twin") for name in Backlog._fields)
 
 
 def test_every_line_of_the_twin_s_log_is_explained() -> None:
     levels = [f"log.{level}" for level in ("debug", "info", "warning", "error", "exception")]
-    assert sorted(named("Log of the twin")) == sorted(calls("service", *levels) | set(ALARMS))
+    assert sorted(named("Log of the twin")) == sorted(calls("twin_service", *levels) | set(ALARMS))
 
 
 def test_every_line_of_an_edge_s_log_is_explained() -> None:
-    said = calls("gateway", "say") - {"trouble"}
-    places = calls("gateway", "look", "troubles.look")
+    said = calls("edge_process", "log") - {"trouble"}
+    places = calls("edge_process", ".update", "troubles.update")
     explained = [cells[0] for cells in rows("Log of an edge")]
     assert {f"`trouble` where `{place}`" for place in places} == {each for each in explained if "where" in each}
     assert {each.strip("`") for each in explained if "where" not in each} == said
 
 
 def test_every_reason_for_which_a_window_is_dropped_is_explained() -> None:
-    reasons = (outlet.WITHHELD, outlet.NOT_FINITE, outbox.FULL, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE,
+    reasons = (outlet.FILTERED, outlet.NOT_FINITE, outbox.FULL, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE,
                sqlite_outbox.LETTERS, pipe_outlet.BEHIND)  # fmt: skip
     assert sorted(named("Windows that are dropped")) == sorted(reasons)
 
 
 def test_every_field_of_an_edge_s_status_is_explained() -> None:
-    fields = (
-        keys("gateway/linkprocess.py", "_status") | keys("gateway/edge.py", "_told") | keys("gateway/edge.py", "_gains")
-    )
-    fields |= keys("gateway/ticks.py", "summary")
-    for file in ("gateway/edge.py", "gateway/control.py", "gateway/supervise.py", "gateway/run.py"):
-        fields |= counted(file, "self.counts", "edge.counts", ".counts")
-    for file in ("link/courier.py", "link/listener.py"):
-        fields |= counted(file, "self.counts")
+    fields = set().union(*(keys("edge_process", name) for name in ("_status", "_gains", "summarise")))
+    fields |= counted("edge_process", "self.counts", "edge.counts", ".counts") | counted("link", "self.counts")
     text = section("Status of an edge")
     assert fields - set(NAME.findall(text)) == set()
-    faults = counted("gateway/keeping.py", "self.faults") | counted("gateway/linkprocess.py", "self._faults")
-    faults |= {sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE, "window not judged"}
+    faults = counted("edge_process", "self.faults", "self._faults")
+    faults |= {sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE, outlet.UNFILTERED}
     assert faults - set(NAME.findall(text)) == set()
 
 
 def test_every_kind_of_evidence_is_explained() -> None:
-    kinds = calls("twin/evidence.py", "self._computed", "self._message", "self._of_update")
+    kinds = calls("twin", "self._computed", "self._message", "self._of_update")
     assert set(NAME.findall("".join(cells[0] for cells in rows("What is found of a window")))) == kinds | {"failed"}
 
 

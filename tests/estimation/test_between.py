@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import random_cases
-from servotwin.estimation.core.between import polygon
+from servotwin.estimation.core.between import polygon, pushed
 from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
 from servotwin.estimation.core.projection import orthonormal, project_out
 from servotwin.estimation.core.response import response
@@ -113,3 +113,17 @@ def test_a_screw_that_rests_keeps_all_derivatives():
     exact, samples = polygon(theta_m, Gap(0.5, 0.0)), contacts(theta_m, Gap(0.5, 0.0))
     np.testing.assert_array_equal(exact[1:, 40:], samples[1:, 40:])
     assert np.ptp(exact[BY_RATE, 40:]) == 0.0
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.0, 1e-3), (4e-4, -3e-4), (-2e-4, 5e-4)])
+def test_in_contact_throughout_area_and_moment_are_those_of_the_cubic(before: float, after: float) -> None:
+    """By Gauss's quadrature, which is exact for a quartic."""
+    high, twist = 0.02, after - before
+    slope = high - 0.5 * before - twist / 6.0
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    x, weights = 0.5 * (nodes + 1.0), 0.5 * weights
+    bow = x * (slope + x * (0.5 * before + x * twist / 6.0)) - high * x
+    crest, begin, area, moment = pushed(0.0, high, before, after)
+    assert (crest, begin) == (high, 0.0)
+    assert area == pytest.approx(float(weights @ bow), rel=1e-9)
+    assert moment == pytest.approx(float(weights @ (x * bow)), rel=1e-9)

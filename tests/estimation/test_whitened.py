@@ -1,6 +1,7 @@
 """The default estimator: right, honest about how right, and silent where it cannot know; reduced from its bench."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,9 +12,12 @@ from benchmarks import estimator_conditions as conditions
 from benchmarks.cramer_rao import bound, noise_root
 from benchmarks.estimator_windows import RATE, Case, cut, paper_loop_cases, random_cases
 from servotwin.errors import InvalidInput
+from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.whitened.estimator import Settings
+from servotwin.estimation.whitened.estimator import Settings, fit
+from servotwin.estimation.whitened.gate import Evidence, judge
+from servotwin.estimation.whitened.model_check import Shift
 from servotwin.estimation.whitened.plain import plain_fit
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
@@ -376,3 +380,46 @@ def test_growth_is_among_the_reasons():
     run = simulate(SERVO, 22.0, reference=SquareWave(1e-3, 20.0), gap=SCurve(0.0, math.radians(60.0), 40.0))
     refused = [estimate_gap(cut(run, start, 1.0).window, SERVO) for start in (9.9, 10.2, 20.0)]
     assert any("grows by +" in reason for estimate in refused for reason in estimate.reasons), refused
+
+
+def evidence(case: Case) -> Evidence:
+    """Evidence of a clean fit with a spread of 0.01 deg, against which nothing speaks."""
+    fitted = fit(measured(case), case.servo, None, Settings())
+    assert fitted.aligned is not None
+    gap, std = fitted.aligned.found.point.gap, math.radians(0.01)
+    return Evidence(
+        aligned=fitted.aligned,
+        std=std,
+        interval=(gap - 2.0 * std, gap + 2.0 * std),
+        travel=Travel(1.0, 1.0, gap),
+        shift=Shift(0.0, std, "", 0.0),
+        observer=(0.0, math.inf),
+        lost_motion=gap,
+        unexplained=0.0,
+    )
+
+
+@pytest.mark.parametrize(("deviations", "status"), [(2.0, GapStatus.OK), (5.0, GapStatus.MODEL_MISMATCH)])
+@pytest.mark.parametrize("view", ["free model", "observer form", "lost motion"])
+def test_another_view_counts_from_three_standard_deviations_on(view: str, deviations: float, status: GapStatus):
+    """Noise moves every view of a window; only what it cannot explain is held against the model."""
+    seen, given = evidence(clean()[1]), Settings()
+    std = math.radians(0.1)
+    most = 1.05 * seen.aligned.found.point.gap + given.contact_travel
+    seen = {
+        "free model": replace(seen, shift=Shift(deviations * std, std, "a stiffness off", 0.0)),
+        "observer form": replace(seen, observer=(-deviations * std, std)),
+        "lost motion": replace(seen, std=0.4 * std, lost_motion=most + 0.4 * deviations * std),
+    }[view]
+    assert judge(seen, given)[0] is status
+
+
+def test_a_slow_motion_beyond_what_noise_leaves_is_a_wrong_model():
+    """A swing of 0.14 mm rms at 7 Hz is 27 times what noise of 0.1 mm leaves of itself when averaged."""
+    case = clean()[1]
+    window = measured(case, floor=1e-4)
+    assert estimate_gap(window, case.servo).status is not GapStatus.MODEL_MISMATCH
+    swing = 2e-4 * np.sin(2.0 * math.pi * 7.0 * np.arange(window.position.size) / window.sample_rate)
+    found = estimate_gap(window.replace(position=window.position + swing), case.servo)
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert "slow motion unexplained" in " ".join(found.reasons)

@@ -162,3 +162,33 @@ def test_relay_without_hysteresis_on_a_double_integrator_is_a_clock() -> None:
     times = np.array([event[0] for event in trajectory.events()])
     assert len(times) == 150
     assert np.abs(times - (2.0 * np.arange(150) + 1.0)).max() < 1e-10
+
+
+def test_a_short_bump_that_an_event_sets_off_is_not_missed() -> None:
+    """The event starts five exponentials whose sum x (1 - x)^4, x = exp(-t), rises above a level and falls again within
+    a few search steps: long gone where the coarse search would look next."""
+    weights, level, begin = np.array([1.0, -4.0, 6.0, -4.0, 1.0]), 0.07, 3.978
+    n = 7  # the five exponentials, a clock, one
+    flow = np.zeros((n, n))
+    flow[:5, :5], flow[5, 6] = -np.diag(np.arange(1.0, 6.0)), 1.0
+    start = np.eye(n)
+    start[:5, 6] = 1.0
+    ring = Guard(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -begin]), 1, start, "ring")
+    rise = Guard(np.array([*weights, 0.0, -level]), 2, None, "rise")
+    fall = Guard(-np.array([*weights, 0.0, -level]), 1, None, "fall")
+    names = (*(f"x{k}" for k in range(1, 6)), "clock", "one")
+    automaton = Automaton((Mode(flow, (ring,)), Mode(flow, (rise,)), Mode(flow, (fall,))), names)
+    state = np.zeros(n)
+    state[6] = 1.0
+    trajectory = Trajectory(automaton, state, 0, 0.4)
+    assert trajectory.step == 0.4
+    trajectory.advance(200)
+
+    def bump(time: float) -> float:
+        x = np.exp(-time)
+        return float(x * (1.0 - x) ** 4 - level)
+
+    top = np.log(5.0)
+    expected = [begin, begin + brentq(bump, 0.0, top, xtol=1e-15), begin + brentq(bump, top, 9.0, xtol=1e-15)]
+    assert [event[1] for event in trajectory.events()] == ["ring", "rise", "fall"]
+    assert [event[0] for event in trajectory.events()] == pytest.approx(expected, rel=1e-12)

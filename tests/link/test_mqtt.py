@@ -48,7 +48,7 @@ def test_windows_letters_and_messages_go_both_ways(server: Mosquitto, store: Sto
         found = opened(key_of(verifier_of(TOKENS["axis-1"])), TO_EDGE, "axis-1", sealed, 100)
         assert (found.serial, found.body) == (1, b"first")
         assert here.listen(0) == [sealed]
-        assert there.metrics.taken.values == {("window", "new"): 1, ("window", "known"): 1, ("letter", "new"): 1}
+        assert there.metrics.stored.values == {("window", "new"): 1, ("window", "known"): 1, ("letter", "new"): 1}
 
 
 def test_a_poll_without_news_ends_empty(server: Mosquitto, store: Store) -> None:
@@ -69,7 +69,7 @@ def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> Non
         for k in range(20):
             first.deliver(parcel(k))
             second.deliver(parcel(k, "axis-2"))
-        taken = [sum(each.metrics.taken.values.values()) for each in (one, other)]
+        taken = [sum(each.metrics.stored.values.values()) for each in (one, other)]
         assert sum(taken) == 40
         assert min(taken) > 0
         assert kept(store) == kept(store, "axis-2") == list(range(20))

@@ -19,8 +19,8 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import STILL, Trial, assess
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.assess import STILL, Trial, assess, nearness
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
@@ -103,6 +103,16 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
         Uncertainty().replace(kk=0.1)
 
 
+def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
+    """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
+    held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)
+    found = certify(held, Uncertainty(gap=gaps(0, 5)), SMALL, SHORT)
+    assert isinstance(found, NotVerified)
+    assert "no gain crossover" in found.reason
+    assert found.best is not None
+    assert (found.best.crossover, found.best.phase_margin) == (0.0, math.pi)
+
+
 # --- measures
 
 
@@ -129,6 +139,11 @@ def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
         last = error[-round(SHORT.last * SHORT.rate) :]
         assert found.ripple[p, c] == pytest.approx(0.5 * np.ptp(last), rel=1e-6, abs=1e-13)
         assert found.tail[p, c] == pytest.approx(np.abs(last).max(), rel=1e-6, abs=1e-13)
+        beyond = max(last.mean() - error.min(), 0.0) / (step + 2.0 * abs(last.mean()))
+        assert found.overshoot[p, c] == pytest.approx(beyond, rel=1e-6, abs=1e-12)
+        near = nearness(setting, members.input_bias, members.step.max())[p, c]
+        arrived = 1 + np.max(np.flatnonzero(np.abs(error) > near), initial=-1)
+        assert found.settling[p, c] == pytest.approx(arrived / SHORT.rate, abs=1e-12)
         assert found.cost[p, c] == pytest.approx(np.abs(error).mean() * SHORT.duration / step, rel=1e-6)
         assert found.effort[p, c] == pytest.approx(
             np.sqrt(np.mean(run.voltage[-last.size :] ** 2)), rel=1e-6, abs=1e-12
@@ -212,8 +227,8 @@ def test_no_candidate_is_one_sentence() -> None:
 
 def test_what_cannot_be_proved_is_refused_with_the_best_found() -> None:
     found = certify(SERVO, Uncertainty(gap=gaps(29, 31)), replace(SMALL, overshoot=1e-6), SHORT)
-    assert isinstance(found, Refusal)
-    assert "candidates is proved: the best overshoots by" in found.reason
+    assert isinstance(found, NotVerified)
+    assert "candidates is verified: the best overshoots by" in found.reason
     assert found.best is not None
     assert found.best.overshoot > 1e-6
 
@@ -300,9 +315,9 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
     wide = rule.redesign(Evidence(estimated(10.0)))
     unit = SERVO.tolerance_for(gap_range(estimated(10.0))[1])
-    assert wide.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
+    assert wide.setting.tolerance == pytest.approx(settling_map(SERVO).least(1e-4 / unit, 1e-3 / unit) * unit)
     noisy = rule.redesign(Evidence(estimated(0.1), at_rest(0.0, noise=1e-3)))
-    assert noisy.tolerance == pytest.approx(3e-3)
+    assert noisy.setting.tolerance == pytest.approx(3e-3)
     assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 
@@ -344,3 +359,18 @@ def test_on_the_model_a_millimetre_step_is_quick_and_hardly_overshoots(degrees: 
     off = run.position / 1e-3 - 1.0
     assert off.max() <= 0.1
     assert run.time[np.flatnonzero(np.abs(off) > 0.02)[-1]] <= 2.0
+
+
+@pytest.mark.parametrize("horizon", [20.0, 200.0])
+def test_wear_until_the_horizon_widens_the_range_of_gaps(horizon: float) -> None:
+    """A setting is to hold until the horizon, while the gap grows at the fastest rate that the trend allows."""
+    trend = Trend.start()
+    for time in range(6):
+        trend = trend.update(replace(estimated(4.0 + 0.01 * time), time=10.0 * time))
+    assert trend.rate_interval[1] > 0.0
+    last = replace(estimated(4.05), time=50.0)
+    policy = CertifiedPolicy(SERVO, Uncertainty(gap=gaps(0.0, 4.06)), horizon=horizon)
+    high = gap_range(last)[1] + horizon * trend.rate_interval[1]
+    for one, most in ((replace(policy, horizon=horizon), high), (replace(policy, horizon=0.0), gap_range(last)[1])):
+        reason = one.redesign(Evidence(last, trend=trend)).reason
+        assert f"to {math.degrees(most):.3g} deg" in reason

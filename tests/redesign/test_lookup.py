@@ -17,21 +17,20 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import Trial
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import (
+    CellIndex,
     CertifiedTable,
     Grid,
-    Key,
     TablePolicy,
     cell_range,
-    keys_of,
-    proved,
+    cells_of,
+    certify_cell,
     table_of,
 )
 from servotwin.redesign.certified.lookup_file import build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.region import Region
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.twin.policies import policy_of
@@ -51,7 +50,9 @@ POLICY = CertifiedPolicy(
 
 @cache
 def table() -> CertifiedTable:
-    return table_of(POLICY, GRID, {key: proved(POLICY, GRID, key) for key in keys_of(GRID, POLICY.uncertainty.gap)})
+    return table_of(
+        POLICY, GRID, {key: certify_cell(POLICY, GRID, key) for key in cells_of(GRID, POLICY.uncertainty.gap)}
+    )
 
 
 def region(low=9.0, high=10.0, feedforward=0.0, left=1e-3, noise=0.0, friction=(0.0, 0.0)) -> Region:
@@ -79,7 +80,7 @@ def test_every_interval_lies_in_a_cell_at_most_four_times_as_wide(one: float, ot
     assert cell[0] <= low <= high <= cell[1] + 1e-12
     assert key.level == 0 or cell[1] - cell[0] <= 4.0 * (high - low) * (1.0 + 1e-9)
     assert cell[1] - cell[0] <= max(grid.levels(stated)[0], 4.0 * (high - low)) * (1.0 + 1e-9)
-    assert key in set(keys_of(grid, stated))
+    assert key in set(cells_of(grid, stated))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +114,7 @@ def test_what_is_looked_up_is_proved_for_the_region(one, other, fed, left, noise
     low, high = sorted((one, other))
     asked = region(low, high, fed, left, noise)
     found = table().find(asked)
-    if isinstance(found, Refusal):
+    if isinstance(found, NotVerified):
         assert asked.largest_bias > GRID.biases[-1] * (1.0 - 1e-9)
         return
     assert found.gap[0] <= asked.gap[0]
@@ -150,7 +151,7 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
 )
 def test_what_no_cell_contains_is_not_covered(asked: Region, why: str) -> None:
     found = table().find(asked)
-    assert isinstance(found, Refusal)
+    assert isinstance(found, NotVerified)
     assert why in found.reason
 
 
@@ -162,7 +163,7 @@ def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
     assert isinstance(wide, Certificate)
     assert wide.gap == POLICY.uncertainty.gap
     none = replace(table(), cells=dict.fromkeys(cells)).find(asked)
-    assert isinstance(none, Refusal)
+    assert isinstance(none, NotVerified)
 
 
 def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
@@ -181,11 +182,11 @@ def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
 
 def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
     fine = Grid(2.0 * DEG, (1e-2,), (0.0,))
-    narrow, wide = (table().cells[Key(level, 0, 0, 0)] for level in (0, 1))
+    narrow, wide = (table().cells[CellIndex(level, 0, 0, 0)] for level in (0, 1))
     other = Design(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
     widest = len(fine.levels(POLICY.uncertainty.gap)) - 1
     assert widest > 3
-    cells = {Key(0, 0, 0, 0): narrow, Key(widest, 0, 0, 0): replace(wide, setting=other)}
+    cells = {CellIndex(0, 0, 0, 0): narrow, CellIndex(widest, 0, 0, 0): replace(wide, setting=other)}
     found = replace(table(), grid=fine, cells=cells).find(region(0.1, 0.2), other.setting())
     assert found.setting == narrow.setting
 
@@ -193,7 +194,7 @@ def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
 def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
     """Cells with more bias than is called known are proved without a bound on the overshoot."""
     cells = {key: found for key, found in table().cells.items() if key.bias == 1}
-    assert isinstance(replace(table(), cells=cells).find(region(left=5e-3)), Refusal)
+    assert isinstance(replace(table(), cells=cells).find(region(left=5e-3)), NotVerified)
     assert isinstance(replace(table(), cells=cells).find(region(left=2e-2)), Certificate)
 
 
@@ -201,9 +202,9 @@ def test_a_cell_whose_voltage_meets_its_limit_is_not_proved() -> None:
     """There a feedforward would leave less on one side."""
     tight = replace(POLICY, servo=SERVO.replace(voltage_limit=1.0))
     loose = replace(POLICY, servo=SERVO.replace(voltage_limit=40.0))
-    key = Key(0, 0, 0, 0)
-    assert proved(tight, GRID, key) is None
-    found = proved(loose, GRID, key)
+    key = CellIndex(0, 0, 0, 0)
+    assert certify_cell(tight, GRID, key) is None
+    found = certify_cell(loose, GRID, key)
     assert found is not None
     assert found.setting.controller.voltage_limit == 40.0
 
@@ -215,17 +216,17 @@ def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
     exact, looked_up = POLICY.redesign(evidence()), TablePolicy(POLICY, table()).redesign(evidence())
     assert looked_up.setting is not None
     assert looked_up.setting.gains.feedforward == exact.setting.gains.feedforward == -0.05
-    assert exact.owed is None
-    assert looked_up.owed is not None
-    assert looked_up.owed.gap == exact.certificate.gap
-    assert isinstance(POLICY.confirm(looked_up.owed, looked_up.certificate.setting), Certificate)
+    assert exact.to_verify is None
+    assert looked_up.to_verify is not None
+    assert looked_up.to_verify.gap == exact.certificate.gap
+    assert isinstance(POLICY.confirm(looked_up.to_verify, looked_up.certificate.setting), Certificate)
 
 
 def test_what_is_not_covered_gets_the_fallback_set_and_owes_nothing() -> None:
     made = TablePolicy(POLICY, table()).redesign(replace(evidence(), disturbance=Disturbance(0, math.inf, 0.0, 0, 0)))
     assert "the fallback set is sent" in made.reason
     assert made.setting.gains == gains_of(table().fallback.setting.controller)
-    assert made.owed is None
+    assert made.to_verify is None
 
 
 def test_what_is_in_force_is_not_sent_again() -> None:
@@ -233,7 +234,7 @@ def test_what_is_in_force_is_not_sent_again() -> None:
     made = policy.redesign(evidence())
     again = policy.redesign(evidence(10.1, setting=made.setting))
     assert again.setting is None
-    assert again.owed is None
+    assert again.to_verify is None
     assert "in force already" in again.reason
 
 
@@ -260,15 +261,15 @@ def test_a_table_comes_back_from_its_file_as_it_was(file: Path) -> None:
 
 def test_a_table_goes_on_where_it_was_interrupted(file: Path, tmp_path: Path, monkeypatch) -> None:
     path = built(tmp_path / "part.table", cells=3)
-    with pytest.raises(InvalidInput, match=r"part\.table: \d+ cells of this table are not proved yet"):
+    with pytest.raises(InvalidInput, match=r"part\.table: \d+ cells of this table are not verified yet"):
         load(path, POLICY)
     looked_at = []
 
     def counted(policy, grid, key):
         looked_at.append(key)
-        return proved(policy, grid, key)
+        return certify_cell(policy, grid, key)
 
-    monkeypatch.setattr("servotwin.redesign.certified.lookup_file.proved", counted)
+    monkeypatch.setattr("servotwin.redesign.certified.lookup_file.certify_cell", counted)
     assert load(built(path), POLICY) == table()
     assert len(looked_at) == len(table().cells) - 3
 

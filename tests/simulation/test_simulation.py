@@ -155,3 +155,23 @@ def test_measured_so_far(controller: object) -> None:
             assert np.abs(part - whole.measured(name)[last:index]).max() <= 1e-13 * np.abs(whole.measured(name)).max()
         last = index
     assert live.time == 0.5
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("rate", [None, 1000.0])
+def test_a_gap_that_jumps_shut_hits_the_chain_through_its_damper(rate: float | None, side: float) -> None:
+    """The screw is put on its flank at once; the chain answers as G2 does to a step of the screw: the damper's impulse
+    sets the second mass moving, at p c / m times the screw's jump."""
+    servo, at = Servo.preset("paper"), 0.1
+    still = servo.controller.replace(Kp=0.0, Ki=0.0, Kd=0.0, sample_rate=rate)
+    gap = PiecewiseCubic([0.0, at], [[10.0 * DEGREE, 0.0, 0.0, 0.0], [2.0 * DEGREE, 0.0, 0.0, 0.0]])
+    first, last = side * 4.0 * DEGREE, side * DEGREE
+    run = simulate(servo, 0.3, controller=still, gap=gap, theta_d0=first, sample_rate=20_000.0)
+    after = run.time >= at
+    assert np.all(run.theta_m == 0.0)
+    assert run.theta_d[after] == pytest.approx(last, rel=1e-12)
+    assert run.position[~after] == pytest.approx(servo.p * first, rel=1e-12)
+    answer = servo.p * first + (last - first) * servo.G2().step(run.time[after] - at)
+    assert run.position[after] == pytest.approx(answer, rel=1e-9, abs=1e-12)
+    speed = (run.q[after][1, 1] - run.q[after][0, 1]) * 20_000.0
+    assert speed == pytest.approx(servo.p * (last - first) * servo.c / servo.m, rel=0.02)

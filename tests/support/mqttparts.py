@@ -10,21 +10,18 @@ from mosquitto import Mosquitto
 from servotwin.link.broker import Broker, Connection, Events, Wanted
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
-from servotwin.link.transport import Parcel, Unreachable, squeezed
+from servotwin.link.transport import Parcel, Unreachable, deflated
 from servotwin.messages import Window, checksum, encode, pack_channel
 from servotwin.store.group_commit import GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
-from servotwin.twin_service.auth import Authority
-from servotwin.twin_service.broker_desk import Desk, Parts
-from servotwin.twin_service.future import Boots
+from servotwin.twin_service.auth import AccessControl, EdgeGate, Verifiers
 from servotwin.twin_service.ingest import Ingest
-from servotwin.twin_service.landing import Landing
-from servotwin.twin_service.limits import Buckets
-from servotwin.twin_service.metrics import Metrics
-from servotwin.twin_service.mqtt import Bridge
-from servotwin.twin_service.outgoing import Outgoing
-from servotwin.twin_service.tokens import Verifiers
+from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.long_poll import LongPolls
+from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
+from servotwin.twin_service.store_executor import FutureBridge
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 SERVOS = ("axis-1", "axis-2")
@@ -38,7 +35,7 @@ def window(sequence: int, servo: str = "axis-1") -> Window:
 
 
 def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
-    return Parcel(servo, *squeezed(encode(window(sequence, servo))), "b0", sequence)
+    return Parcel(servo, *deflated(encode(window(sequence, servo))), "b0", sequence)
 
 
 class Twin:
@@ -58,7 +55,7 @@ class Twin:
         assert self.store.commit([WorkResult(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [
             True
         ]
-        self._loop.call_soon_threadsafe(self.outgoing.post, servo)
+        self._loop.call_soon_threadsafe(self.polls.notify, servo)
 
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._stop.set)
@@ -69,22 +66,21 @@ class Twin:
         asyncio.run(self._main())
 
     async def _main(self) -> None:
-        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), Landing()
-        self.outgoing = Outgoing(self._posted, 100, 0.2)
-        boots = Boots(1.0, 1e9)
-        ingest = Ingest(lambda incoming: landing(self.commits.put(incoming)), SERVOS.__contains__, boots, self.metrics)
-        buckets = Buckets(1e6, 1e6, self._loop.time)
-        parts = Parts(
-            Authority(VERIFIERS), SERVOS.__contains__, buckets, ingest, self.outgoing, lambda: None, self.metrics
-        )
-        bridge = Bridge(self._broker, Desk(parts), "twins")
-        await bridge.begin()
-        while not bridge.connected:
+        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), FutureBridge()
+        self.polls = LongPolls(self._posted, 100, shared=True)
+        known = SERVOS.__contains__
+        limits = SampleTimeLimiter(1.0, 1e9)
+        ingest = Ingest(lambda incoming: landing.wrap(self.commits.put(incoming)), known, limits, self.metrics)
+        gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
+        handler = MqttRequestHandler(gate, ingest, self.polls, lambda: None, self.metrics)
+        server = MqttServer(self._broker, handler, "twins")
+        await server.start()
+        while not server.connected:
             await asyncio.sleep(0.01)
         self._began.set()
         await self._stop.wait()
-        self.outgoing.close()
-        await bridge.end()
+        self.polls.close()
+        await server.stop()
 
     async def _posted(self, servo: str, serial: int) -> list[OutgoingMessage]:
         return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
@@ -126,7 +122,7 @@ def kept(store: Store, servo: str = "axis-1") -> list[int]:
 
 
 def refusals(running: Twin) -> dict[str, int]:
-    return {code: number for (code,), number in running.metrics.refused.values.items()}
+    return {code: number for (code,), number in running.metrics.rejected.values.items()}
 
 
 def raw(server: Mosquitto, topic: str, payload: bytes) -> None:

@@ -33,5 +33,5 @@ def work(claim: Lease, now: float) -> WorkResult:
 
 
 if __name__ == "__main__":
-    worker._work_of = lambda _start: work
+    worker._load_work = lambda _start: work
     worker.main(int(sys.argv[1]))

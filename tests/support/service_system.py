@@ -17,10 +17,10 @@ from servotwin import messages
 from servotwin.link.seal import verifier_of
 from servotwin.messages import Hello, Setting, Window, encode, pack_channel
 from servotwin.store.store import open_store
-from servotwin.twin_service.pool import Pool
-from servotwin.twin_service.system import System
-from servotwin.twin_service.tokens import Verifiers, write_tokens
+from servotwin.twin_service.auth import Verifiers, write_tokens
+from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
+from servotwin.twin_service.worker_pool import WorkerPool
 
 TOKEN, OTHER, OPERATOR = "token-of-ax-1", "token-of-ax-2", "token-of-the-operator"
 SERVO = '[models.axis]\nservo = "paper"\n[models.axis.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "axis"\n'
@@ -66,15 +66,15 @@ def place(found: Window) -> str:
 
 
 @contextlib.asynccontextmanager
-async def served(path: Path, workers: int = 0) -> AsyncIterator[tuple[System, httpx.AsyncClient]]:
+async def served(path: Path, workers: int = 0) -> AsyncIterator[tuple[TwinService, httpx.AsyncClient]]:
     """The service in this process, its lifespan begun, and a client of it."""
     twin = read_twin(path)
     store = open_store(twin.service.store)
-    pool = Pool(workers, twin.start, twin.service.job_timeout_s)
-    system = System(twin, store, pool=pool)
-    app = system.app
+    pool = WorkerPool(workers, twin.start, twin.service.job_timeout_s)
+    system = TwinService(twin, store, pool=pool)
+    app = system.http_app()
     try:
-        async with app.api.router.lifespan_context(app.api):
+        async with app.lifespan():
             transport = httpx.ASGITransport(app, raise_app_exceptions=True)
             async with httpx.AsyncClient(transport=transport, base_url="http://twin") as client:
                 yield system, client

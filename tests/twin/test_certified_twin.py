@@ -96,7 +96,7 @@ def test_where_nothing_is_proved_the_fallback_set_is_sent_and_it_is_said():
     settings = SETTINGS.replace(demands=replace(FEW, integral=(0.0,)))
     (update,), redesign = answer(settings=settings, told=disturbed(0.4))
     proved = certified(PAPER, settings).fallback()
-    assert "is proved: the best is off by" in redesign.reason
+    assert "is verified: the best is off by" in redesign.reason
     assert redesign.reason.endswith("; the fallback set is sent")
     assert update.setting.gains == gains_of(proved.setting.controller.replace(feedforward=-0.1))
     assert update.setting.band == band_of(proved)

@@ -14,7 +14,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -91,7 +91,7 @@ def kinds(outcome: WorkResult) -> list[str]:
 
 def failing(monkeypatch) -> None:
     def refuted(_policy, _region, _setting):
-        return Refusal("the setting settles on 3.0 % of the members, and 99 % are asked")
+        return NotVerified("the setting settles on 3.0 % of the members, and 99 % are asked")
 
     monkeypatch.setattr(CertifiedPolicy, "confirm", refuted)
 
@@ -166,9 +166,9 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet,
     back = sent(queue.window(1, update.version))
     queue.applied(back)
     looked_up, made = [], []
-    plain, exact = TablePolicy.prove, CertifiedPolicy.prove
-    monkeypatch.setattr(TablePolicy, "prove", lambda *given: looked_up.append(1) or plain(*given))
-    monkeypatch.setattr(CertifiedPolicy, "prove", lambda *given: made.append(1) or exact(*given))
+    plain, exact = TablePolicy.verify, CertifiedPolicy.verify
+    monkeypatch.setattr(TablePolicy, "verify", lambda *given: looked_up.append(1) or plain(*given))
+    monkeypatch.setattr(CertifiedPolicy, "verify", lambda *given: made.append(1) or exact(*given))
     outcome = queue.window(2, back.version, reason="asked for")
     assert "redesign" in kinds(outcome)
     assert (len(looked_up), len(made)) == (0, 1)

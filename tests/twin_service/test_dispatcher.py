@@ -4,13 +4,12 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
-from servotwin.twin_service.dispatcher import Dispatcher, Parts
+from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
 from servotwin.twin_service.ingest import Clocks
-from servotwin.twin_service.job import Done
-from servotwin.twin_service.metrics import Metrics
-from servotwin.twin_service.pool import WorkerLost
-from servotwin.twin_service.proofs import Allowance
-from servotwin.twin_service.shelf import Shelf
+from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.worker import LeaseResult
+from servotwin.twin_service.worker_pool import WorkerLost
 
 DIES, FAILS = b"dies", b"fails"
 
@@ -34,29 +33,27 @@ class Lender:
         return list(self.turns.pop(0)) if self.turns else []
 
     def release(self, _owner, servos=None) -> None:
+        """Of the store: the servos; of the pool: a worker."""
         if servos is not None:
             self.released.append(servos)
 
-    async def lend(self) -> "Lender":
+    async def acquire(self) -> "Lender":
         if not self.turns:
             self.through.set()
             await asyncio.Event().wait()
         return self
 
-    def take_back(self, _worker) -> None:
-        pass
-
     async def replace(self, _worker, _why) -> None:
         pass
 
-    async def work(self, claims: Sequence[Lease], _now: float) -> AsyncIterator[Done]:
+    async def work(self, claims: Sequence[Lease], _now: float) -> AsyncIterator[LeaseResult]:
         for each in claims:
             self.seen.append((each.servo, each.attempts))
             body = each.messages[0].body
             if body == DIES:
                 raise WorkerLost("it died")
             made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,))
-            yield Done(made, "it failed", 0.0)
+            yield LeaseResult(made, "it failed", 0.0)
 
 
 def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
@@ -66,16 +63,25 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
         return valid
 
     async def body() -> Lender:
-        lender, shelf = Lender(turns), Shelf()
-        parts = Parts(lender, shelf, lender, commit, lambda _servo: None, Metrics(), Clocks())
-        dispatcher = Dispatcher(parts, "me", Allowance(0.0))
+        lender, shelf = Lender(turns), StoreExecutor()
+        dispatcher = Dispatcher(
+            store=lender,
+            executor=shelf,
+            pool=lender,
+            commit=commit,
+            notify=lambda _servo: None,
+            metrics=Metrics(),
+            clocks=Clocks(),
+            owner="me",
+            quota=VerificationQuota(0.0),
+        )
 
         async def one_by_one() -> "Lender":
             while dispatcher._tasks:
                 await asyncio.wait(dispatcher._tasks)
-            return await Lender.lend(lender)
+            return await Lender.acquire(lender)
 
-        lender.lend = one_by_one
+        lender.acquire = one_by_one
         running = asyncio.create_task(dispatcher.run())
         await asyncio.wait_for(lender.through.wait(), 30.0)
         running.cancel()

@@ -18,8 +18,8 @@ from servotwin.link.broker import Broker
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.transport import Unreachable
 from servotwin.store.store import Store, open_store
+from servotwin.twin_service.auth import write_private
 from servotwin.twin_service.config import read_service
-from servotwin.twin_service.secret_file import write_private
 
 
 @pytest.fixture

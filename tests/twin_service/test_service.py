@@ -28,10 +28,10 @@ from servotwin.messages import Acknowledge, Setting, Update, decode, encode
 from servotwin.messages.compression import compress
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
-from servotwin.twin_service.system import System
-from servotwin.twin_service.tokens import read_tokens, write_tokens
+from servotwin.twin_service.auth import read_tokens, write_tokens
+from servotwin.twin_service.service import TwinService
 
-Body = Callable[[System, httpx.AsyncClient], Coroutine[Any, Any, None]]
+Body = Callable[[TwinService, httpx.AsyncClient], Coroutine[Any, Any, None]]
 
 
 @pytest.fixture
@@ -298,10 +298,10 @@ def test_only_so_many_polls_wait(serving):
     async def body(system, client):
         path = "/v1/servos/ax-1/outgoing?wait=20"
         first = asyncio.create_task(client.get(path, headers=bearer()))
-        while not system.outgoing.polls:
+        while not system.polls.open:
             await asyncio.sleep(0.01)
         assert code(await client.get(path, headers=bearer())) == (429, "too_many")
-        system.outgoing.close()
+        system.polls.close()
         assert unpacked((await first).content) == []
 
     serving(body, "long_polls = 1")
@@ -360,7 +360,7 @@ def test_health_says_what_is_not_well(serving):
         assert said["store"] is True
         assert said["workers"] == 0
         assert said["waiting"]["messages"] == 0
-        system.shelf.fault = "gone"
+        system.executor.fault = "gone"
         assert (await client.get("/healthz")).status_code == 503
 
     serving(body)

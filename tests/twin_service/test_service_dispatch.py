@@ -14,10 +14,10 @@ from store_cases import SYSTEMS, addresses
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
-from servotwin.twin_service.pool import Pool
-from servotwin.twin_service.proofs import Allowance
-from servotwin.twin_service.system import System
+from servotwin.twin_service.dispatcher import VerificationQuota
+from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
+from servotwin.twin_service.worker_pool import WorkerPool
 
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 PATIENCE = 60.0
@@ -28,10 +28,10 @@ async def working(path, url=None, workers=1, timeout=30.0):
     """A service with scripted workers, and a client."""
     twin = read_twin(path)
     store = open_store(url or twin.service.store)
-    system = System(twin, store, pool=Pool(workers, twin.start, timeout, WORKER))
-    app = system.app
+    system = TwinService(twin, store, pool=WorkerPool(workers, twin.start, timeout, WORKER))
+    app = system.http_app()
     try:
-        async with app.api.router.lifespan_context(app.api):
+        async with app.lifespan():
             transport = httpx.ASGITransport(app)
             async with httpx.AsyncClient(transport=transport, base_url="http://twin") as client:
                 yield system, client
@@ -158,13 +158,13 @@ def test_processes_share_one_database_and_tell_each_other_s_edges(tmp_path):
 
 
 def test_proofs_are_saved_up_to_two_and_then_come_at_their_rate():
-    allowance = Allowance(6.0)
+    allowance = VerificationQuota(6.0)
     begun = []
     for tick in range(1, 6001):
         now = 0.01 * tick
-        if allowance.may(now):
+        if allowance.refill(now):
             allowance.take()
             begun.append(now)
     assert begun[:2] == [0.01, 0.02]
     assert len(begun) == 2 + 5
-    assert not Allowance(0.0).may(1e6)
+    assert not VerificationQuota(0.0).refill(1e6)

@@ -17,20 +17,23 @@ from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import Refusal
 from servotwin.store.records import OutgoingMessage
-from servotwin.twin_service import logs
+from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
-from servotwin.twin_service.future import Boots
-from servotwin.twin_service.limits import Bodies, Buckets, Disconnected
-from servotwin.twin_service.metrics import Count, Gauge, Histogram, Metrics
-from servotwin.twin_service.outgoing import Outgoing
-from servotwin.twin_service.refused import STATUS, Refused
-from servotwin.twin_service.secret_file import read_secret, write_private
-from servotwin.twin_service.tokens import Verifiers, read_tokens, write_tokens
+from servotwin.twin_service.limits import (
+    STATUS,
+    BodyReader,
+    Disconnected,
+    RateLimiter,
+    RequestRejected,
+    SampleTimeLimiter,
+)
+from servotwin.twin_service.long_poll import LongPolls
+from servotwin.twin_service.monitoring import Counter, Gauge, Histogram, Metrics, configure_logging
 from servotwin.twin_service.twin_file import read_twin
 
 
 def refusal(act):
-    with pytest.raises(Refused) as refused:
+    with pytest.raises(RequestRejected) as refused:
         act()
     return refused.value.refusal
 
@@ -54,7 +57,7 @@ def test_every_reason_has_a_status():
     later=st.lists(st.tuples(st.floats(0.0, 1e4), st.floats(-1e4, 1e6)), max_size=20),
 )
 def test_a_boot_s_sample_time_runs_no_faster_than_it_can(speed, slack, first, later):
-    boots, now = Boots(speed, slack), 1000.0
+    boots, now = SampleTimeLimiter(speed, slack), 1000.0
     boots.check("a", "b", first, now)
     for passed, end in later:
         now += passed
@@ -68,7 +71,7 @@ def test_a_boot_s_sample_time_runs_no_faster_than_it_can(speed, slack, first, la
 
 
 def test_a_hello_moves_a_boot_s_time_on_but_never_back():
-    boots = Boots(1.0, 0.0)
+    boots = SampleTimeLimiter(1.0, 0.0)
     boots.hello("a", "b", 100.0, 0.0)
     boots.hello("a", "b", 50.0, 1.0)
     boots.check("a", "b", 101.0, 1.0)
@@ -80,13 +83,13 @@ def test_a_hello_moves_a_boot_s_time_on_but_never_back():
 @given(st.floats(0.1, 100.0), st.integers(1, 50), st.lists(st.floats(0.0, 2.0), max_size=200))
 def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(rate, burst, pauses):
     clock, taken = Clock(), 0
-    buckets = Buckets(rate, burst, clock)
+    buckets = RateLimiter(rate, burst, clock)
     for pause in pauses:
         clock.now += pause
         try:
             buckets.take("a")
             taken += 1
-        except Refused as refused:
+        except RequestRejected as refused:
             assert refused.refusal is Refusal.TOO_MANY  # noqa: PT017
     assert taken <= burst + rate * clock.now + 1e-6
     assert taken >= min(len(pauses), burst)
@@ -110,11 +113,11 @@ def received(*parts, end=True):
 
 @given(st.lists(st.binary(max_size=40), max_size=10), st.integers(0, 150), st.none() | st.integers(0, 300))
 def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, declared):
-    bodies, whole = Bodies(limit, 10.0), b"".join(parts)
+    bodies, whole = BodyReader(limit, 10.0), b"".join(parts)
     length = None if declared is None else str(declared)
     try:
         found = asyncio.run(bodies.read(length, received(*parts)))
-    except Refused as refused:
+    except RequestRejected as refused:
         assert refused.refusal is Refusal.TOO_LARGE  # noqa: PT017
         assert max(len(whole), declared or 0) > limit
     else:
@@ -124,7 +127,7 @@ def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, de
 
 
 def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
-    bodies = Bodies(100, 10.0, memory=150)
+    bodies = BodyReader(100, 10.0, memory=150)
     with pytest.raises(Disconnected):
         asyncio.run(bodies.read(None, received(b"x", end=False)))
     assert bodies.held == 0
@@ -141,7 +144,7 @@ def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
 
         first = asyncio.create_task(bodies.read(None, slow))
         await gate.wait()
-        with pytest.raises(Refused) as refused:
+        with pytest.raises(RequestRejected) as refused:
             await bodies.read(None, received(bytes(90)))
         first.cancel()
         await asyncio.gather(first, return_exceptions=True)
@@ -152,7 +155,7 @@ def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
 
 
 def test_metrics_are_prometheus_text():
-    count, told = Count("a_total", "How many.", "kind", "put"), Metrics()
+    count, told = Counter("a_total", "How many.", "kind", "put"), Metrics()
     count.add('w"\n\\', "new", by=2)
     assert list(count.lines()) == ['a_total{kind="w\\"\\n\\\\",put="new"} 2']
     assert list(Gauge("g", "Now.", lambda: {"x": 1.5}, "of").lines()) == ['g{of="x"} 1.5']
@@ -161,7 +164,7 @@ def test_metrics_are_prometheus_text():
         histogram.observe(value)
     lines = ['h_bucket{le="0.1"} 2', 'h_bucket{le="1"} 3', 'h_bucket{le="+Inf"} 4', "h_sum 7.65", "h_count 4"]
     assert list(histogram.lines()) == lines
-    told.watch("w", "Watched.", lambda: True)
+    told.add_gauge("w", "Watched.", lambda: True)
     text = told.text()
     assert text.endswith("# HELP w Watched.\n# TYPE w gauge\nw 1\n")
     assert len({line for line in text.splitlines() if line.startswith("# TYPE")}) == text.count("# TYPE")
@@ -169,7 +172,7 @@ def test_metrics_are_prometheus_text():
 
 def test_a_log_line_is_one_json_object_whatever_it_holds():
     stream = io.StringIO()
-    handler = logs.configure("info", stream)
+    handler = configure_logging("info", stream)
     log = logging.getLogger("servotwin.test")
     try:
         log.info("a\nb", extra={"servo": "x\ny", "number": math.nan, "thing": object()})
@@ -201,20 +204,20 @@ def test_polls_ask_the_store_only_when_something_may_be_there():
         return [each for each in posted if each.serial > serial]
 
     async def body():
-        outgoing = Outgoing(read, 10)
+        outgoing = LongPolls(read, 10)
         for _ in range(5):
-            assert list(await outgoing.after("a", 0, 0.0)) == []
+            assert list(await outgoing.messages("a", 0, 0.0)) == []
         assert len(asked) == 1
-        waiting = [asyncio.create_task(outgoing.after("a", 0, 60.0)) for _ in range(3)]
+        waiting = [asyncio.create_task(outgoing.messages("a", 0, 60.0)) for _ in range(3)]
         await asyncio.sleep(0.01)
         posted.append(OutgoingMessage(1, b"x"))
-        outgoing.post("b")
+        outgoing.notify("b")
         await asyncio.sleep(0.01)
         assert not any(task.done() for task in waiting)
-        outgoing.post("a")
+        outgoing.notify("a")
         assert [await task for task in waiting] == [posted] * 3
-        assert outgoing.polls == 0
-        assert list(await outgoing.after("a", 1, 0.01)) == []
+        assert outgoing.open == 0
+        assert list(await outgoing.messages("a", 1, 0.01)) == []
         assert not outgoing._waiting
 
     asyncio.run(body())
@@ -232,11 +235,11 @@ def test_a_message_posted_while_the_store_is_asked_is_not_missed():
             await go_on.wait()
             return found
 
-        outgoing = Outgoing(read, 10)
-        poll = asyncio.create_task(outgoing.after("a", 0, 60.0))
+        outgoing = LongPolls(read, 10)
+        poll = asyncio.create_task(outgoing.messages("a", 0, 60.0))
         await begun.wait()
         posted.append(OutgoingMessage(1, b"x"))
-        outgoing.post("a")
+        outgoing.notify("a")
         go_on.set()
         assert await asyncio.wait_for(poll, 10.0) == posted
 
@@ -332,19 +335,19 @@ def test_what_others_posted_ends_the_polls_that_it_is_for():
         return [each for each in posted if each.serial > serial]
 
     async def body():
-        outgoing = Outgoing(read, 10, shared=True)
-        early, late = (asyncio.create_task(outgoing.after("a", serial, 60.0)) for serial in (0, 1))
-        while outgoing.polls < 2 or outgoing.waiting != ["a"]:
+        outgoing = LongPolls(read, 10, shared=True)
+        early, late = (asyncio.create_task(outgoing.messages("a", serial, 60.0)) for serial in (0, 1))
+        while outgoing.open < 2 or outgoing.waiting != ["a"]:
             await asyncio.sleep(0.01)
-        outgoing.posted({"a": 0, "b": 7})
+        outgoing.notify_serials({"a": 0, "b": 7})
         await asyncio.sleep(0.01)
         assert not early.done()
         posted.append(OutgoingMessage(1, b"x"))
-        outgoing.posted({"a": 1})
+        outgoing.notify_serials({"a": 1})
         assert await early == posted
         assert not late.done()
         posted.append(OutgoingMessage(2, b"y"))
-        outgoing.posted({"a": 2})
+        outgoing.notify_serials({"a": 2})
         assert await late == posted[1:]
 
     asyncio.run(body())

@@ -37,9 +37,9 @@ from service_system import (
 from servotwin.messages import encode
 from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
-from servotwin.twin_service.pool import Pool
-from servotwin.twin_service.system import System
+from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
+from servotwin.twin_service.worker_pool import WorkerPool
 
 PATIENCE = 60.0
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")
@@ -307,11 +307,11 @@ def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_pat
 
 def test_a_service_that_cannot_begin_does_not_end_well(tmp_path, monkeypatch):
     twin = read_twin(twin_file(tmp_path))
-    pool = Pool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
-    monkeypatch.setattr(service, "System", lambda twin, store: System(twin, store, pool=pool))
+    pool = WorkerPool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
+    monkeypatch.setattr(service, "TwinService", lambda twin, store: TwinService(twin, store, pool=pool))
     with (
         closing(open_store(twin.service.store)) as store,
-        service.listening(twin.service) as listener,
+        service.listening_socket(twin.service) as listener,
         pytest.raises(SystemExit) as ended,
     ):
         service.serve(twin, store, listener)

@@ -8,17 +8,15 @@ import pytest
 from servotwin.cli.audit import Source, audit
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
-from servotwin.twin_service import auth, pool
-from servotwin.twin_service.auth import TokenFile
+from servotwin.twin_service import auth, worker_pool
+from servotwin.twin_service.auth import TokenFile, Verifiers, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import MQTT_PASSWORD, PASSWORD
-from servotwin.twin_service.secret_file import write_private
-from servotwin.twin_service.tokens import Verifiers, read_tokens, write_tokens
 
 
 def test_workers_do_not_see_what_the_service_keeps_to_itself(monkeypatch):
     for name in (PASSWORD, MQTT_PASSWORD):
         monkeypatch.setenv(name, "hunter2")
-    assert "hunter2" not in pool._environment().values()
+    assert "hunter2" not in worker_pool._environment().values()
 
 
 def test_tokens_written_while_they_are_read_count_too(tmp_path, monkeypatch):
@@ -34,7 +32,7 @@ def test_tokens_written_while_they_are_read_count_too(tmp_path, monkeypatch):
     file = TokenFile(path)
     monkeypatch.undo()
     assert file.refresh()
-    file.authority.admit_servo("ax-1", b"new")
+    file.access.check_servo("ax-1", b"new")
 
 
 def test_an_operator_s_token_follows_no_redirection(tmp_path):

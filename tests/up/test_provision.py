@@ -22,7 +22,7 @@ from servotwin.edge_process.config_file import load
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
 from servotwin.store.store import open_store
-from servotwin.twin_service.tokens import read_tokens
+from servotwin.twin_service.auth import read_tokens
 from servotwin.up import enrolment
 
 PATIENCE = 60.0

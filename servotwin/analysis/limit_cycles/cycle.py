@@ -16,10 +16,9 @@ from enum import Enum
 
 import numpy as np
 
-from servotwin.analysis.limit_cycles.orbit import Orbit
-from servotwin.analysis.limit_cycles.poincare import Firing, LostOrbit, Section, fired
+from servotwin.analysis.limit_cycles.orbit import ClosedOrbit, Orbit, closed_orbit
+from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section, guard_events
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
-from servotwin.analysis.limit_cycles.shooting import Found, closed_orbit
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
@@ -143,9 +142,11 @@ def _searched(loop: ScaledLoop) -> CycleResult:
 
 
 def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
-    """Stretch after stretch of one run, each with the half peak-to-peak in its second half of the position or of the
-    motor's travel, the larger (while the motor crosses the gap the position rests, but not for good), and with the
-    half peak-to-peak of the position."""
+    """Parts of one run, each twice as long, with two half peak-to-peaks of the second half of each.
+
+    The first is the larger of the position's and the motor's travel: while the motor crosses the gap the position
+    rests, but not for good. The second is the position's.
+    """
     state, mode = loop.state, loop.mode
     for look in range(_LOOKS):
         run = Trajectory(loop.loop.automaton, state, mode, loop.sample_step)
@@ -161,11 +162,11 @@ def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
         state, mode = run.state, run.mode
 
 
-def _followed(loop: ScaledLoop, run: Trajectory) -> Found:
+def _followed(loop: ScaledLoop, run: Trajectory) -> ClosedOrbit:
     """The orbit that the events of a tail suggest."""
-    times, firings = fired(run)
-    length = _repeating(firings)
-    last, last_times = firings[-length - 1 :], times[-length - 1 :]
+    times, guards = guard_events(run)
+    length = _repeating(guards)
+    last, last_times = guards[-length - 1 :], times[-length - 1 :]
     # An event set off by another at the same instant has no guard of its own to section the flow with.
     own = [last[i] for i in range(1, length + 1) if last_times[i] > last_times[i - 1]]
     first = min(own, key=last[1:].count)
@@ -175,7 +176,7 @@ def _followed(loop: ScaledLoop, run: Trajectory) -> Found:
     states = run.record.state[: run.record.size[0]]
     scale = np.max(np.abs(states[len(states) // 2 :]), axis=0)
     scale[scale == 0.0] = 1.0
-    half = loop.mirror is not None and _mirrored(last[1:], loop.mirror.firings)
+    half = loop.mirror is not None and _mirrored(last[1:], loop.mirror.guards)
     try:
         found = closed_orbit(loop, section, start, scale, half)
         if found.orbit.stable or not half:
@@ -186,14 +187,14 @@ def _followed(loop: ScaledLoop, run: Trajectory) -> Found:
     return closed_orbit(loop, section, start, scale, False)
 
 
-def _repeating(firings: list[Firing]) -> int:
+def _repeating(guards: list[GuardId]) -> int:
     """Length of the shortest pattern that the last events repeat twice after its first time."""
-    for length in range(1, len(firings) // 3 + 1):
-        if firings[-length:] == firings[-2 * length : -length] == firings[-3 * length : -2 * length]:
+    for length in range(1, len(guards) // 3 + 1):
+        if guards[-length:] == guards[-2 * length : -length] == guards[-3 * length : -2 * length]:
             return length
-    raise LostOrbit(f"the last {len(firings)} events do not repeat")
+    raise LostOrbit(f"the last {len(guards)} events do not repeat")
 
 
-def _mirrored(pattern: list[Firing], firings: dict[Firing, Firing]) -> bool:
+def _mirrored(pattern: list[GuardId], guards: dict[GuardId, GuardId]) -> bool:
     half, odd = divmod(len(pattern), 2)
-    return not odd and [firings[firing] for firing in pattern[:half]] == pattern[half:]
+    return not odd and [guards[guard_id] for guard_id in pattern[:half]] == pattern[half:]

@@ -1,14 +1,24 @@
-"""A periodic orbit of the loop, exact: its period, extremes, events and Floquet multipliers."""
+"""A periodic orbit of the loop, exact: found by shooting, and verified by the event simulation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from servotwin.analysis.limit_cycles.poincare import Firing, Flags, Stretch
+from servotwin.analysis.limit_cycles.poincare import (
+    FixedPoint,
+    Flags,
+    FlowSegment,
+    GuardId,
+    LostOrbit,
+    Section,
+    Shot,
+    newton,
+)
+from servotwin.analysis.limit_cycles.scaled import Mirror, ScaledLoop
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.exponential import expm1
@@ -98,14 +108,14 @@ class Orbit:
         return times, run.at(times, self.loop.rows[name])
 
 
-def extremes(automaton: Automaton, state: Array, stretches: tuple[Stretch, ...], rows: Array) -> tuple[float, float]:
-    """Exact least and largest value of the output ``rows[mode] @ x`` along stretches that begin at `state`."""
+def extremes(automaton: Automaton, state: Array, segments: tuple[FlowSegment, ...], rows: Array) -> tuple[float, float]:
+    """Exact least and largest value of the output ``rows[mode] @ x`` along segments that begin at `state`."""
     values: list[float] = []
     x = state
-    for stretch in stretches:
-        flow, row = automaton.flows[stretch.mode], rows[stretch.mode]
-        parts = max(2, int(np.ceil(_LOOKS * automaton.fastest_lasting * stretch.duration)))
-        look = stretch.duration / parts
+    for segment in segments:
+        flow, row = automaton.flows[segment.mode], rows[segment.mode]
+        parts = max(2, int(np.ceil(_LOOKS * automaton.fastest_lasting * segment.duration)))
+        look = segment.duration / parts
         jump = expm1(flow, look).astype(float)
         for _ in range(parts):
             after = x + jump @ x
@@ -114,7 +124,7 @@ def extremes(automaton: Automaton, state: Array, stretches: tuple[Stretch, ...],
             if (slope @ x) * (slope @ after) < 0.0:
                 values.append(_turn(row, flow, x, look))
             x = after
-        x = stretch.reset @ x
+        x = segment.reset @ x
     return min(values), max(values)
 
 
@@ -128,18 +138,18 @@ def _turn(row: Array, flow: Array, x: Array, look: float) -> float:
     return float(row @ at(time))
 
 
-def phases(loop: ServoAutomaton, stretches: tuple[Stretch, ...], period: float) -> tuple[OrbitEvent, ...]:
-    """The events at the ends of stretches by phase, that of the section first and not again at the end."""
+def phases(loop: ServoAutomaton, segments: tuple[FlowSegment, ...], period: float) -> tuple[OrbitEvent, ...]:
+    """The events at the ends of segments by phase, that of the section first and not again at the end."""
     elapsed, events = 0.0, []
-    for stretch in stretches[:-1]:
-        elapsed += stretch.duration
-        guard = _guard(loop.automaton, stretch.firing)
+    for segment in segments[:-1]:
+        elapsed += segment.duration
+        guard = _guard(loop.automaton, segment.guard_id)
         events.append(OrbitEvent(elapsed / period % 1.0, guard[0], guard[1]))
     return tuple(events)
 
 
-def _guard(automaton: Automaton, firing: Firing) -> tuple[str, int]:
-    guard = automaton.modes[firing.mode].guards[firing.guard]
+def _guard(automaton: Automaton, guard_id: GuardId) -> tuple[str, int]:
+    guard = automaton.modes[guard_id.mode].guards[guard_id.guard]
     return guard.label, guard.side
 
 
@@ -149,3 +159,110 @@ def leading(derivative: Array, free: Flags, phase: int = 1) -> Complex:
     values = np.linalg.eigvals(derivative[np.ix_(free, free)]).astype(complex)
     ordered = values[np.argsort(-np.abs(values), kind="stable")]
     return np.asarray(ordered[: len(ordered) - phase])
+
+
+# Largest residual of a returned orbit, in parts of each state's range: hundreds of roundings.
+CLOSED = 1e-9
+# An "orbit" smaller than this part of p gap is the equilibrium.
+_SMALLEST = 1e-6
+_GRID = 64
+
+
+class ClosedOrbit(NamedTuple):
+    """An orbit and how far from it, in parts of each state's size, the search began."""
+
+    orbit: Orbit
+    distance: float
+
+
+def closed_orbit(loop: ScaledLoop, section: Section, start: Array, scale: Array, half: bool) -> ClosedOrbit:
+    """The orbit through the section near a point of it.
+
+    Parameters
+    ----------
+    loop : ScaledLoop
+    section : Section
+        Of the full period; where `half` succeeds its `hits` are counted anew.
+    start : (n,) array
+        Just before the section's event.
+    scale : (n,) array
+        Size of each state.
+    half : bool
+        Look for a symmetric orbit: close it after half a period by its mirror image.
+
+    Raises
+    ------
+    LostOrbit
+        There is none near, or what was found does not close in the event simulation.
+    """
+    reflection = loop.mirror if half else None
+    if reflection is not None:
+        point = _half(loop, section, reflection, start, scale)
+        section = replace(section, hits=_hits(section, reflection, point.shot))
+    else:
+        point = newton(section.shoot, start, loop.free, scale)
+    distance = float(np.max(np.abs(start - point.state)[loop.free] / scale[loop.free]))
+    full = section.shoot(point.state)
+    period = sum(segment.duration for segment in full.segments)
+    residual = _residual(loop, section, point.state, full, period)
+    if residual > CLOSED:
+        raise LostOrbit(f"what was found fails to close by {residual:.2g} of its range")
+    orbit = _orbit(loop, section, point, full, period, residual, reflection is not None)
+    if orbit.amplitude < _SMALLEST * loop.extent * loop.unit:
+        raise LostOrbit("what was found is an equilibrium")
+    return ClosedOrbit(orbit, distance)
+
+
+def _half(loop: ScaledLoop, section: Section, reflection: Mirror, start: Array, scale: Array) -> FixedPoint:
+    """The fixed point of: fly to the mirrored section event, reflect."""
+    to_mirror = replace(section, end=reflection.guards[section.start])
+
+    def shoot(state: Array) -> Shot:
+        shot = to_mirror.shoot(state)
+        return Shot(reflection.signs * shot.state, reflection.signs[:, None] * shot.derivative, shot.segments)
+
+    return newton(shoot, start, loop.free, scale)
+
+
+def _hits(section: Section, reflection: Mirror, half: Shot) -> int:
+    """How often the section's event fires in a half period after its start, and in the mirrored half after that."""
+    guards = [segment.guard_id for segment in half.segments[1:]]
+    return guards.count(section.start) + guards.count(reflection.guards[section.start])
+
+
+def _residual(loop: ScaledLoop, section: Section, start: Array, full: Shot, period: float) -> float:
+    """How well the event simulation closes, from one moment far from any event to the same one a period later."""
+    events = np.cumsum([segment.duration for segment in full.segments])
+    grid = np.arange(1, _GRID) * (period / _GRID)
+    calm = 1 + int(np.argmax(np.min(np.abs(grid[:, None] - events), axis=1)))
+    run = Trajectory(loop.loop.automaton, start, section.start.mode, period / _GRID, 2 * section.refine)
+    run.advance(calm)
+    before = run.state.copy()
+    run.advance(calm + _GRID)
+    size = int(run.record.size[0])
+    spread = np.ptp(run.record.state[:size], axis=0)
+    spread[spread == 0.0] = 1.0
+    return float(np.max(np.abs(run.state - before)[loop.free] / spread[loop.free]))
+
+
+def _orbit(
+    loop: ScaledLoop, section: Section, point: FixedPoint, full: Shot, period: float, residual: float, symmetric: bool
+) -> Orbit:
+    automaton, rows = loop.loop.automaton, loop.loop.rows
+    lowest, highest = extremes(automaton, point.state, full.segments, rows["position"])
+    motor = extremes(automaton, point.state, full.segments, rows["theta_m"])
+    shifted = float(rows["position"][0] @ loop.displacement)
+    return Orbit(
+        frequency=1.0 / period,
+        lowest=loop.unit * lowest + shifted,
+        highest=loop.unit * highest + shifted,
+        motor_amplitude=0.5 * loop.unit * (motor[1] - motor[0]),
+        symmetric=symmetric,
+        multipliers=leading(full.derivative, loop.free),
+        half_multipliers=leading(point.shot.derivative, loop.free) if symmetric else None,
+        events=phases(loop.loop, full.segments, period),
+        residual=residual,
+        loop=loop.loop,
+        start=loop.actual(point.state),
+        start_mode=section.start.mode,
+    )

@@ -2,7 +2,7 @@
 
 A point of the map is a state *just before* a section event, in the mode that the event ends. The map fires the event,
 follows the flow through every further event and stops just before the next section event. The kernel finds the
-sequence of events and their times; state and derivative are then carried along it by matrix exponentials and, at
+sequence of events and their times; state and derivative are then propagate along it by matrix exponentials and, at
 events, saltation matrices. Within one sequence nothing else is nonlinear than the times of the events.
 """
 
@@ -25,22 +25,22 @@ Flags = NDArray[np.bool_]
 GRAZING = 1e-12
 
 
-class Firing(NamedTuple):
+class GuardId(NamedTuple):
     """A guard of a mode, by their indices."""
 
     mode: int
     guard: int
 
 
-class Stretch(NamedTuple):
-    """Flow in one mode for `duration` seconds; then `firing`, and at the same instant whatever it sets off.
+class FlowSegment(NamedTuple):
+    """Flow in one mode for `duration` seconds; then `guard_id`, and at the same instant whatever it sets off.
 
     `reset` and `target` are those of all these events together.
     """
 
     mode: int
     duration: float
-    firing: Firing
+    guard_id: GuardId
     reset: Array
     target: int
 
@@ -51,7 +51,7 @@ class Shot(NamedTuple):
 
     state: Array
     derivative: Array
-    stretches: tuple[Stretch, ...]
+    segments: tuple[FlowSegment, ...]
 
 
 class LostOrbit(RuntimeError):
@@ -65,7 +65,7 @@ class Section:
     Attributes
     ----------
     automaton : Automaton
-    start, end : Firing
+    start, end : GuardId
         The event at the start, and the one that ends a passage when it fires for the `hits`-th time after the start.
     hits : int
     sample_step, horizon : float
@@ -75,8 +75,8 @@ class Section:
     """
 
     automaton: Automaton
-    start: Firing
-    end: Firing
+    start: GuardId
+    end: GuardId
     hits: int
     sample_step: float
     horizon: float
@@ -84,90 +84,90 @@ class Section:
 
     def shoot(self, state: Array) -> Shot:
         """From just before the start event to just before the end event."""
-        stretches = self._stretches(state, self.start.mode, self.hits, skip=1)
-        if stretches[0].firing != self.start:
-            raise LostOrbit(f"{self._name(stretches[0].firing)} comes before {self._name(self.start)}")
-        return carried(self.automaton, state, stretches)
+        segments = self._segments(state, self.start.mode, self.hits, skip=1)
+        if segments[0].guard_id != self.start:
+            raise LostOrbit(f"{self._name(segments[0].guard_id)} comes before {self._name(self.start)}")
+        return propagate(self.automaton, state, segments)
 
     def approach(self, state: Array, mode: int) -> Array:
         """The state just before the first start event from any state in any mode."""
         opposite = Section(self.automaton, self.start, self.start, 1, self.sample_step, self.horizon, self.refine)
-        return carried(self.automaton, state, opposite._stretches(state, mode, 1, skip=0)).state
+        return propagate(self.automaton, state, opposite._segments(state, mode, 1, skip=0)).state
 
-    def _stretches(self, state: Array, mode: int, hits: int, skip: int) -> tuple[Stretch, ...]:
+    def _segments(self, state: Array, mode: int, hits: int, skip: int) -> tuple[FlowSegment, ...]:
         run = Trajectory(self.automaton, state, mode, self.sample_step, self.refine)
         while run.time < self.horizon:
             try:
                 run.advance(run.samples - 1 + 64)
             except ZenoError as error:
                 raise LostOrbit(str(error)) from None
-            times, firings = fired(run)
-            found = [i for i, firing in enumerate(firings) if i >= skip and firing == self.end]
+            times, guards = guard_events(run)
+            found = [i for i, guard_id in enumerate(guards) if i >= skip and guard_id == self.end]
             if len(found) >= hits:
                 last = found[hits - 1]
-                return _grouped(self.automaton, times[: last + 1], firings[: last + 1])
+                return _grouped(self.automaton, times[: last + 1], guards[: last + 1])
         raise LostOrbit(f"{self._name(self.end)} does not come within {self.horizon:.6g} s")
 
-    def _name(self, firing: Firing) -> str:
-        mode = self.automaton.modes[firing.mode]
-        return f"{mode.guards[firing.guard].label!r} of mode {mode.name!r}"
+    def _name(self, guard_id: GuardId) -> str:
+        mode = self.automaton.modes[guard_id.mode]
+        return f"{mode.guards[guard_id.guard].label!r} of mode {mode.name!r}"
 
 
-def fired(run: Trajectory) -> tuple[list[float], list[Firing]]:
+def guard_events(run: Trajectory) -> tuple[list[float], list[GuardId]]:
     """Times (s) and guards of a run's events so far."""
     r, size = run.record, int(run.record.size[1])
     times = (r.event_step[:size] + r.event_fraction[:size]) * run.step
     pairs = zip(r.event_mode[:size].tolist(), r.event_guard[:size].tolist(), strict=True)
-    return times.tolist(), [Firing(mode, guard) for mode, guard in pairs]
+    return times.tolist(), [GuardId(mode, guard) for mode, guard in pairs]
 
 
-def _grouped(automaton: Automaton, times: list[float], firings: list[Firing]) -> tuple[Stretch, ...]:
-    """Events as stretches; those at the instant of another, which it set off, are one with it. The last event is not
+def _grouped(automaton: Automaton, times: list[float], guards: list[GuardId]) -> tuple[FlowSegment, ...]:
+    """Events as segments; those at the instant of another, which it set off, are one with it. The last event is not
     applied, so it stands alone."""
-    stretches: list[Stretch] = []
+    segments: list[FlowSegment] = []
     before = 0.0
-    for i, (time, firing) in enumerate(zip(times, firings, strict=True)):
-        guard = automaton.modes[firing.mode].guards[firing.guard]
+    for i, (time, guard_id) in enumerate(zip(times, guards, strict=True)):
+        guard = automaton.modes[guard_id.mode].guards[guard_id.guard]
         reset = np.eye(len(automaton.names)) if guard.reset is None else np.asarray(guard.reset, dtype=float)
-        if stretches and time == before and i < len(times) - 1:
-            last = stretches[-1]
-            stretches[-1] = last._replace(reset=reset @ last.reset, target=guard.target)
+        if segments and time == before and i < len(times) - 1:
+            last = segments[-1]
+            segments[-1] = last._replace(reset=reset @ last.reset, target=guard.target)
         else:
-            stretches.append(Stretch(firing.mode, time - before, firing, reset, guard.target))
+            segments.append(FlowSegment(guard_id.mode, time - before, guard_id, reset, guard.target))
         before = time
-    return tuple(stretches)
+    return tuple(segments)
 
 
-def carried(automaton: Automaton, state: Array, stretches: tuple[Stretch, ...]) -> Shot:
-    """State and derivative along stretches, up to just before the event that ends the last one.
+def propagate(automaton: Automaton, state: Array, segments: tuple[FlowSegment, ...]) -> Shot:
+    """State and derivative along segments, up to just before the event that ends the last one.
 
     At an event with guard row g, reset R and flows f-, f+ before and after it a deviation d becomes
     ``R d + (f+ - R f-) (g d) / (g f-)``; at the last one, where the map stops on the section,
     ``d - f- (g d) / (g f-)``.
     """
     x, derivative = np.array(state, dtype=float), np.eye(len(state))
-    for i, stretch in enumerate(stretches):
-        flow = automaton.flows[stretch.mode]
-        change = expm1(flow, stretch.duration).astype(float)
+    for i, segment in enumerate(segments):
+        flow = automaton.flows[segment.mode]
+        change = expm1(flow, segment.duration).astype(float)
         x = x + change @ x
         derivative = derivative + change @ derivative
         before = flow @ x
-        sooner = _sooner(automaton, stretch.firing, x, before) @ derivative
-        if i == len(stretches) - 1:
+        sooner = _sooner(automaton, segment.guard_id, x, before) @ derivative
+        if i == len(segments) - 1:
             derivative = derivative - np.outer(before, sooner)
         else:
-            x = stretch.reset @ x
-            after = automaton.flows[stretch.target] @ x
-            derivative = stretch.reset @ derivative + np.outer(after - stretch.reset @ before, sooner)
-    return Shot(x, derivative, stretches)
+            x = segment.reset @ x
+            after = automaton.flows[segment.target] @ x
+            derivative = segment.reset @ derivative + np.outer(after - segment.reset @ before, sooner)
+    return Shot(x, derivative, segments)
 
 
-def _sooner(automaton: Automaton, firing: Firing, x: Array, flow: Array) -> Array:
+def _sooner(automaton: Automaton, guard_id: GuardId, x: Array, flow: Array) -> Array:
     """(n,) g / (g f-): by how much sooner the event comes per deviation of the state."""
-    row = np.asarray(automaton.modes[firing.mode].guards[firing.guard].row, dtype=float)
+    row = np.asarray(automaton.modes[guard_id.mode].guards[guard_id.guard].row, dtype=float)
     rate = float(row @ flow)
-    if not rate > GRAZING * float(np.abs(row) @ (np.abs(automaton.flows[firing.mode]) @ np.abs(x))):
-        raise LostOrbit(f"the event {automaton.modes[firing.mode].guards[firing.guard].label!r} grazes its guard")
+    if not rate > GRAZING * float(np.abs(row) @ (np.abs(automaton.flows[guard_id.mode]) @ np.abs(x))):
+        raise LostOrbit(f"the event {automaton.modes[guard_id.mode].guards[guard_id.guard].label!r} grazes its guard")
     return row / rate
 
 

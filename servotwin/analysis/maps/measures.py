@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +66,14 @@ def measured(settings: MapSettings, chunk: range) -> Measures:
         return _reduced(settings, cells.amplitude[:, None, None], position, voltage)
 
 
+def compute_cells(settings: MapSettings, threads: int | None = None) -> Measures:
+    """Run all cells of a map in threads of this process, by default as many as there are processors."""
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        return joined(list(pool.map(partial(measured, settings), settings.chunks)))
+
+
 def joined(parts: list[Measures]) -> Measures:
-    """Measures of cells that follow one another."""
+    """Join the measures of cells that follow one another."""
     return Measures(*(np.concatenate([getattr(part, name) for part in parts]) for name in MEASURES))
 
 

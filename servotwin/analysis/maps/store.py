@@ -1,23 +1,27 @@
-"""Finished pieces of a map on the disk, so that an interrupted map goes on where it was."""
+"""Finished pieces of a map on the disk, and the computing of those that are missing: an interrupted map goes on."""
 
 from __future__ import annotations
 
 import json
 import zipfile
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from servotwin.analysis.maps.measures import MEASURES, Measures
+from servotwin.analysis.maps.measures import MEASURES, Measures, joined, measured
+from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.errors import InvalidInput
 from servotwin.runtime import files
 
 
 @dataclass(frozen=True)
-class Store:
+class MapStore:
     """The folder of one map: settings.json and chunks/NNNNNN.npz, each with the fingerprint of its settings.
 
     Parameters
@@ -101,3 +105,50 @@ def _shown(key: str, there: object, value: object) -> str:
     """What differs, where it is short enough to be said."""
     words = [json.dumps(each) for each in (there, value)]
     return f"{key} = {words[0]}, not {words[1]}" if max(map(len, words)) <= 40 else f"another {key}"
+
+
+@dataclass(frozen=True)
+class Piece:
+    """The work of one chunk, as it is sent to a worker."""
+
+    settings: MapSettings
+    number: int
+    cells: range
+
+    def measured(self) -> Measures:
+        """What its cells do."""
+        return measured(self.settings, self.cells)
+
+
+def compute(store: MapStore, workers: int | None, scheduler: str | None, console: Console) -> None:
+    """Compute and keep the pieces that are missing, under a progress bar."""
+    chunks = store.settings.chunks
+    pieces = [Piece(store.settings, number, chunks[number]) for number in store.missing()]
+    total = len(chunks)
+    if not pieces:
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    try:
+        with (
+            workplace(workers, scheduler),
+            Progress(*columns, TimeRemainingColumn(), console=console) as progress,
+            closing(shared(Piece.measured, pieces)) as outcomes,
+        ):
+            bar = progress.add_task("mapping", total=total, completed=total - len(pieces))
+            for piece, measures in outcomes:
+                store.keep(piece.number, measures)
+                progress.advance(bar)
+    except KeyboardInterrupt:
+        done = total - len(store.missing())
+        raise KeyboardInterrupt(
+            f"interrupted: {done} of {total} pieces are in {store.directory}; the same command goes on from there"
+        ) from None
+
+
+def collected(store: MapStore) -> Measures:
+    """All pieces as one."""
+    parts = [store.kept(number) for number in range(len(store.settings.chunks))]
+    whole = [part for part in parts if part is not None]
+    if len(whole) < len(parts):
+        raise InvalidInput(f"{store.directory}: pieces of the map vanished meanwhile; give the same command again")
+    return joined(whole)

@@ -1,4 +1,9 @@
-"""All controllers of a type with a given crossover and phase margin, on a grid of their free angles, zoomed."""
+"""All controllers of a type with a given crossover and phase margin, by the phases of their factors (as in pidtune).
+
+    C(s) = K (s sin phz + wc cos phz) (s sin be + wc cos be) / (s (s sin al + wc cos al))
+
+At s = j wc every bracket is wc exp(j angle): so the angles are phases, and abs(C(j wc)) = K.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +12,119 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from servotwin.analysis.tuning.factors import FASTEST_FILTER, KINDS, Factors, Kind
-from servotwin.analysis.tuning.response import FrequencyData, Plant, circled
+from servotwin.analysis.tuning.response import FrequencyData, Plant, nyquist_stable
+from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.linear import Complex
+
+# Where a type has no filter of its own: the law's derivative needs one, so fast that it costs half a degree at most.
+FASTEST_FILTER = 0.01
+_ROUNDING = 8.0 * float(np.finfo(float).eps)
+
+
+class ControllerType(NamedTuple):
+    """What a controller type consists of: an integrator, a second zero `be`, a filter `al` to choose."""
+
+    integral: bool
+    zero: bool
+    second_zero: bool
+    filter: bool
+
+
+CONTROLLER_TYPES = {
+    "P": ControllerType(False, False, False, False),
+    "PI": ControllerType(True, True, False, False),
+    "PD": ControllerType(False, True, False, False),
+    "PDF": ControllerType(False, True, False, True),
+    "PID": ControllerType(True, True, True, False),
+    "PIDF": ControllerType(True, True, True, True),
+}
+
+
+class Factors(NamedTuple):
+    """K (V/m), the crossover wc (rad/s) and the angles phz, be, al (rad); be is 0 without a second zero."""
+
+    K: float
+    wc: float
+    phz: float
+    be: float
+    al: float
+    integral: bool
+
+    def controller(self) -> Controller:
+        """The gains of the law that equals C(s); the filter's time is tan(al) / wc."""
+        Kp, Ki, Kd, time = (float(value) for value in _gains(self))
+        # Without derivative action the filter has nothing to filter; the law wants one all the same.
+        return Controller(Kp, Ki, Kd, time if time > 0.0 else FASTEST_FILTER / self.wc)
+
+    def response(self, omega: ArrayLike) -> Complex:
+        """C(j omega)."""
+        s, w = 1j * np.asarray(omega, dtype=float), self.wc
+        first = s * np.sin(self.phz) + w * np.cos(self.phz)
+        second = s * np.sin(self.be) + w * np.cos(self.be)
+        below = s * np.sin(self.al) + w * np.cos(self.al)
+        return np.asarray(self.K * first * second / (below * (s if self.integral else w)))
+
+
+def _gains(factors: Factors) -> tuple[float, float, float, float]:
+    """Kp, Ki, Kd, Tf by comparing coefficients over s (Tf s + 1)."""
+    K, wc, phz, be, al, integral = factors
+    time = math.tan(al) / wc
+    below = wc * math.cos(al)
+    square = K * math.sin(phz) * math.sin(be) / below
+    linear = K * wc * math.sin(phz + be) / below
+    constant = K * wc**2 * math.cos(phz) * math.cos(be) / below
+    if not integral:
+        # Without the integrator the same numerator stands over wc (Tf s + 1).
+        square, linear, constant = 0.0, linear / wc, constant / wc
+        return constant, 0.0, linear - constant * time, time
+    Kp = linear - constant * time
+    return Kp, constant, square - Kp * time, time
+
+
+def factored(controller: Controller, wc: float) -> Factors:
+    """The factors of given gains (the inverse of `Factors.controller`) at a crossover wc, rad/s.
+
+    Raises
+    ------
+    InvalidInput
+        The controller has no integral action, or its zeros are not real and stable.
+    """
+    c = controller
+    if c.Ki == 0.0:
+        raise InvalidInput("controller Ki = 0: the factorisation needs integral action")
+    zeros = _zeros(c)
+    if not all(zero < 0.0 for zero in zeros):
+        shown = "complex" if math.isnan(zeros[0]) else f"{', '.join(f'{zero:.6g}' for zero in zeros)} 1/s"
+        raise InvalidInput(f"the controller's zeros are {shown}: they must be real and negative to be factored")
+    angles = sorted((math.atan2(wc, -zero) for zero in zeros), reverse=True)
+    angles += [0.0] * (2 - len(angles))
+    K = abs(complex(c.Kp + c.Ki / (1j * wc) + c.Kd * 1j * wc / (c.Tf * 1j * wc + 1.0)))
+    return Factors(math.copysign(K, c.Ki), wc, angles[0], angles[1], math.atan(wc * c.Tf), True)
+
+
+def _zeros(c: Controller) -> list[float]:
+    """Real zeros of a controller with integral action, 1/s; NaN for two that are complex.
+
+    What cancels but for rounding is zero: the highest coefficient of a controller with one zero only, and the
+    discriminant of two equal ones.
+    """
+    square, linear, constant = c.Kp * c.Tf + c.Kd, c.Kp + c.Ki * c.Tf, c.Ki
+    linear_rounding = _ROUNDING * (abs(c.Kp) + abs(c.Ki) * c.Tf)
+    square_rounding = _ROUNDING * (abs(c.Kp) * c.Tf + abs(c.Kd))
+    if abs(square) <= square_rounding:
+        return [-constant / linear] if abs(linear) > linear_rounding else []
+    discriminant = linear**2 - 4.0 * square * constant
+    if abs(discriminant) <= 2.0 * abs(linear) * linear_rounding + 4.0 * abs(constant) * square_rounding:
+        discriminant = 0.0
+    if discriminant < 0.0:
+        return [math.nan, math.nan]
+    larger = -0.5 * (linear + math.copysign(math.sqrt(discriminant), linear))
+    return [larger / square, constant / larger]
+
 
 # Angles of a grid, and how often it is repeated, each time a quarter as wide, about the best.
 _ANGLES, _ZOOMS = 16, 4
@@ -28,15 +140,15 @@ class Candidate(NamedTuple):
     integral: float
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """The stable candidates, at least one, and how many were looked at and stable."""
 
     kept: list[Candidate]
-    looked_at: int
+    evaluated: int
     stable: int
 
 
-def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Candidate], float]) -> Found:
+def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Candidate], float]) -> SearchResult:
     """All stable candidates of a type for a crossover (rad/s) and a phase margin (rad), more of them where `cost` is
     low.
 
@@ -45,8 +157,8 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
     InvalidInput
         The type cannot give this margin at this crossover, or no candidate is stable.
     """
-    kind, at = KINDS[name], _at_crossover(plant, wc)
-    omega = plant.looks(wc)
+    kind, at = CONTROLLER_TYPES[name], _at_crossover(plant, wc)
+    omega = plant.search_frequencies(wc)
     values = plant.response(omega)
     possible = False
     for sign in (1.0, -1.0):
@@ -61,13 +173,13 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
             if not grid:
                 break
             count, possible = count + len(grid), True
-            kept += _judged(grid, omega, values, plant.integrators)
+            kept += _stable_candidates(grid, omega, values, plant.integrators)
             if not kept:
                 break
             best = min(kept, key=cost).factors
             be, al = (best.be, _HIGHEST / 4 ** (zoom + 1)), (best.al, _HIGHEST / 4 ** (zoom + 1))
         if kept:
-            return Found(kept, count, len(kept))
+            return SearchResult(kept, count, len(kept))
     if not possible:
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
     where = f"{wc:g} rad/s and {math.degrees(margin):g} deg there"
@@ -87,7 +199,7 @@ def _at_crossover(plant: Plant, wc: float) -> complex:
 
 
 def _grid(
-    kind: Kind, wc: float, turn: float, K: float, be: tuple[float, float], al: tuple[float, float], zoom: int
+    kind: ControllerType, wc: float, turn: float, K: float, be: tuple[float, float], al: tuple[float, float], zoom: int
 ) -> list[Factors]:
     """Candidates on a grid about (centre, width) of the two free angles, as far as phz is a zero's angle."""
     bes = _angles(*be, 0.0, zoom) if kind.second_zero else np.zeros(1)
@@ -108,9 +220,9 @@ def _angles(centre: float, width: float, lowest: float, zoom: int) -> Array:
     return np.unique(np.clip(grid, lowest, _HIGHEST))
 
 
-def _judged(grid: list[Factors], omega: Array, plant: Complex, integrators: int) -> list[Candidate]:
+def _stable_candidates(grid: list[Factors], omega: Array, plant: Complex, integrators: int) -> list[Candidate]:
     loops = np.array([factors.response(omega) for factors in grid]) * plant
-    stable = circled(loops, integrators + grid[0].integral)
+    stable = nyquist_stable(loops, integrators + grid[0].integral)
     Ms = np.max(1.0 / np.abs(1.0 + loops), axis=1)
     kept = []
     for factors, good, peak in zip(grid, stable, Ms, strict=True):
@@ -124,7 +236,7 @@ def _wrapped(angle: float) -> float:
     return float((angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-def _unreachable(name: str, kind: Kind, wc: float, margin: float, at: complex) -> str:
+def _unreachable(name: str, kind: ControllerType, wc: float, margin: float, at: complex) -> str:
     low = (-90.0 if kind.integral else 0.0) - (90.0 if kind.filter else 0.0)
     high = low + 90.0 * (kind.zero + kind.second_zero + kind.filter)
     phase = math.degrees(float(np.angle(at)))

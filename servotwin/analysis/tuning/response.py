@@ -93,7 +93,7 @@ class Plant:
         w = np.asarray(omega, dtype=float)
         return np.asarray(self.system.response(w) * np.exp(-1j * w * self.delay))
 
-    def looks(self, wc: float) -> Array:
+    def search_frequencies(self, wc: float) -> Array:
         """(N,) rad/s, ascending: where to look at a loop that crosses over at wc."""
         if isinstance(self.system, FrequencyData):
             omega = np.asarray(self.system.omega, dtype=float)
@@ -131,7 +131,7 @@ def _integrators(system: LinearSystem | FrequencyData) -> int:
     return int(np.flatnonzero(system.denominator)[0]) - int(np.flatnonzero(system.numerator)[0])
 
 
-def circled(loops: Complex, integrators: int) -> Array:
+def nyquist_stable(loops: Complex, integrators: int) -> Array:
     """Which closed loops are stable, by Nyquist's criterion.
 
     Parameters

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.analysis.tuning.candidates import Candidate, search
-from servotwin.analysis.tuning.factors import KINDS, Factors
-from servotwin.analysis.tuning.response import FrequencyData, Plant, circled
+from servotwin.analysis.tuning.candidates import CONTROLLER_TYPES, Candidate, Factors, search
+from servotwin.analysis.tuning.response import FrequencyData, Plant, nyquist_stable
 from servotwin.config.table import did_you_mean
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
@@ -56,9 +55,11 @@ class Specification:
     prefer: str = "Ms"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            hint = did_you_mean(self.kind, tuple(KINDS))
-            raise InvalidInput(f"controller type {self.kind!r} does not exist{hint}; give one of {', '.join(KINDS)}")
+        if self.kind not in CONTROLLER_TYPES:
+            hint = did_you_mean(self.kind, tuple(CONTROLLER_TYPES))
+            raise InvalidInput(
+                f"controller type {self.kind!r} does not exist{hint}; give one of {', '.join(CONTROLLER_TYPES)}"
+            )
         if self.prefer not in ("Ms", "Ki"):
             raise InvalidInput(f"prefer = {self.prefer!r}: must be 'Ms' or 'Ki'")
         if not (math.isfinite(self.crossover) and self.crossover > 0.0):
@@ -137,16 +138,16 @@ def tune(
     eager = sorted((one for one in found.kept if one.Ms <= limit), key=lambda one: -one.integral)
     for candidate in [*eager, best]:
         law = candidate.factors.controller()
-        achieved = judged(system, law, delay)
+        achieved = evaluate(system, law, delay)
         # The looks of the search may just miss a peak; the exact Ms decides.
         if achieved.Ms <= wanted.Ms_max:
             break
     if like is not None:
         law = like.replace(Kp=law.Kp, Ki=law.Ki, Kd=law.Kd, Tf=law.Tf)
-    return Tuning(law, candidate.factors, achieved, found.looked_at, found.stable)
+    return Tuning(law, candidate.factors, achieved, found.evaluated, found.stable)
 
 
-def judged(system: LinearSystem | FrequencyData, controller: Controller, delay: float = 0.0) -> Margins:
+def evaluate(system: LinearSystem | FrequencyData, controller: Controller, delay: float = 0.0) -> Margins:
     """All crossovers and margins, Ms and bandwidth of a controller on a plant: from roots of polynomials where there
     are any, from a dense response otherwise."""
     law = pidf(controller)
@@ -154,8 +155,10 @@ def judged(system: LinearSystem | FrequencyData, controller: Controller, delay: 
         loop = series(law, system)
         return margins(loop, feedback(loop, gain(1.0)))
     plant = Plant(system, delay)
-    at_one = plant.looks(1.0)
-    omega = plant.looks(float(at_one[np.argmin(np.abs(np.log(np.abs(law.response(at_one) * plant.response(at_one)))))]))
+    at_one = plant.search_frequencies(1.0)
+    omega = plant.search_frequencies(
+        float(at_one[np.argmin(np.abs(np.log(np.abs(law.response(at_one) * plant.response(at_one)))))])
+    )
     loops = law.response(omega) * plant.response(omega)
-    stable = bool(circled(loops[None, :], plant.integrators + (controller.Ki != 0.0))[0])
+    stable = bool(nyquist_stable(loops[None, :], plant.integrators + (controller.Ki != 0.0))[0])
     return margins_of_response(lambda w: np.asarray(law.response(w) * plant.response(w)), omega, stable)

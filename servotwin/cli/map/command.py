@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from servotwin.analysis.maps.pieces import collected, compute
 from servotwin.analysis.maps.result import StabilityMap, write_numbers
-from servotwin.analysis.maps.store import Store
+from servotwin.analysis.maps.store import MapStore, collected, compute
 from servotwin.cli.map import table
 from servotwin.cli.map.request import Request
 from servotwin.errors import InvalidInput
@@ -52,7 +51,7 @@ def stability_map(
     if workers is not None and scheduler is not None:
         raise InvalidInput(f"--workers {workers} and --scheduler {scheduler}: give one; a cluster has its own workers")
     settings = request.settings()
-    store = Store(out, settings)
+    store = MapStore(out, settings)
     compute(store, workers, scheduler, console)
     found = StabilityMap(settings, collected(store))
     write_numbers(found, out)

@@ -1,4 +1,4 @@
-"""What a setting does to many machines that the model may stand for."""
+"""Simulation of settings on many machines that the model may stand for, and the measures of each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
-from servotwin.redesign.certified.uncertainty import Members
+from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
 from servotwin.simulation.cases import Cases
 from servotwin.simulation.ensemble import summarise_members
@@ -25,14 +25,14 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Trial:
-    """How members are tried.
+    """Duration and sampling of the simulations.
 
     Parameters
     ----------
     duration, last : float
-        s: length of a run from rest with one step of the reference, and of the end of it that is judged.
+        s: length of a run from rest with one step of the reference, and of its judged last part.
     rate : float
-        Hz, at which errors and voltages are looked at.
+        Hz, at which errors and voltages are sampled.
     threads : int, optional
         As many as there are processors by default.
     """
@@ -44,8 +44,8 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """Measures of each member, (P, C) arrays.
+class MachineMeasures:
+    """Measures of each simulated machine, (P, C) arrays.
 
     Attributes
     ----------
@@ -56,13 +56,14 @@ class Outcome:
     error_rms, effort : array
         m, V: root mean squares of error and voltage there.
     overshoot : array
-        Beyond where it ends, per step and error at the end: what an input bias leaves is not overshoot.
+        Largest error beyond the mean of the last part, per step and error there: the error that an input bias leaves is
+        not overshoot.
     settling : array
         s, last time at which the error is beyond `nearness`.
     cost : array
         s, integral of abs(error) over the whole run, per step.
     saturated : array of bool
-        Whether the voltage met its limit.
+        True where the voltage met its limit.
     """
 
     ripple: Array
@@ -76,12 +77,12 @@ class Outcome:
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """(P, C)."""
+        """(P, C), True where the loop settled."""
         return self.ripple < STILL
 
 
-def assess(settings: Sequence[Design], members: Members, trial: Trial) -> list[Outcome]:
-    """Simulate every setting on every member, exactly and in continuous time; the reference steps once from rest."""
+def assess(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[MachineMeasures]:
+    """Simulate every setting on every machine, exactly and in continuous time; the reference steps once from rest."""
     laws = np.empty((len(settings), 1, 1), dtype=object)
     laws[:, 0, 0] = [setting.continuous.controller for setting in settings]
     plants = np.empty((len(members.plants), 1), dtype=object)
@@ -106,9 +107,9 @@ def assess(settings: Sequence[Design], members: Members, trial: Trial) -> list[O
 
 
 def nearness(setting: Design, input_bias: Array, step: float) -> Array:
-    """m: an error within which the loop is where it is to be, for each input bias (V) and the largest step (m).
+    """Error (m) within which the loop has arrived, for each input bias (V) and the largest step (m).
 
-    That is 2 % of the step, what an input bias leaves where nothing integrates, and the dead zone.
+    It is 2 % of the step, plus the error that an input bias leaves where nothing integrates, plus the dead zone.
     """
     law = setting.controller
     left = np.abs(input_bias + law.feedforward) / abs(law.Kp)
@@ -119,9 +120,9 @@ def _of(figures: Figures, setting: int) -> Figures:
     return Figures(*(values[setting] for values in figures))
 
 
-def _outcome(error: Figures, voltage: Figures, step: Array, trial: Trial, limit: float) -> Outcome:
+def _outcome(error: Figures, voltage: Figures, step: Array, trial: Trial, limit: float) -> MachineMeasures:
     """Measures from (P, C) figures."""
-    return Outcome(
+    return MachineMeasures(
         ripple=0.5 * (error.last_highest - error.last_lowest),
         tail=np.maximum(error.last_highest, -error.last_lowest),
         error_rms=np.sqrt(error.last_mean_square),

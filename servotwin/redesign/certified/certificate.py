@@ -1,4 +1,4 @@
-"""What a setting must show before it is sent, and what it showed."""
+"""Demands on a setting before it is sent, and the certificate of the simulations that it passed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from servotwin.redesign.design import Design
 @settings("demands")
 @dataclass(frozen=True)
 class Demands:
-    """What a setting must show, and how hard it is looked for.
+    """Demands on a setting, and the effort of the search for one.
 
     Parameters
     ----------
@@ -22,17 +22,17 @@ class Demands:
     scales : tuple of float
         Factors on Kp and Kd.
     integral : tuple of float
-        Factors on Ki, tried where there is friction, or the input bias is known to no better than `bias_known`.
+        Factors on Ki, tried where there is friction, or where the input bias is known to no better than `bias_known`.
     bias_known : float
         V.
     hysteresis : tuple of (float, float)
         enter and leave of a dead zone of p gap, tried beside no dead zone where there is noise.
     effort_weight : float
-        s/V: what a volt (rms) of measurement noise in the voltage costs, beside seconds of error.
+        s/V: cost of a volt (rms) of measurement noise in the voltage, beside seconds of error.
     screened, plants, conditions : int
-        Plants that rank the candidates, plants of the proof, and conditions of each.
+        Plants that rank the candidates, plants of the verification, and conditions of each.
     attempts : int
-        Candidates that are tried before none is found.
+        Candidates that are verified before the search is given up.
     """
 
     Ms: Annotated[
@@ -63,35 +63,36 @@ class Demands:
 
 @dataclass(frozen=True)
 class Certificate:
-    """A setting with what it showed.
+    """A setting and its results on the simulated machines.
 
     Attributes
     ----------
     setting : Design
     gap, input_bias, step, friction : (float, float)
-        rad, V, m, N m: ranges of the members.
+        rad, V, m, N m: ranges of the simulated machines.
     members : int
+        Number of simulated machines.
     settled : float
-        Share that settled.
+        Share of them that settled.
     cost : float
-        s: 95th percentile of the integral of abs(error) per step, and the noise's price.
+        s: 95th percentile of the integral of abs(error) per step, plus the cost of noise.
     tail, tail_p95, error_rms, effort : float
-        m, m, m, V: worst of all members in the last part; the 95th percentile of the tail.
+        m, m, m, V: worst of all machines in the last part; the 95th percentile of the tail.
     overshoot : float
         Worst, per step.
     settling, settling_worst : float
-        s until the error stays below 2 % of the largest step, what the input bias leaves and the dead zone: the 95th
-        percentile, and the worst.
+        s until the error stays below `within`: the 95th percentile, and the worst.
     within : float
-        m: that error, where it is largest.
+        m: 2 % of the largest step, plus the error that the input bias leaves, plus the dead zone.
     Ms, crossover, phase_margin : float
-        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad.
+        Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain
+        is below one at every frequency has the crossover 0 and the margin pi.
     saturated : bool
-        Whether the voltage limit was met by a member.
+        True when the voltage met its limit on any machine.
     looked_at : int
         Candidates simulated, this one included.
     seconds : float
-        What it took.
+        Computing time.
     """
 
     setting: Design
@@ -119,8 +120,8 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """No candidate could be proved."""
+class NotVerified:
+    """The reason why no candidate was verified, and the certificate of the best one."""
 
     reason: str
     best: Certificate | None = None

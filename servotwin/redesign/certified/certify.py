@@ -1,8 +1,8 @@
-"""A setting that was proved on the machines the estimate allows, or none.
+"""The search for a setting that is verified by simulation on the machines that the estimate allows.
 
-Candidates are simulated on members drawn from everything that is uncertain: the plant's parameters, the gap within the
-estimate's interval, the size of the steps, what is left of the input bias. A few members rank them; the best is then
-tried on many, and sent only if these settle. Nothing is extrapolated from the estimate's point value.
+Candidates are simulated on machines drawn from everything that is uncertain: the plant's parameters, the gap within the
+estimate's interval, the size of the steps, the rest of the input bias. A few machines rank the candidates; the best is
+then simulated on many, and sent only if these settle. Nothing is extrapolated from the estimate's point value.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.margins import Margins
+from servotwin.plant.margins import GainCrossover, Margins
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import Outcome, Trial, assess, nearness
-from servotwin.redesign.certified.certificate import Certificate, Demands, Refusal
-from servotwin.redesign.certified.uncertainty import Members, Uncertainty, draw
+from servotwin.redesign.certified.assess import MachineMeasures, Trial, assess, nearness
+from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
+from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
 from servotwin.redesign.design import Design
 
 # Measurement noise reaches from well above the crossover to half the rate at which it is sampled.
 _NOISE_BAND = (10.0, 2500.0)
-# What an input bias leaves is the same number on every plant, but for rounding.
+# The error that an input bias leaves is the same number on every plant, but for rounding.
 _ROUNDED = 1.0 + 1e-6
 
 
@@ -38,8 +38,8 @@ def certify(
     feedforward: float = 0.0,
     noise: float = 0.0,
     clock: Callable[[], float] = perf_counter,
-) -> Certificate | Refusal:
-    """The cheapest setting that meets the demands on every machine the uncertainty allows.
+) -> Certificate | NotVerified:
+    """Find the cheapest setting that meets the demands on all simulated machines that the uncertainty allows.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def certify(
     demands, trial = demands or Demands(), trial or Trial()
     demands, disturbed = _for_disturbance(demands, uncertainty, feedforward)
     laws = candidates_of(servo, demands, uncertainty.gap[1], disturbed, noise > 0.0)
-    candidates = [_fed(setting, feedforward) for setting in laws]
+    candidates = [_with_feedforward(setting, feedforward) for setting in laws]
     ranked = _ranked(
         candidates, draw(servo, uncertainty, demands.screened, demands.conditions, demands.seed), trial, demands, noise
     )
@@ -78,7 +78,9 @@ def certify(
             return tried
         best = tried if best is None or tried.settled > best.settled else best
     assert best is not None
-    return Refusal(f"none of {len(candidates)} candidates is proved: the best {_shortcoming(best, demands)}", best)
+    return NotVerified(
+        f"none of {len(candidates)} candidates is verified: the best {_shortcoming(best, demands)}", best
+    )
 
 
 def confirm(
@@ -89,8 +91,8 @@ def confirm(
     trial: Trial | None = None,
     noise: float = 0.0,
     clock: Callable[[], float] = perf_counter,
-) -> Certificate | Refusal:
-    """Whether one setting meets the demands on every machine the uncertainty allows; no other is looked at.
+) -> Certificate | NotVerified:
+    """Verify one setting on simulated machines that the uncertainty allows; no other is looked at.
 
     Parameters
     ----------
@@ -106,13 +108,13 @@ def confirm(
     tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
     tried = replace(tried, looked_at=1, seconds=clock() - begin)
     missing = _shortcoming(tried, demands)
-    return Refusal(f"the setting {missing}", tried) if missing else tried
+    return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
 def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: float) -> tuple[Demands, bool]:
-    """The demands where friction or bias act on a member, and whether they do.
+    """Demands where friction or bias act on a machine, and True where they do.
 
-    The members' bias sets in together with the step: what it adds to the overshoot says nothing.
+    The bias sets in together with the step, so that the overshoot it adds means nothing.
     """
     low, high = (bias + feedforward for bias in uncertainty.input_bias)
     disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
@@ -122,8 +124,8 @@ def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: fl
 def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, noisy: bool) -> list[Design]:
     """Every combination of scales, integral action and dead zone within the bound on Ms.
 
-    Integral action is for friction and for an input bias that is not known, a dead zone keeps noise out of the voltage:
-    they are looked at only where there is something for them to do.
+    Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
+    candidates only where there is friction or bias, or noise.
 
     Raises
     ------
@@ -161,11 +163,13 @@ def _margins(servo: Servo, law: Controller) -> Margins:
     return servo.margins(law)
 
 
-def _fed(setting: Design, feedforward: float) -> Design:
+def _with_feedforward(setting: Design, feedforward: float) -> Design:
     return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)
 
 
-def _ranked(candidates: list[Design], members: Members, trial: Trial, demands: Demands, noise: float) -> list[Design]:
+def _ranked(
+    candidates: list[Design], members: SimulatedMachines, trial: Trial, demands: Demands, noise: float
+) -> list[Design]:
     """Best first: those that settle on more members, in whole percents, then the cheaper."""
     outcomes = assess(candidates, members, trial)
 
@@ -177,7 +181,7 @@ def _ranked(candidates: list[Design], members: Members, trial: Trial, demands: D
     return [candidates[k] for k in sorted(range(len(candidates)), key=place)]
 
 
-def _cost(setting: Design, outcome: Outcome, demands: Demands, noise: float) -> float:
+def _cost(setting: Design, outcome: MachineMeasures, demands: Demands, noise: float) -> float:
     price = demands.effort_weight * setting.noise_effort(noise, _NOISE_BAND) if noise else 0.0
     return float(np.percentile(outcome.cost, 95.0)) + price
 
@@ -185,14 +189,14 @@ def _cost(setting: Design, outcome: Outcome, demands: Demands, noise: float) -> 
 def _certificate(
     servo: Servo,
     setting: Design,
-    members: Members,
+    members: SimulatedMachines,
     uncertainty: Uncertainty,
-    outcome: Outcome,
+    outcome: MachineMeasures,
     demands: Demands,
     noise: float,
 ) -> Certificate:
     loop = _margins(servo, setting.controller.replace(feedforward=0.0, enter=1.0, leave=1.0))
-    crossover = loop.gain_crossovers[-1]
+    crossover = loop.gain_crossovers[-1] if loop.gain_crossovers else GainCrossover(0.0, math.pi)
     return Certificate(
         setting=setting,
         gap=uncertainty.gap,
@@ -220,9 +224,12 @@ def _certificate(
 
 
 def _shortcoming(tried: Certificate, demands: Demands) -> str:
-    """What is missing, in words; empty: nothing."""
+    """Name the demand that is not met; empty where all are met."""
+    if tried.crossover == 0.0:
+        return "has no gain crossover: its loop gain is below one at every frequency"
     if tried.settled < demands.settled:
-        return f"settles on {100.0 * tried.settled:.1f} % of the members, and {100.0 * demands.settled:g} % are asked"
+        share, least = 100.0 * tried.settled, 100.0 * demands.settled
+        return f"settles on {share:.1f} % of the simulated machines, and {least:g} % are demanded"
     if tried.tail > _ROUNDED * demands.tail:
         return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * demands.tail:.3g} mm are allowed"
     if tried.overshoot > demands.overshoot:

@@ -1,7 +1,7 @@
-"""Settings proved beforehand, one for each cell of a grid over what evidence leaves open.
+"""Settings verified beforehand, one for each cell of a grid over gap, input bias and noise.
 
-A cell is an interval of gaps and a largest input bias that the feedforward leaves; its setting was proved for the whole
-cell, so it holds for every region inside. What no proved cell contains is not covered: then the fallback set is sent.
+A cell is an interval of gaps and a largest input bias that the feedforward leaves; its setting was verified on machines
+of the whole cell, so it serves every region inside. A region that no verified cell contains gets the fallback set.
 Cells of every width overlap by half, so that a region lies in one at most four times as wide, but for the narrowest.
 """
 
@@ -18,11 +18,10 @@ import msgspec
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
-from servotwin.redesign.certified.certificate import Certificate, Refusal
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.region import Region
-from servotwin.redesign.certified.uncertainty import Range
+from servotwin.redesign.certified.uncertainty import Range, Region
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
@@ -33,7 +32,7 @@ _QUIET = 1e-6  # m rms: noise below is like none
 
 @dataclass(frozen=True)
 class Grid:
-    """Where settings are proved.
+    """Grid of cells for which settings are verified.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ class Grid:
     biases : tuple of float
         V, rising: largest input bias that is left beside the feedforward.
     noises : tuple of float
-        m rms, rising: for which settings are ranked; what is proved does not depend on it.
+        m rms, rising: for which settings are ranked; the verification does not depend on it.
 
     Raises
     ------
@@ -70,8 +69,8 @@ class Grid:
         return tuple(whole / 2.0**k for k in range(halvings, -1, -1))
 
 
-class Key(NamedTuple):
-    """Which cell: places in the levels of width, along the gap in half widths, in the biases and in the noises."""
+class CellIndex(NamedTuple):
+    """Index of a cell: places in the levels of width, along the gap in half widths, in the biases and in the noises."""
 
     level: int
     place: int
@@ -81,7 +80,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class CertifiedTable:
-    """What was proved for the cells of a grid.
+    """Certificates of the cells of a grid.
 
     Attributes
     ----------
@@ -93,11 +92,11 @@ class CertifiedTable:
     feedforward_limit : float
         V, either sign.
     bias_known : float
-        V: up to here the policy asks for less overshoot, and only cells up to here are proved for that.
+        V: up to here the policy demands less overshoot, and only cells up to here are verified for that.
     fallback : Certificate
-        What holds for the whole stated range.
-    cells : dict of Key to Certificate or None
-        None: nothing is proved there.
+        Of the fallback set, which serves the whole stated range.
+    cells : dict of CellIndex to Certificate or None
+        None: no setting was verified there.
     """
 
     grid: Grid
@@ -106,34 +105,34 @@ class CertifiedTable:
     feedforward_limit: float
     bias_known: float
     fallback: Certificate
-    cells: dict[Key, Certificate | None]
+    cells: dict[CellIndex, Certificate | None]
 
-    def find(self, region: Region, running: Setting | None = None) -> Certificate | Refusal:
-        """The certificate of the narrowest proved cell that contains a region, its feedforward put in.
+    def find(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
+        """Find the certificate of the narrowest verified cell that contains a region, with the region's feedforward.
 
-        A cell up to four times as wide comes before it whose setting is `running` already, but for the feedforward.
+        A cell up to four times as wide is preferred whose setting is `running` already, but for the feedforward.
         """
         if region.friction[0] < self.friction[0] or region.friction[1] > self.friction[1]:
-            return Refusal(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")
+            return NotVerified(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")
         if abs(region.feedforward) > self.feedforward_limit:
-            return Refusal(f"a feedforward of {region.feedforward:.3g} V is in no cell of the table")
-        proved = [(key, found) for key in self._containing(region) if (found := self.cells.get(key)) is not None]
-        if proved:
-            widest = proved[0][0].level + _KEPT_LEVELS
-            kept = [found for key, found in proved if key.level <= widest and _alike(found.setting, running)]
-            return _fed((kept or [proved[0][1]])[0], region.feedforward)
+            return NotVerified(f"a feedforward of {region.feedforward:.3g} V is in no cell of the table")
+        verified = [(key, found) for key in self._containing(region) if (found := self.cells.get(key)) is not None]
+        if verified:
+            widest = verified[0][0].level + _KEPT_LEVELS
+            same = [found for key, found in verified if key.level <= widest and _alike(found.setting, running)]
+            return _with_feedforward((same or [verified[0][1]])[0], region.feedforward)
         low, high = (math.degrees(end) for end in region.gap)
-        left = 1e3 * region.largest_bias
-        return Refusal(
-            f"no proved cell of the table holds gaps of {low:.4g} to {high:.4g} deg with {left:.3g} mV of bias"
+        bias = 1e3 * region.largest_bias
+        return NotVerified(
+            f"no verified cell of the table holds gaps of {low:.4g} to {high:.4g} deg with {bias:.3g} mV of bias"
         )
 
-    def _containing(self, region: Region) -> Iterator[Key]:
+    def _containing(self, region: Region) -> Iterator[CellIndex]:
         """Cells that contain a region, the smallest bias first, then the narrowest."""
         low, high = region.gap
         noise = self._noise(region.noise)
         wide = enumerate(self.grid.levels(self.stated))
-        places = [Key(level, self._place(low, width), 0, noise) for level, width in wide]
+        places = [CellIndex(level, self._place(low, width), 0, noise) for level, width in wide]
         holding = [key for key in places if _holds(cell_range(self.grid, self.stated, key), low, high)]
         known = region.largest_bias <= self.bias_known
         for bias, limit in enumerate(self.grid.biases):
@@ -141,19 +140,19 @@ class CertifiedTable:
                 yield from (key._replace(bias=bias) for key in holding)
 
     def _place(self, low: float, width: float) -> int:
-        """Of the cell of a width with the largest beginning that is not above `low`."""
+        """Place of the cell of a width that begins highest, but not above `low`."""
         most = 2 * round((self.stated[1] - self.stated[0]) / width) - 2 if width > 0.0 else 0
         if most <= 0:
             return 0
         return min(max(0, math.floor((low - self.stated[0]) / (0.5 * width))), most)
 
     def _noise(self, noise: float) -> int:
-        """The level that is nearest, in ratios."""
+        """Nearest level, in ratios."""
         distances = [abs(math.log((level + _QUIET) / (noise + _QUIET))) for level in self.grid.noises]
         return distances.index(min(distances))
 
 
-def keys_of(grid: Grid, stated: Range) -> Iterator[Key]:
+def cells_of(grid: Grid, stated: Range) -> Iterator[CellIndex]:
     """All cells, the widest first."""
     widths = grid.levels(stated)
     for level in reversed(range(len(widths))):
@@ -161,37 +160,37 @@ def keys_of(grid: Grid, stated: Range) -> Iterator[Key]:
         for place in range(count):
             for bias in range(len(grid.biases)):
                 for noise in range(len(grid.noises)):
-                    yield Key(level, place, bias, noise)
+                    yield CellIndex(level, place, bias, noise)
 
 
-def cell_range(grid: Grid, stated: Range, key: Key) -> Range:
+def cell_range(grid: Grid, stated: Range, key: CellIndex) -> Range:
     """rad: the gaps of a cell."""
     width = grid.levels(stated)[key.level]
     low = stated[0] + 0.5 * width * key.place
     return low, min(low + width, stated[1])
 
 
-def proved(policy: CertifiedPolicy, grid: Grid, key: Key) -> Certificate | None:
-    """What holds in a cell; None: nothing is proved.
+def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certificate | None:
+    """Certify the setting of a cell; None where none is verified.
 
-    The feedforward enters by what it leaves of the bias alone, as long as no voltage meets its limit: so the cell is
-    proved with none, and with a limit that is lower by the largest feedforward. Where that is met, it is not proved.
-    Every member has to settle: the few that need not might all lie in the region that is looked up.
+    As long as no voltage meets its limit, the feedforward matters only through the bias that it leaves. So the cell is
+    verified without feedforward, and with a limit that is lower by the largest one; where that limit is met, there is
+    no certificate. Every machine has to settle: the few that need not might all lie in the region that is looked up.
     """
     stated, bias = policy.uncertainty.gap, grid.biases[key.bias]
     known = policy.uncertainty.replace(gap=cell_range(grid, stated, key), input_bias=(-bias, bias))
     limit = policy.servo.controller.voltage_limit
     servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
-    demands = replace(policy.held(), settled=1.0)
+    demands = replace(policy.demands_within_band(), settled=1.0)
     found = certify(servo, known, demands, policy.trial, 0.0, grid.noises[key.noise], policy.clock)
-    if isinstance(found, Refusal) or found.saturated:
+    if isinstance(found, NotVerified) or found.saturated:
         return None
     law = found.setting.controller.replace(voltage_limit=limit)
     return replace(found, setting=replace(found.setting, controller=law))
 
 
-def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[Key, Certificate | None]) -> CertifiedTable:
-    """The table of a policy's proofs."""
+def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[CellIndex, Certificate | None]) -> CertifiedTable:
+    """Table of the certificates of a policy."""
     known = policy.uncertainty
     least = policy.demands.bias_known
     return CertifiedTable(grid, known.gap, known.friction, policy.feedforward_limit, least, policy.fallback(), cells)
@@ -199,7 +198,7 @@ def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[Key, Certificate |
 
 @dataclass(frozen=True)
 class TablePolicy:
-    """The certified policy with its proofs looked up; what it sends carries the certificate of a cell.
+    """The certified policy with its certificates looked up; a redesign carries the certificate of a cell.
 
     Parameters
     ----------
@@ -210,38 +209,38 @@ class TablePolicy:
     policy: CertifiedPolicy
     table: CertifiedTable
     needs_estimate: ClassVar[bool] = False
-    owes: ClassVar[bool] = True
+    provisional: ClassVar[bool] = True
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """The setting of a cell that contains all that the evidence allows; without one the fallback set, and why."""
+        """Choose the setting of a cell that contains all machines that the evidence allows; else the fallback set."""
         return self.policy.decide(evidence, self)
 
-    def prove(self, region: Region, running: Setting | None) -> Certificate | Refusal:
-        """Looked up."""
+    def verify(self, region: Region, running: Setting | None) -> Certificate | NotVerified:
+        """Look a region up."""
         return self.table.find(region, running)
 
     def fallback(self) -> Certificate:
-        """Looked up."""
+        """Certificate of the fallback set."""
         return self.table.fallback
 
     def withdrawn(self, evidence: Evidence, why: str) -> Redesign:
         """The fallback set, whatever the table says."""
-        return self.policy.decide(evidence, _Withdrawn(self.table.fallback, why))
+        return self.policy.decide(evidence, _WithdrawnTable(self.table.fallback, why))
 
 
 @dataclass(frozen=True)
-class _Withdrawn:
-    """Proves nothing."""
+class _WithdrawnTable:
+    """A table that verifies nothing any more."""
 
-    proved: Certificate
+    certificate: Certificate
     why: str
-    owes: ClassVar[bool] = False
+    provisional: ClassVar[bool] = False
 
-    def prove(self, _region: Region, _running: Setting | None) -> Refusal:
-        return Refusal(self.why)
+    def verify(self, _region: Region, _running: Setting | None) -> NotVerified:
+        return NotVerified(self.why)
 
     def fallback(self) -> Certificate:
-        return self.proved
+        return self.certificate
 
 
 def _holds(cell: Range, low: float, high: float) -> bool:
@@ -249,7 +248,7 @@ def _holds(cell: Range, low: float, high: float) -> bool:
 
 
 def _alike(one: Design, other: Setting | None) -> bool:
-    """Whether two settings are the same but for the feedforward."""
+    """True when two settings are the same but for the feedforward."""
     if other is None or other.gains is None or one.tolerance != other.tolerance:
         return False
     return gains_of(one.controller) == msgspec.structs.replace(
@@ -257,8 +256,8 @@ def _alike(one: Design, other: Setting | None) -> bool:
     )
 
 
-def _fed(found: Certificate, feedforward: float) -> Certificate:
-    """With a feedforward, and the input bias that then is the cell's."""
+def _with_feedforward(found: Certificate, feedforward: float) -> Certificate:
+    """Certificate with a feedforward, and the input bias that then is the cell's."""
     low, high = found.input_bias
     law = found.setting.controller.replace(feedforward=feedforward)
     setting = replace(found.setting, controller=law)

@@ -1,4 +1,4 @@
-"""A table of proved settings as a file, and for whom it holds."""
+"""A table of verified settings as a file, and for whom it holds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from msgspec import Struct
 import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.lookup import CertifiedTable, Grid, Key, keys_of, proved, table_of
+from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, cells_of, certify_cell, table_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.runtime import files
 
@@ -29,17 +29,17 @@ class TableFile(Struct, frozen=True, tag="certified-table/1"):
     Attributes
     ----------
     of : dict of str to str
-        Everything that the proofs depend on, in full.
+        Everything that the verification depends on, in full.
     grid : Grid
     fallback : Certificate
-    cells : tuple of (Key, Certificate or None)
+    cells : tuple of (CellIndex, Certificate or None)
         Fewer than the grid has while it is unfinished.
     """
 
     of: dict[str, str]
     grid: Grid
     fallback: Certificate
-    cells: tuple[tuple[Key, Certificate | None], ...]
+    cells: tuple[tuple[CellIndex, Certificate | None], ...]
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -47,7 +47,7 @@ _decoder = msgspec.msgpack.Decoder(TableFile)
 
 
 def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:
-    """The finished table of a file, for the policy whose proofs it holds.
+    """The finished table of a file, for the policy whose certificates it holds.
 
     Raises
     ------
@@ -56,16 +56,16 @@ def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:
     """
     found = _read(path)
     _check_owner(path, found, policy)
-    missing = len(set(keys_of(found.grid, policy.uncertainty.gap)) - {key for key, _ in found.cells})
+    missing = len(set(cells_of(found.grid, policy.uncertainty.gap)) - {key for key, _ in found.cells})
     if missing:
-        raise InvalidInput(f"{path}: {missing} cells of this table are not proved yet: run the same command again")
+        raise InvalidInput(f"{path}: {missing} cells of this table are not verified yet: run the same command again")
     return table_of(policy, found.grid, dict(found.cells))
 
 
 def build(
     path: Path, policy: CertifiedPolicy, grid: Grid, clock: Callable[[], float] = perf_counter
 ) -> Generator[tuple[int, int], None, None]:
-    """Prove a table cell by cell into a file, going on where an earlier run ended; gives (cells done, cells in all).
+    """Verify a table cell by cell into a file, going on where an earlier run ended; gives (cells done, cells in all).
 
     What is done is on the disk every few seconds and when this is closed.
 
@@ -74,13 +74,13 @@ def build(
     InvalidInput
         The file is there and no table, another's or on another grid; it cannot be written; there is no fallback set.
     """
-    keys = list(keys_of(grid, policy.uncertainty.gap))
+    keys = list(cells_of(grid, policy.uncertainty.gap))
     cells = _begun(path, policy, grid)
     kept, fallback = clock(), policy.fallback()
     try:
         for key in keys:
             if key not in cells:
-                cells[key] = proved(policy, grid, key)
+                cells[key] = certify_cell(policy, grid, key)
             yield len(cells), len(keys)
             if clock() - kept > _KEPT_EVERY:
                 _write(path, TableFile(told(policy), grid, fallback, tuple(cells.items())))
@@ -90,7 +90,7 @@ def build(
 
 
 def told(policy: CertifiedPolicy) -> dict[str, str]:
-    """Everything that a policy's proofs depend on, by name and in full."""
+    """Everything that a policy's certificates depend on, by name and in full."""
     parts = {"servotwin": servotwin.__version__, "feedforward_limit": repr(policy.feedforward_limit)}
     for name in ("servo", "uncertainty", "demands"):
         parts |= dict(spelled(name, getattr(policy, name)))
@@ -98,7 +98,7 @@ def told(policy: CertifiedPolicy) -> dict[str, str]:
     return {**parts, **trial}
 
 
-def _begun(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[Key, Certificate | None]:
+def _begun(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[CellIndex, Certificate | None]:
     if not path.exists():
         return {}
     found = _read(path)
@@ -118,7 +118,7 @@ def _read(path: Path) -> TableFile:
             f"{path}: cannot be read ({error.strerror or error}); `servotwin certify` makes tables"
         ) from None
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidInput(f"{path}: is no table of proved settings ({error})") from None
+        raise InvalidInput(f"{path}: is no table of verified settings ({error})") from None
 
 
 def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
@@ -129,7 +129,7 @@ def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
         there, here = (each.get(key, "nothing") for each in (found.of, wanted))
         more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
         raise InvalidInput(
-            f"{path}: was proved for {key} = {there}, and this is {here}{more}: prove a table of its own with"
+            f"{path}: was verified for {key} = {there}, and this is {here}{more}: certify a table of its own with"
             " `servotwin certify`"
         )
 

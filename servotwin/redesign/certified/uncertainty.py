@@ -1,4 +1,4 @@
-"""How wrong the model may be, and the machines it then stands for."""
+"""Uncertainty of the model and its conditions, the machines drawn from it, and the region that evidence leaves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 @settings("uncertainty")
 @dataclass(frozen=True)
 class Uncertainty:
-    """What is known of a machine: each value lies in its range, and nothing says where.
+    """Ranges of a machine's parameters and conditions; within them nothing is known.
 
     Raises
     ------
@@ -75,8 +75,40 @@ class Uncertainty:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
+class Region:
+    """Ranges of a machine's conditions that evidence leaves open.
+
+    Attributes
+    ----------
+    gap : (float, float)
+        rad, total.
+    feedforward : float
+        V: a part of the setting.
+    input_bias, friction : (float, float)
+        V, N m.
+    noise : float
+        m rms of the measured position; 0 where it is unknown.
+    """
+
+    gap: Range
+    feedforward: float
+    input_bias: Range
+    friction: Range
+    noise: float
+
+    def within(self, known: Uncertainty) -> Uncertainty:
+        """Prior knowledge narrowed to the region."""
+        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction)
+
+    @property
+    def largest_bias(self) -> float:
+        """Largest sum of input bias and feedforward, V."""
+        return max(abs(bias + self.feedforward) for bias in self.input_bias)
+
+
 @dataclass(frozen=True, eq=False)
-class Members:
+class SimulatedMachines:
     """Machines to be simulated: every plant in every one of its conditions.
 
     Attributes
@@ -95,12 +127,12 @@ class Members:
 
     @property
     def count(self) -> int:
-        """How many machines."""
+        """Number of machines."""
         return self.gap.size
 
 
-def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> Members:
-    """`plants` times `conditions` members, spread evenly (scrambled Sobol sequences); equal calls draw equal members.
+def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> SimulatedMachines:
+    """Draw `plants` times `conditions` machines, spread evenly (scrambled Sobol); equal calls draw equal machines.
 
     The first plant is the model itself. The first two conditions of every plant have the largest and the smallest gap
     and input bias: the ends of an estimate's interval are where a setting fails first.
@@ -110,7 +142,7 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
         conditioned[:, 0, :3:2], conditioned[:, 1, :3:2] = 1.0, 0.0
     gap = _spread(uncertainty.gap, conditioned[..., 0])
     step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), conditioned[..., 1]))
-    return Members(
+    return SimulatedMachines(
         drawn_plants(servo, uncertainty, plants, seed),
         gap,
         step,

@@ -1,0 +1,95 @@
+"""The link process as the control process sees it: started, and restarted when it has ended."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from servotwin.edge_process.monitoring import log
+from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.runtime.child_process import ChildProcess
+from servotwin.runtime.frames import FrameSocket
+from servotwin.runtime.retry import Backoff, Retry
+
+Start = Callable[[socket.socket], ChildProcess]
+_END_S = 10.0
+
+
+def link_command(file: Path) -> Start:
+    """Return a function that starts a link process for an `edge.toml`; no secret is in its arguments."""
+
+    def start(end: socket.socket) -> ChildProcess:
+        command = [sys.executable, "-m", "servotwin.edge_process.link_process", str(file), str(end.fileno())]
+        return ChildProcess(command, pass_fds=(end.fileno(),))
+
+    return start
+
+
+class LinkChild:
+    """Keeps a link process running.
+
+    Parameters
+    ----------
+    start : callable
+        Starts a process that speaks over a socket.
+    outlet : PipeOutlet
+    """
+
+    def __init__(self, start: Start, outlet: PipeOutlet) -> None:
+        self._start, self._outlet = start, outlet
+        self._process: ChildProcess | None = None
+        self._backoff = Backoff(Retry(0.5, 2.0, 10.0))
+        self._started = self._due = 0.0
+        self.starts = 0
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id."""
+        return None if self._process is None else self._process.pid
+
+    def check(self, now: float) -> None:
+        """Start it where it is due; note where it has ended. Costs microseconds while it runs."""
+        if self._process is None:
+            if now >= self._due:
+                self._launch(now)
+            return
+        code = self._process.code
+        if code is None and self._outlet.connected:
+            return
+        if code is None:
+            self._process.kill()
+            return
+        log("link process gone", code=code)
+        self._ended(now)
+
+    def close(self) -> None:
+        """Let it finish what it has, and wait for its end."""
+        self._outlet.disconnect()
+        if self._process is not None:
+            self._process.wait(_END_S)
+        self._process = None
+
+    def _launch(self, now: float) -> None:
+        ours, theirs = socket.socketpair()
+        try:
+            self._process = self._start(theirs)
+        except OSError as error:
+            ours.close()
+            log("link process not started", error=str(error))
+            self._ended(now)
+            return
+        finally:
+            theirs.close()
+        self.starts += 1
+        self._started = now
+        self._outlet.connect(FrameSocket(ours))
+
+    def _ended(self, now: float) -> None:
+        """Restart one that ran for a while at once, one that keeps ending later and later."""
+        self._outlet.disconnect()
+        self._process = None
+        if now - self._started > 10.0:
+            self._backoff.succeeded()
+        self._due = now + self._backoff.failed(0.0)

@@ -1,0 +1,348 @@
+"""HTTP application: routes, requests, responses, error bodies and `/openapi.json`, as one ASGI callable.
+
+No framework: its layers take longer for the PUT of a window than checking and committing the window do.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import traceback
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from contextlib import AbstractAsyncContextManager
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl
+
+import msgspec
+
+from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal
+from servotwin.messages.compression import ENCODINGS
+from servotwin.twin_service.auth import bearer_token
+from servotwin.twin_service.limits import STATUS, Disconnected, Receive, RequestRejected
+from servotwin.twin_service.monitoring import Metrics
+
+log = logging.getLogger(__name__)
+
+Scope = MutableMapping[str, Any]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+Lifespan = Callable[[], AbstractAsyncContextManager[None]]
+
+MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
+MAX_INTEGER = 2**53
+_TITLE, _VERSION = "servotwin twin", "1"
+_DESCRIPTION = (
+    """MessagePack in, MessagePack out; errors are JSON: {"code": ..., "detail": ...}. Times in s, angles in rad."""
+)
+_pack = msgspec.msgpack.Encoder().encode
+
+
+class HttpRequest:
+    """One request.
+
+    Attributes
+    ----------
+    method : str
+    path : dict of str to str
+        Parameters in the path, percent-decoded.
+    receive : callable
+        ASGI's: the next event of the request, for `BodyReader`.
+    """
+
+    __slots__ = ("_headers", "_query", "_query_string", "method", "path", "receive")
+
+    def __init__(self, scope: Scope, receive: Receive, path: dict[str, str]) -> None:
+        self.method, self.path, self.receive = scope["method"], path, receive
+        self._headers, self._query_string = scope["headers"], scope["query_string"]
+        self._query: dict[str, str] | None = None
+
+    def header(self, name: bytes) -> bytes | None:
+        """The first header of that lower-case name."""
+        return next((value for key, value in self._headers if key == name), None)
+
+    @property
+    def token(self) -> bytes | None:
+        """Bearer token; None: there is none."""
+        return bearer_token(self.header(b"authorization"))
+
+    @property
+    def content_length(self) -> str | None:
+        """Content-Length as sent."""
+        value = self.header(b"content-length")
+        return None if value is None else value.decode("latin-1")
+
+    @property
+    def content_encoding(self) -> str:
+        """Compression of the body; raises RequestRejected where it is unknown."""
+        encoding = (self.header(b"content-encoding") or b"").decode("latin-1")
+        if encoding in ENCODINGS:
+            return encoding
+        if encoding == "identity":
+            return ""
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "content-encoding: known are identity, deflate and zstd")
+
+    def argument(self, key: str) -> str | None:
+        """An argument of the query; the last one where there are several."""
+        if self._query is None:
+            self._query = dict(parse_qsl(self._query_string.decode("latin-1"), keep_blank_values=True))
+        return self._query.get(key)
+
+    def integer(self, key: str, default: int | None = None) -> int:
+        """An argument of the query, an integer from 0 to 2**53; raises RequestRejected."""
+        text = self.argument(key)
+        if text is None and default is not None:
+            return default
+        digits = text is not None and text.isascii() and text.isdecimal() and len(text) <= 16
+        if text is None or not (digits and int(text) <= MAX_INTEGER):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a whole number from 0 to {MAX_INTEGER}")
+        return int(text)
+
+    def seconds(self, key: str, default: float | None = None) -> float:
+        """An argument of the query, a time in s; raises RequestRejected."""
+        text = self.argument(key)
+        if text is None and default is not None:
+            return default
+        try:
+            value = float(text or "")
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and value >= 0.0):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a time in s, finite and at least 0")
+        return value
+
+
+class HttpResponse:
+    """Status, headers and body of a response."""
+
+    __slots__ = ("body", "headers", "status")
+
+    def __init__(
+        self,
+        status: int = 200,
+        body: bytes = b"",
+        content_type: str | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        self.status, self.body = status, body
+        self.headers = [(key.encode("latin-1"), value.encode("latin-1")) for key, value in (headers or {}).items()]
+        self.headers.append((b"content-length", b"%d" % len(body)))
+        if content_type is not None:
+            self.headers.append((b"content-type", content_type.encode("latin-1")))
+
+    async def send(self, send: Send) -> None:
+        """Send it."""
+        await send({"type": "http.response.start", "status": self.status, "headers": self.headers})
+        await send({"type": "http.response.body", "body": self.body})
+
+
+def msgpack_response(value: object, status: int = 200) -> HttpResponse:
+    """Response in MessagePack."""
+    return HttpResponse(status, _pack(value), MSGPACK)
+
+
+def json_response(value: object, status: int = 200, headers: Mapping[str, str] | None = None) -> HttpResponse:
+    """Response in JSON."""
+    return HttpResponse(status, msgspec.json.encode(value), JSON, headers)
+
+
+Handler = Callable[[HttpRequest], Awaitable[HttpResponse]]
+Operation = dict[str, Any]
+
+
+class HttpRoute(NamedTuple):
+    """Declaration of one route.
+
+    Attributes
+    ----------
+    method, path : str
+        "GET", "/v1/servos/{servo}": a name in braces matches one segment.
+    handler : callable
+    operation : dict
+        Its OpenAPI operation object, as `operation` makes it.
+    """
+
+    method: str
+    path: str
+    handler: Handler
+    operation: Operation
+
+
+class HttpApp:
+    """ASGI application of routes.
+
+    A handler rejects a request by raising RequestRejected. Any other exception is the server's to log and to answer
+    with status 500.
+
+    Parameters
+    ----------
+    routes : iterable of HttpRoute
+    metrics : Metrics
+        Counts rejections.
+    lifespan : callable
+        Context manager that is entered before the first request and left after the last.
+    """
+
+    def __init__(self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: Lifespan) -> None:
+        self._metrics, self.lifespan = metrics, lifespan
+        declared = list(routes)
+        document = msgspec.json.encode(_openapi(declared))
+
+        async def openapi(_request: HttpRequest) -> HttpResponse:
+            return HttpResponse(200, document, JSON)
+
+        methods: dict[str, dict[str, Handler]] = {"/openapi.json": {"GET": openapi}}
+        for route in declared:
+            methods.setdefault(route.path, {})[route.method] = route.handler
+        self._routes = [(_pattern(path), handlers) for path, handlers in methods.items()]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await self._run_lifespan(receive, send)
+            return
+        try:
+            response = await self._respond(scope, receive)
+        except Disconnected:
+            return
+        await response.send(send)
+
+    async def _respond(self, scope: Scope, receive: Receive) -> HttpResponse:
+        for pattern, handlers in self._routes:
+            match = pattern.fullmatch(scope["path"])
+            if match is None:
+                continue
+            handler = handlers.get(scope["method"])
+            if handler is None:
+                allowed = {"allow": ", ".join(sorted(handlers))}
+                return self._no_route(405, "this path does not know that method", allowed)
+            request = HttpRequest(scope, receive, match.groupdict())
+            try:
+                return await handler(request)
+            except RequestRejected as rejected:
+                return self._rejection(request, rejected)
+        return self._no_route(404, "there is no such path")
+
+    def _no_route(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> HttpResponse:
+        code = Refusal.NOT_UNDERSTOOD.value
+        self._metrics.rejected.add(code)
+        return json_response({"code": code, "detail": detail}, status, headers)
+
+    def _rejection(self, request: HttpRequest, rejected: RequestRejected) -> HttpResponse:
+        """Error body; the rejection is counted, and logged without the body of the request."""
+        code, status = rejected.refusal.value, rejected.status
+        self._metrics.rejected.add(code)
+        about = {"servo": request.path.get("servo", "")[:64], "code": code, "why": rejected.detail}
+        log.info("refused", extra={**about, "method": request.method, "status": status})
+        headers = {"retry-after": "1"} if status in (429, 503) else {}
+        if status == 401:
+            headers["www-authenticate"] = "Bearer"
+        if rejected.close:
+            headers["connection"] = "close"
+        return json_response({"code": code, "detail": rejected.detail}, status, headers)
+
+    async def _run_lifespan(self, receive: Receive, send: Send) -> None:
+        phase = "startup"
+        await receive()
+        try:
+            async with self.lifespan():
+                await send({"type": "lifespan.startup.complete"})
+                phase = "shutdown"
+                await receive()
+        except BaseException:
+            await send({"type": f"lifespan.{phase}.failed", "message": traceback.format_exc()})
+            raise
+        await send({"type": "lifespan.shutdown.complete"})
+
+
+def _pattern(path: str) -> re.Pattern[str]:
+    """Regular expression of a path with {names}."""
+    literals = re.split(r"\{(\w+)\}", path)
+    parts = (f"(?P<{part}>[^/]+)" if i % 2 else re.escape(part) for i, part in enumerate(literals))
+    return re.compile("".join(parts))
+
+
+# OpenAPI
+
+_NAME = NAME_PATTERN.replace(r"\A", "^").replace(r"\Z", "$")
+_BYTES: Operation = {"type": "string", "format": "binary"}
+INTEGER: Operation = {"type": "integer", "minimum": 0, "maximum": MAX_INTEGER}
+SECONDS: Operation = {"type": "number", "minimum": 0}
+_CONTENT: dict[str, Operation] = {MSGPACK: _BYTES, JSON: {}, TEXT: {"type": "string"}}
+_ERROR: Operation = {
+    "type": "object",
+    "required": ["code", "detail"],
+    "properties": {
+        "code": {"type": "string", "enum": [refusal.value for refusal in STATUS]},
+        "detail": {"type": "string"},
+    },
+}
+MESSAGE_ERRORS = (400, 401, 403, 404, 409, 413, 422, 429, 503)
+QUERY_ERRORS = (400, 401, 403, 404, 503)
+
+
+def parameter(
+    name: str, schema: Operation, description: str, where: str = "query", required: bool = False
+) -> Operation:
+    """OpenAPI parameter object."""
+    return {
+        "name": name,
+        "in": where,
+        "required": required or where == "path",
+        "schema": schema,
+        "description": description,
+    }
+
+
+SERVO = parameter("servo", {"type": "string", "pattern": _NAME}, "Name of the servo.", "path")
+BOOT = parameter("boot", {"type": "string", "pattern": _NAME}, "Boot of the edge.", "path")
+SEQUENCE = parameter("sequence", INTEGER, "Number of the window within the boot.", "path")
+ENCODING = parameter(
+    "content-encoding",
+    {"type": "string", "enum": ["identity", "deflate", "zstd"]},
+    "Compression of the body.",
+    "header",
+)
+
+
+def operation(
+    summary: str,
+    responses: Mapping[int, tuple[str, str | None]],
+    *parameters: Operation,
+    body: str = "",
+    errors: Iterable[int] = (),
+) -> Operation:
+    """OpenAPI operation object.
+
+    Parameters
+    ----------
+    summary : str
+    responses : mapping of int to (str, str or None)
+        Status to description and content type.
+    *parameters : dict
+        As `parameter` makes them.
+    body : str
+        Description of the request's MessagePack body; empty: it has none.
+    errors : iterable of int
+        Statuses of error bodies.
+    """
+    described: Operation = {}
+    for status, (description, kind) in responses.items():
+        content = {} if kind is None else {"content": {kind: {"schema": _CONTENT[kind]}}}
+        described[str(status)] = {"description": description, **content}
+    for status in errors:
+        described.setdefault(str(status), {"description": "Rejected.", "content": {JSON: {"schema": _ERROR}}})
+    found: Operation = {"summary": summary, "parameters": list(parameters), "responses": described}
+    if body:
+        schema = {**_BYTES, "maxLength": MAX_BYTES}
+        found["requestBody"] = {"required": True, "description": body, "content": {MSGPACK: {"schema": schema}}}
+    return found
+
+
+def _openapi(routes: Iterable[HttpRoute]) -> Operation:
+    """OpenAPI 3.1 document of the routes."""
+    paths: Operation = {}
+    for route in routes:
+        name = f"{route.method.lower()} {route.path}"
+        found = {**route.operation, "operationId": re.sub(r"\W+", "_", name).strip("_")}
+        paths.setdefault(route.path, {})[route.method.lower()] = found
+    info = {"title": _TITLE, "description": _DESCRIPTION, "version": _VERSION}
+    return {"openapi": "3.1.0", "info": info, "paths": paths}

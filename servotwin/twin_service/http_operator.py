@@ -1,0 +1,248 @@
+"""HTTP API of the operators: servos, windows, the evidence chain; health and metrics for monitoring."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import msgspec
+
+from servotwin.messages import NAME_PATTERN, Refusal
+from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import Backlog, StoredEvidence, WindowTrace
+from servotwin.store.store import Store
+from servotwin.twin_service.auth import AccessControl
+from servotwin.twin_service.http_app import (
+    BOOT,
+    INTEGER,
+    JSON,
+    MSGPACK,
+    QUERY_ERRORS,
+    SECONDS,
+    SEQUENCE,
+    SERVO,
+    TEXT,
+    HttpRequest,
+    HttpResponse,
+    HttpRoute,
+    json_response,
+    operation,
+    parameter,
+)
+from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.monitoring import CONTENT_TYPE, Metrics
+from servotwin.twin_service.store_executor import StoreExecutor
+
+MAX_ROWS = 1000
+_BACKLOG_S = 0.5
+"""s for which a backlog that was read is served again."""
+Health = Callable[[], dict[str, Any]]
+"""Parts of the service -> whether each works, "ok" for all of them."""
+
+
+class OperatorApi:
+    """Routes that only read.
+
+    Parameters
+    ----------
+    access : AccessControl
+    store : Store
+    executor : StoreExecutor
+    health : callable
+    metrics : Metrics
+    wall : callable
+        s since the epoch.
+    """
+
+    def __init__(
+        self,
+        access: AccessControl,
+        store: Store,
+        executor: StoreExecutor,
+        health: Health,
+        metrics: Metrics,
+        wall: Callable[[], float],
+    ) -> None:
+        self._access, self._store, self._executor = access, store, executor
+        self._health, self._metrics, self._wall = health, metrics, wall
+        self._backlog_lock = asyncio.Lock()
+        self._backlog: tuple[float, Backlog | None] = -math.inf, None
+        metrics.add_gauge("servotwin_waiting", "Messages and proofs not yet worked on.", self._counts, "kind")
+        metrics.add_gauge("servotwin_waiting_seconds", "For how long the oldest message waits.", self._age)
+
+    def routes(self) -> list[HttpRoute]:
+        """Declarations."""
+        limit = parameter("limit", {**INTEGER, "maximum": MAX_ROWS}, "Largest number of rows.")
+        servos = operation(
+            "Summaries of all servos",
+            {200: ("By name.", JSON)},
+            parameter("after", {"type": "string"}, "Only names after this one."),
+            limit,
+            errors=QUERY_ERRORS,
+        )
+        servo = operation("Summary of one servo", {200: ("Its present state.", JSON)}, SERVO, errors=QUERY_ERRORS)
+        audit = operation(
+            "The evidence chain: window, estimate, version, receipt, effect",
+            {200: ("Newest window first.", JSON)},
+            *(SERVO, limit),
+            parameter("since", SECONDS, "Only windows received then or later, s since the epoch."),
+            parameter("before", INTEGER, "Only windows with lower ids: the next page."),
+            errors=QUERY_ERRORS,
+        )
+        events = operation(
+            "Evidence that belongs to no window: starts of the edge, fallbacks, answers, faults of the twin itself",
+            {200: ("Newest first.", JSON)},
+            *(SERVO, limit),
+            parameter("since", SECONDS, "Only evidence from then or later, s since the epoch."),
+            errors=QUERY_ERRORS,
+        )
+        window = operation(
+            "A window as it came", {200: ("window/1.", MSGPACK)}, SERVO, BOOT, SEQUENCE, errors=QUERY_ERRORS
+        )
+        healthy = {200: ("All is well.", JSON), 503: ("Something is not; the body says what.", JSON)}
+        return [
+            HttpRoute("GET", "/v1/servos", self._get_servos, servos),
+            HttpRoute("GET", SERVO_PATH, self._get_servo, servo),
+            HttpRoute("GET", SERVO_PATH + "/audit", self._get_audit, audit),
+            HttpRoute("GET", SERVO_PATH + "/events", self._get_events, events),
+            HttpRoute("GET", WINDOW_PATH, self._get_window, window),
+            HttpRoute("GET", "/healthz", self._get_health, operation("Health of the service", healthy)),
+            HttpRoute(
+                "GET",
+                "/metrics",
+                self._get_metrics,
+                operation("Metrics for Prometheus", {200: ("Text format 0.0.4.", TEXT)}),
+            ),
+        ]
+
+    async def _get_servos(self, request: HttpRequest) -> HttpResponse:
+        self._access.check_operator(request.token)
+        after, limit = request.argument("after") or "", _limit(request)
+        if after and not re.match(NAME_PATTERN, after):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "after: give the name of a servo")
+        summaries = await self._query(partial(self._store.servos, after, limit))
+        return json_response([summary._asdict() for summary in summaries])
+
+    async def _get_servo(self, request: HttpRequest) -> HttpResponse:
+        servo = self._admitted_servo(request)
+        summary = await self._query(partial(self._store.servo, servo))
+        if summary is None:
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} was never heard of")
+        return json_response(summary._asdict())
+
+    async def _get_audit(self, request: HttpRequest) -> HttpResponse:
+        servo = self._admitted_servo(request)
+        since = request.seconds("since", 0.0) or None
+        before = request.integer("before", 0) or None
+        traces = await self._query(partial(self._store.audit, servo, since, _limit(request), None, before))
+        return json_response([trace_as_json(trace) for trace in traces])
+
+    async def _get_events(self, request: HttpRequest) -> HttpResponse:
+        servo = self._admitted_servo(request)
+        since = request.seconds("since", 0.0)
+        events = await self._query(partial(self._store.events, servo, since, _limit(request)))
+        return json_response([evidence_as_json(event) for event in events])
+
+    async def _get_window(self, request: HttpRequest) -> HttpResponse:
+        """The stored bytes of a window, with their compression as content-encoding."""
+        servo = self._admitted_servo(request)
+        boot, sequence = request.path["boot"], _sequence(request.path["sequence"])
+        if not re.match(NAME_PATTERN, boot):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "boot: is no boot's name")
+        window = await self._query(partial(self._store.window, servo, boot, sequence))
+        if window is None or not window.body:
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "this window is not kept", 404)
+        headers = {"content-encoding": window.encoding} if window.encoding else {}
+        return HttpResponse(200, window.body, MSGPACK, headers)
+
+    async def _get_health(self, _request: HttpRequest) -> HttpResponse:
+        """Health and backlog: 200, or 503."""
+        health = self._health()
+        try:
+            health["waiting"] = (await self._read_backlog())._asdict()
+        except StoreUnavailable:
+            health["ok"] = health["store"] = False
+        return json_response(health, 200 if health["ok"] else 503)
+
+    async def _get_metrics(self, _request: HttpRequest) -> HttpResponse:
+        with suppress(StoreUnavailable):  # the gauges then show the last backlog
+            await self._read_backlog()
+        return HttpResponse(200, self._metrics.text().encode(), CONTENT_TYPE)
+
+    def _counts(self) -> Mapping[str, float]:
+        backlog = self._backlog[1]
+        return {} if backlog is None else {"messages": backlog.messages, "proofs": backlog.proofs}
+
+    def _age(self) -> float:
+        backlog = self._backlog[1]
+        return math.nan if backlog is None else backlog.age
+
+    async def _read_backlog(self) -> Backlog:
+        """Backlog, read at most every 0.5 s: anybody may ask for it, as often as he likes."""
+        async with self._backlog_lock:
+            at, backlog = self._backlog
+            if backlog is None or self._wall() - at >= _BACKLOG_S:
+                backlog = await self._executor.run(lambda: self._store.backlog(self._wall()))
+                self._backlog = self._wall(), backlog
+            return backlog
+
+    def _admitted_servo(self, request: HttpRequest) -> str:
+        """Name of the servo in the path, for an operator."""
+        self._access.check_operator(request.token)
+        servo = request.path["servo"]
+        if not re.match(NAME_PATTERN, servo):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "servo: is no servo's name")
+        return servo
+
+    async def _query(self, call: Callable[[], Any]) -> Any:
+        try:
+            return await self._executor.run(call)
+        except StoreUnavailable:
+            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
+
+
+def trace_as_json(trace: WindowTrace) -> dict[str, Any]:
+    """A window's evidence chain for JSON, MessagePack bodies decoded."""
+    return {
+        "window": trace.window._asdict(),
+        "found": [evidence_as_json(record) for record in trace.found],
+        "steps": [
+            {
+                "update": evidence_as_json(step.update),
+                "answers": [evidence_as_json(record) for record in step.answers],
+                "effect": None
+                if step.effect is None
+                else {
+                    "window": step.effect.window._asdict(),
+                    "before": None if step.effect.before is None else evidence_as_json(step.effect.before),
+                    "after": evidence_as_json(step.effect.after),
+                },
+            }
+            for step in trace.steps
+        ],
+    }
+
+
+def evidence_as_json(record: StoredEvidence) -> dict[str, Any]:
+    """A piece of evidence for JSON, its body decoded; null where it cannot be."""
+    try:
+        body = msgspec.msgpack.decode(record.body)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        body = None
+    return {**record._asdict(), "body": body}
+
+
+def _limit(request: HttpRequest) -> int:
+    return min(request.integer("limit", 100) or 1, MAX_ROWS)
+
+
+def _sequence(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) <= 16):
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "sequence: is no whole number")
+    return int(text)

@@ -1,0 +1,206 @@
+"""HTTP server: uvicorn with limits on the head of a request, the listening socket and TLS."""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import signal
+import socket
+import ssl
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from servotwin.errors import InvalidInput
+from servotwin.twin_service.config import ServiceConfig
+from servotwin.twin_service.http_app import HttpApp
+
+_HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
+"""Largest request line with headers, and s from its first byte (or the connection) to its last."""
+_BACKLOG = 2048
+_GRACE_S = 20
+"""s that running requests may take when the service is told to stop."""
+_CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
+"""For TLS 1.2; all of 1.3 are good. Older uvicorns would allow ciphers without any encryption."""
+_IDLE_S = 75
+"""s after which an idle connection is closed."""
+
+
+class LimitedHttpProtocol(HttpToolsProtocol):
+    """HTTP/1.1 connection with limits on the size and time of a request's head.
+
+    A head that is endless, or never complete, would otherwise hold memory or a descriptor for ever. So would a single
+    header or trailer, which the parser reports only once it is complete.
+    """
+
+    _head = _unreported = 0
+    _timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._start_timer()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_timer()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        unreported = self._unreported = self._unreported + len(data)
+        super().data_received(data)
+        # Unchanged: the parser reported nothing of this data.
+        if self._unreported == unreported > _HEAD_BYTES:
+            self.transport.abort()
+
+    def on_body(self, body: bytes) -> None:
+        self._unreported = 0
+        super().on_body(body)
+
+    def on_message_begin(self) -> None:
+        self._unreported = 0
+        super().on_message_begin()
+        self._head = 0
+        self._start_timer()
+
+    def on_url(self, url: bytes) -> None:
+        self._count(len(url))
+        super().on_url(url)
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self._count(len(name) + len(value))
+        super().on_header(name, value)
+
+    def on_headers_complete(self) -> None:
+        self._unreported = 0
+        self._stop_timer()
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        self._unreported = 0
+        super().on_message_complete()
+
+    def _count(self, size: int) -> None:
+        self._unreported = 0
+        self._head += size
+        if self._head > _HEAD_BYTES:
+            self.transport.abort()
+            raise ValueError("the head of a request is too long")
+
+    def _start_timer(self) -> None:
+        if self._timer is None:
+            self._timer = self.loop.call_later(_HEAD_S, self.transport.abort)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+class HttpServer(uvicorn.Server):
+    """uvicorn that prints its address once it accepts requests, and ends long polls when it has to stop.
+
+    Parameters
+    ----------
+    config : ServiceConfig
+    app : HttpApp
+    close_polls : callable
+        Ends all long polls.
+    """
+
+    def __init__(self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None]) -> None:
+        super().__init__(server_config(config, app))
+        self._close_polls = close_polls
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Stop at both signals; that is a regular end, so that they are not raised again afterwards."""
+        former = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for each in sockets or ():
+            print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._close_polls()
+        await super().shutdown(sockets)
+
+
+def server_config(config: ServiceConfig, app: HttpApp) -> uvicorn.Config:
+    """Configure uvicorn."""
+    return uvicorn.Config(
+        app,
+        http=LimitedHttpProtocol,
+        ws="none",
+        lifespan="on",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        proxy_headers=False,
+        backlog=_BACKLOG,
+        timeout_keep_alive=_IDLE_S,
+        timeout_graceful_shutdown=_GRACE_S,
+        ssl_certfile=config.tls_certificate,
+        ssl_keyfile=config.tls_key,
+        ssl_ciphers=_CIPHERS,
+    )
+
+
+def listening_socket(config: ServiceConfig, port: int | None = None) -> socket.socket:
+    """Open a socket that listens at the service's address.
+
+    Raises
+    ------
+    InvalidInput
+        The address is in use, or does not belong to this machine.
+    """
+    where = config.bind, config.port if port is None else port
+    family = socket.AF_INET6 if ":" in config.bind else socket.AF_INET
+    # The protocol is named: asyncio sets TCP_NODELAY only on sockets that say TCP; without it responses take 50 ms.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(where)
+        listener.listen(_BACKLOG)
+        return listener
+    except OSError as error:
+        listener.close()
+        raise InvalidInput(f"bind = {where[0]!r}, port = {where[1]}: cannot listen there ({error.strerror})") from None
+
+
+def check_tls(config: ServiceConfig) -> None:
+    """Check that certificate and key can be read and belong together, before anything listens.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    certificate, key = config.tls_certificate, config.tls_key
+    if certificate is None or key is None:
+        return
+    try:
+        # The password is given, or OpenSSL would ask for one on a terminal.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
+    except (OSError, ValueError) as error:
+        raise InvalidInput(
+            f"tls_certificate {certificate}, tls_key {key}: are no certificate with its own key, in PEM and without a "
+            f"password ({getattr(error, 'reason', None) or error})"
+        ) from None
+
+
+def raise_descriptor_limit() -> None:
+    """Allow as many connections as the system grants one process."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def _url(listener: socket.socket, tls: bool) -> str:
+    host, port = listener.getsockname()[:2]
+    return f"{'https' if tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"

@@ -1,0 +1,184 @@
+"""Monitoring: metrics in Prometheus' text format 0.0.4, and logs as JSON lines.
+
+One thread updates the metrics, so that nothing is locked. No client library: the format is a page long, and nothing
+else of a library would be used.
+"""
+
+from __future__ import annotations
+
+import collections
+import logging
+import sys
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+import msgspec
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
+"""Upper bounds of the histograms' buckets."""
+
+Labels = tuple[str, ...]
+_STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
+"""Attributes that every log record has."""
+
+
+class Counter:
+    """Counter, one per combination of label values.
+
+    Parameters
+    ----------
+    name, help_ : str
+    labels : str
+        Names of the labels, which have few values: the name of a servo is not a label.
+    """
+
+    kind = "counter"
+
+    def __init__(self, name: str, help_: str, *labels: str) -> None:
+        self.name, self.help, self.labels = name, help_, labels
+        self.values: collections.Counter[Labels] = collections.Counter({} if labels else {(): 0})
+
+    def add(self, *values: str, by: int = 1) -> None:
+        """Add to the counter of these label values."""
+        self.values[values] += by
+
+    def lines(self) -> Iterator[str]:
+        """Sample lines."""
+        for values, number in sorted(self.values.items()):
+            yield f"{self.name}{_labels(self.labels, values)} {number}"
+
+
+class Gauge:
+    """Gauge that is read when the metrics are; `read` returns a number, or one per value of its only label."""
+
+    kind = "gauge"
+
+    def __init__(self, name: str, help_: str, read: Callable[[], float | Mapping[str, float]], label: str = "") -> None:
+        self.name, self.help, self._read, self._label = name, help_, read, label
+
+    def lines(self) -> Iterator[str]:
+        """Sample lines."""
+        found = self._read()
+        if not isinstance(found, Mapping):
+            yield f"{self.name} {_number(found)}"
+            return
+        for value, number in sorted(found.items()):
+            yield f"{self.name}{_labels((self._label,), (value,))} {_number(number)}"
+
+
+class Histogram:
+    """Histogram of times, s."""
+
+    kind = "histogram"
+
+    def __init__(self, name: str, help_: str, ends: Sequence[float] = _SECONDS) -> None:
+        self.name, self.help, self._ends = name, help_, tuple(ends)
+        self._counts, self._sum = [0] * (len(self._ends) + 1), 0.0
+
+    def observe(self, value: float) -> None:
+        """Add a time."""
+        self._counts[bisect_left(self._ends, value)] += 1
+        self._sum += value
+
+    @property
+    def count(self) -> int:
+        """Number of times."""
+        return sum(self._counts)
+
+    def lines(self) -> Iterator[str]:
+        """Sample lines."""
+        below = 0
+        for end, count in zip((*map(_number, self._ends), "+Inf"), self._counts, strict=True):
+            below += count
+            yield f'{self.name}_bucket{{le="{end}"}} {below}'
+        yield f"{self.name}_sum {_number(self._sum)}"
+        yield f"{self.name}_count {below}"
+
+
+class Metrics:
+    """Metrics of the service."""
+
+    def __init__(self) -> None:
+        self.stored = Counter("servotwin_messages_total", "Messages committed, by kind and whether new.", "kind", "put")
+        self.rejected = Counter("servotwin_refused_total", "Messages and requests not taken, by reason code.", "code")
+        self.commit = Histogram("servotwin_commit_seconds", "From a message's last byte to its commit.")
+        self.age = Histogram("servotwin_queue_age_seconds", "From a message's commit to that of its outcome.")
+        self.work = Histogram("servotwin_work_seconds", "A worker's time for one servo's messages.")
+        self.results = Counter("servotwin_outcomes_total", "What became of servos lent to workers.", "result")
+        self.evidence = Counter("servotwin_evidence_total", "What twins found and did, by kind.", "kind")
+        self.sent = Counter("servotwin_posted_total", "Messages made for edges.")
+        self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that had to be replaced.")
+        self._all: list[Counter | Gauge | Histogram] = [
+            self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.sent,
+            self.workers_lost,
+        ]  # fmt: skip
+
+    def add_gauge(
+        self, name: str, help_: str, read: Callable[[], float | Mapping[str, float]], label: str = ""
+    ) -> None:
+        """Add a gauge."""
+        self._all.append(Gauge(name, help_, read, label))
+
+    def text(self) -> str:
+        """All metrics in the text format."""
+        return "".join(line + "\n" for metric in self._all for line in _lines(metric))
+
+
+def _lines(metric: Counter | Gauge | Histogram) -> Iterator[str]:
+    yield f"# HELP {metric.name} {metric.help}"
+    yield f"# TYPE {metric.name} {metric.kind}"
+    yield from metric.lines()
+
+
+def _labels(names: Sequence[str], values: Sequence[str]) -> str:
+    pairs = ",".join(f'{name}="{_escaped(value)}"' for name, value in zip(names, values, strict=True))
+    return f"{{{pairs}}}" if pairs else ""
+
+
+def _escaped(value: str) -> str:
+    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+
+
+def _number(value: float) -> str:
+    return f"{value:.12g}"
+
+
+class JsonLines(logging.Formatter):
+    """Formats a record as one JSON object: time, level, where, message and the fields of `extra`.
+
+    Callers never give it a token, a header or a body.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return one line."""
+        extra = {key: value for key, value in vars(record).items() if key not in _STANDARD}
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "where": record.name,
+            "message": record.getMessage(),
+            **extra,
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return msgspec.json.encode(line, enc_hook=str).decode()
+
+
+def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handler:
+    """Log to `stream` (standard error) from `level` on; returns the handler, so that it can be removed.
+
+    uvicorn logs only warnings: its access log would hold every request.
+    """
+    handler = logging.StreamHandler(stream or sys.stderr)
+    handler.setFormatter(JsonLines())
+    ours = logging.getLogger("servotwin")
+    ours.setLevel(level.upper())
+    ours.addHandler(handler)
+    theirs = logging.getLogger("uvicorn")
+    theirs.setLevel(logging.WARNING)
+    theirs.addHandler(handler)
+    ours.propagate = theirs.propagate = False
+    return handler

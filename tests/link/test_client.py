@@ -1,0 +1,236 @@
+"""Sender and receiver over a scripted transport; time and chance come from the test."""
+
+from collections.abc import Callable, Iterator
+from math import inf
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servotwin.link.client import Receiver, Sender
+from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
+from servotwin.link.session import Session
+from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Update, Window, checksum, encode, pack_channel
+from servotwin.runtime.retry import Retry
+
+RETRY = Retry(1.0, 2.0, 8.0)
+KEY = key_of(verifier_of("secret"))
+
+
+def window(sequence: int) -> Window:
+    channels = (pack_channel("position", "m", [0.0, 1e-3]),)
+    return Window("axis-1", "b0", sequence, 0.0, 10.0, channels, (), 0, "", "reference", checksum(channels))
+
+
+class Script:
+    """A transport that answers by a script; when that is at its end everything is delivered."""
+
+    def __init__(self) -> None:
+        self.delivered: list[Parcel] = []
+        self.faults: list[Exception | None] = []
+        self.news: list[bytes] = []
+        self.asked: list[int] = []
+
+    def deliver(self, parcel: Parcel) -> None:
+        self._fail()
+        self.delivered.append(parcel)
+
+    def listen(self, after: int) -> list[bytes]:
+        self.asked.append(after)
+        self._fail()
+        return self.news
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _fail(self) -> None:
+        fault = self.faults.pop(0) if self.faults else None
+        if fault is not None:
+            raise fault
+
+
+@pytest.fixture
+def script() -> Script:
+    return Script()
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Iterator[SqliteOutbox]:
+    box = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1")
+    yield box
+    box.close()
+
+
+@pytest.fixture
+def sender(outbox: SqliteOutbox, script: Script) -> Sender:
+    return Sender(Session(outbox, RETRY), script)
+
+
+def test_letters_go_first_then_windows_in_order(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
+    for k in range(2):
+        outbox.put(window(k))
+    outbox.put_letter(b"letter")
+    assert [sender.step(0.0).window for _ in range(3)] == [None, ("b0", 0), ("b0", 1)]
+    assert [parcel.is_window for parcel in script.delivered] == [False, True, True]
+    assert sender.step(0.0).wait_s == inf
+    assert (outbox.pending(), outbox.letters()) == ([], [])
+    assert sender.session.counts == {"letters": 1, "windows": 2}
+
+
+def test_out_of_reach_everything_waits_longer_and_longer(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
+    outbox.put(window(0))
+    script.faults = [Unreachable("gone")] * 6
+    now, waits = 0.0, []
+    while script.faults:
+        waits.append(sender.step(now).wait_s)
+        assert sender.session.trouble == "gone"
+        assert sender.step(now + 0.25 * waits[-1]).wait_s == pytest.approx(0.75 * waits[-1])
+        now += waits[-1]
+    assert waits == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0]
+    sent = sender.step(now)
+    assert (sent.window, sent.reconnected, sender.session.trouble) == (("b0", 0), True, "")
+    outbox.put(window(1))
+    assert not sender.step(now).reconnected
+
+
+@pytest.mark.parametrize("reason", [reason for reason in Refusal if not reason.passing])
+def test_what_will_never_be_taken_is_dropped_and_counted(
+    sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
+) -> None:
+    outbox.put(window(0))
+    outbox.put(window(1))
+    script.faults = [Refused(reason, "no")]
+    assert sender.step(0.0).wait_s == 0.0
+    assert sender.step(0.0).window == ("b0", 1)
+    assert outbox.dropped == {reason.value: 1}
+    outbox.put_letter(b"letter")
+    script.faults = [Refused(reason, "no")]
+    sender.step(0.0)
+    assert outbox.letters() == []
+    assert sender.session.counts[f"refused: {reason.value}"] == 2
+
+
+@pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.passing and reason is not Refusal.FUTURE])
+def test_what_may_be_taken_later_is_kept(sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal) -> None:
+    outbox.put(window(0))
+    script.faults = [Refused(reason, "not now", 5.0)]
+    assert sender.step(0.0).wait_s == 5.0
+    assert sender.step(5.0).window == ("b0", 0)
+
+
+def test_a_window_from_the_future_holds_up_no_other(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
+    outbox.put(window(0))
+    outbox.put(window(1))
+    script.faults = [Refused(Refusal.FUTURE, "too early")]
+    sender.step(0.0)
+    assert sender.step(0.0).window == ("b0", 1)
+    assert sender.step(0.0).wait_s == 1.0
+    assert sender.step(1.0).window == ("b0", 0)
+
+
+FAULTS = st.lists(
+    st.sampled_from([None, Unreachable("gone"), *(Refused(reason, "no") for reason in Refusal)]), max_size=30
+)
+
+
+def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_without_a_pause(
+    sender: Sender, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outbox.put(window(0))
+    outbox.put(window(1))
+    parcel, tries = outbox.parcel, 0
+
+    def read(key: tuple[str, int]) -> Parcel:
+        nonlocal tries
+        tries += key == ("b0", 0)
+        if key == ("b0", 0) and tries < 3:
+            raise KeyError(key)
+        return parcel(key)
+
+    monkeypatch.setattr(outbox, "parcel", read)
+    assert sender.step(0.0).window is None
+    assert sender.step(0.0).window == ("b0", 1)
+    assert [sender.step(0.0).wait_s, sender.step(1.0).wait_s, sender.step(1.0).wait_s] == [1.0, 0.0, 2.0]
+    assert sender.step(3.0).window == ("b0", 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(FAULTS)
+def test_every_window_is_delivered_once_or_counted(
+    tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None]
+) -> None:
+    outbox, script = SqliteOutbox(tmp_path_factory.mktemp("box") / "o", "axis-1"), Script()
+    sender, now = Sender(Session(outbox, RETRY, lambda: 0.5), script), 0.0
+    script.faults = list(faults)
+    for k in range(5):
+        outbox.put(window(k))
+    while (wait := sender.step(now).wait_s) < inf:
+        now += wait
+    delivered = [parcel.sequence for parcel in script.delivered]
+    assert len(delivered) == len(set(delivered))
+    assert len(delivered) + sum(outbox.dropped.values()) == 5
+    permanent = sum(isinstance(fault, Refused) and not fault.reason.passing for fault in faults[: len(faults)])
+    assert sum(outbox.dropped.values()) <= permanent
+    outbox.close()
+
+
+@pytest.fixture
+def receiver(script: Script) -> Receiver:
+    return Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0)
+
+
+def sealed(serial: int, body: bytes | None = None, key: bytes = KEY, direction: str = TO_EDGE) -> bytes:
+    return seal(key, direction, "axis-1", serial, encode(Acknowledge("axis-1", "b0", serial)) if body is None else body)
+
+
+def test_what_the_twin_says_is_heard_once_and_in_order(receiver: Receiver, script: Script) -> None:
+    script.news = [sealed(2), sealed(3), sealed(2), sealed(1)]
+    assert [serial for serial, _ in receiver.step().messages] == [2, 3]
+    script.news = [sealed(3), sealed(7)]
+    assert [serial for serial, _ in receiver.step().messages] == [7]
+    assert script.asked == [0, 3]
+    assert receiver.counts == {"received": 3, "repeated": 3}
+
+
+def test_nothing_comes_through_with_a_broken_seal(receiver: Receiver, script: Script) -> None:
+    other, good = key_of(verifier_of("other")), sealed(1)
+    script.news = [sealed(9, key=other), sealed(9, direction=TO_TWIN), good[:-1] + bytes([good[-1] ^ 1]), b"rubbish"]
+    received = receiver.step()
+    assert (received.messages, received.wait_s) == ([], 1.0)
+    assert receiver.counts["broken seal"] == 4
+    script.news += [sealed(1)]
+    assert [serial for serial, _ in receiver.step().messages] == [1]
+
+
+def test_a_message_that_is_none_or_not_for_an_edge_is_passed_over(receiver: Receiver, script: Script) -> None:
+    hello = encode(Hello("axis-1", "b0", 0.0, 1.0, 0, Setting(0.0), ""))
+    script.news = [sealed(1, b"rubbish"), sealed(2, hello), sealed(3)]
+    assert [serial for serial, _ in receiver.step().messages] == [3]
+    assert receiver.counts["not understood"] == 2
+
+
+def test_polls_that_fail_come_less_and_less_often(receiver: Receiver, script: Script) -> None:
+    script.faults = [Unreachable("gone"), Refused(Refusal.BAD_TOKEN, "no"), Refused(Refusal.TOO_MANY, "slowly", 30.0)]
+    assert [receiver.step().wait_s for _ in range(4)] == [1.0, 2.0, 30.0, 0.0]
+    assert receiver.trouble == ""
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_survived(data: bytes) -> None:
+    script = Script()
+    script.news = [data]
+    assert Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0).step().messages == []
+
+
+def test_an_update_is_handed_on_as_it_was(receiver: Receiver, script: Script) -> None:
+    update = Update("axis-1", 1, 0, ("b0", 0), 0.0, None, None, (None, None), "OK", Setting(1e-4), 60.0)
+    script.news = [sealed(5, encode(update))]
+    assert receiver.step().messages == [(5, encode(update))]
+
+
+def test_the_token_is_not_shown(receiver: Receiver, script: Script) -> None:
+    shown: Callable[[object], str] = repr
+    assert "secret" not in shown(receiver)
