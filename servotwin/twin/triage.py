@@ -18,7 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.quick import Quick, quick_fit
+from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
@@ -170,7 +170,7 @@ def _blind(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
-def _unclear(seen: Quick, settings: TriageSettings) -> str:
+def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
     """Why a glance cannot say whether the gap moved."""
     if not seen.settled:
         return "the plain fit did not converge"
@@ -263,7 +263,7 @@ class Triage:
             misfit=found.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, found.misfit),
         )
 
-    def _misled(self, found: Quick, estimate: GapEstimate) -> str:
+    def _misled(self, found: QuickFit, estimate: GapEstimate) -> str:
         """The error of a glance, in words; empty where it is small enough."""
         off = abs(found.gap - estimate.gap)
         if off <= allowed(math.hypot(found.std, estimate.std), self.settings):
