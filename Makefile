@@ -14,7 +14,7 @@ help:
 	@echo "make test       the same and all tests, about five minutes; as root it installs the Debian packages"
 	@echo "                that some tests need (make test PACKAGES=no: skip those tests instead)"
 	@echo "make fuzz       the random tests with fresh and with more examples"
-	@echo "make bench      speed beside what one would use instead; or: python -m benchmarks NAME"
+	@echo "make bench      speed beside other solvers; or: python -m benchmarks NAME"
 	@echo "make format     format the code and fix what can be fixed"
 	@echo "make lock       pin the dependencies anew (needs uv)"
 

@@ -1,1 +1,1 @@
-"""Speed and accuracy beside what one would use instead, measured side by side in one run."""
+"""Speed and accuracy beside other solvers, measured in one run."""

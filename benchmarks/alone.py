@@ -1,4 +1,4 @@
-"""Benches that stand alone: they measure how good something is, not how fast."""
+"""Benchmarks of quality, which run alone: estimator, edge, policies, novelty, triage, ticks, fleet."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
 def run_alone(
     names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool, full: bool = False
 ) -> bool:
-    """Run the one that is named, if one is; `others`: whether options were given that only the speeds take.
+    """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
-    `full` is for the fleet alone: as long as the figures that are stated of it took.
+    `full` applies to the fleet only: the full length of the documented figures.
 
     Raises
     ------
     InvalidInput
-        It is not alone.
+        Other names or options beside it.
     """
     name = next((name for name in names if name in ALONE), None)
     if full and (tuple(names) != (whole.NAME,) or quick):

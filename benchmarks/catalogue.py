@@ -12,8 +12,8 @@ import numpy as np
 from benchmarks import decisions, fits, hold, ours, solver, startup, taylor
 from benchmarks.alone import ALONE
 from benchmarks.contest import Check, Contestant, Workload
-from benchmarks.machine import cores
-from benchmarks.workloads import UNIT, Noisy, Sweep, Wear
+from benchmarks.report import cores
+from benchmarks.workloads import UNIT, NoisyWorkload, SweepWorkload, WearWorkload
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
@@ -23,22 +23,21 @@ MILLIMETRE = "/ 1 mm"
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure: small workloads (`quick`), contestants of many seconds (`slow`), positions of W1 to compare
-    with."""
+    """Small workloads (`quick`), contestants of many seconds (`slow`), and reference positions of W1."""
 
     quick: bool = False
     slow: bool = False
     reference: Path | None = None
 
     @property
-    def wear(self) -> Wear:
+    def wear(self) -> WearWorkload:
         """In full 200 s with 10 reference steps; small 8 s with 4."""
-        return Wear(duration=8.0, period=4.0) if self.quick else Wear()
+        return WearWorkload(duration=8.0, period=4.0) if self.quick else WearWorkload()
 
     @property
-    def sweep(self) -> Sweep:
+    def sweep(self) -> SweepWorkload:
         """In full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
-        return Sweep(side=3, duration=1.0) if self.quick else Sweep()
+        return SweepWorkload(side=3, duration=1.0) if self.quick else SweepWorkload()
 
 
 Build: TypeAlias = Callable[[Options], Workload]
@@ -57,7 +56,7 @@ def w1(options: Options) -> Workload:
     )
 
 
-def _holds(wear: Wear) -> tuple[Contestant, ...]:
+def _holds(wear: WearWorkload) -> tuple[Contestant, ...]:
     return hold.wearing(wear, wear.sample_rate), hold.wearing(wear, 4.0 * wear.sample_rate)
 
 
@@ -111,7 +110,7 @@ def w2(options: Options) -> Workload:
     )
 
 
-def _sweepers(sweep: Sweep, threads: int) -> tuple[Contestant, ...]:
+def _sweepers(sweep: SweepWorkload, threads: int) -> tuple[Contestant, ...]:
     return (
         ours.sweeping(sweep, threads),
         hold.sweeping(sweep, 5e3, threads),
@@ -143,7 +142,7 @@ def w3(options: Options) -> Workload:
 
 def sampled(options: Options) -> Workload:
     """The deployed loop, in noise."""
-    noisy = Noisy(options.wear)
+    noisy = NoisyWorkload(options.wear)
     return Workload(
         "sampled",
         f"{noisy.wear.duration:g} s, law sampled at 5 kHz, noise, loop filter",
@@ -154,11 +153,11 @@ def sampled(options: Options) -> Workload:
 
 
 def decision(options: Options) -> Workload:
-    """What the certified policy takes to decide."""
+    """Time of a decision of the certified policy."""
     size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
     return Workload(
         "decision",
-        f"settings proved on {size} each",
+        f"settings verified on {size} each",
         decisions.decisions(options.quick),
         (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
         lambda _: "",

@@ -21,12 +21,12 @@ def bench(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Small workloads, to see that all works.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Small workloads, as a check.")] = False,
     full: Annotated[bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten.")] = False,
-    slow: Annotated[bool, typer.Option("--slow", help="Also what takes many seconds a run: scipy, compiling.")] = False,
+    slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
 ) -> None:
-    """Speed and accuracy beside what one would use instead, side by side."""
+    """Measure speed and accuracy beside other solvers."""
     from datetime import UTC, datetime
 
     from benchmarks.alone import run_alone

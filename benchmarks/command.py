@@ -13,9 +13,8 @@ from rich.table import Table
 
 from benchmarks.catalogue import WORKLOADS, Options, chosen
 from benchmarks.contest import Check, Workload
-from benchmarks.document import Result, dumps
-from benchmarks.machine import machine
-from benchmarks.measure import Clock, Row, race, turns
+from benchmarks.measure import Clock, ContestantTimes, WorkloadResult, dumps, race, turns
+from benchmarks.report import machine
 from servotwin.runtime import files
 
 RUNS, QUICK_RUNS = 7, 2
@@ -30,8 +29,8 @@ def bench(
     options: Options | None = None,
     console: Console | None = None,
     clock: Clock = time.perf_counter,
-) -> tuple[Result, ...]:
-    """Measure workloads and show what was found.
+) -> tuple[WorkloadResult, ...]:
+    """Measure workloads and print a table of each.
 
     Parameters
     ----------
@@ -67,21 +66,21 @@ def bench(
     return results
 
 
-def _measured(workload: Workload, runs: int, block: float, clock: Clock, console: Console) -> Result:
+def _measured(workload: Workload, runs: int, block: float, clock: Clock, console: Console) -> WorkloadResult:
     """One workload, under a progress bar that goes when the table comes."""
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task(workload.name, total=turns(workload, runs))
 
-        def notice(what: str) -> None:
-            progress.update(bar, advance=1, description=f"{workload.name}, {what}")
+        def notice(activity: str) -> None:
+            progress.update(bar, advance=1, description=f"{workload.name}, {activity}")
 
-        result = Result(workload, race(workload, runs, block, clock, notice))
+        result = WorkloadResult(workload, race(workload, runs, block, clock, notice))
     console.print(table(result))
     return result
 
 
-def table(result: Result) -> Table:
+def table(result: WorkloadResult) -> Table:
     """One workload's table for the terminal."""
     workload = result.workload
     shown = Table(title=f"{workload.name}: {workload.title}", title_justify="left", box=None, pad_edge=False)
@@ -94,7 +93,7 @@ def table(result: Result) -> Table:
     return shown
 
 
-def _numbers(result: Result, row: Row, checks: Sequence[Check]) -> list[str]:
+def _numbers(result: WorkloadResult, row: ContestantTimes, checks: Sequence[Check]) -> list[str]:
     if row.missing:
         return ["-"] * (2 + len(checks))
     errors = [f"{row.errors[check.name]:.2g}" for check in checks]

@@ -1,4 +1,4 @@
-"""What is measured: a workload, who takes part in it, and how far off an answer is."""
+"""Workloads, their contestants, and checks of the answers."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Contestant:
     prepare : callable
         Builds and compiles what is needed once, and returns the job that is timed.
     missing : str
-        Why it cannot take part; empty when it can.
+        Reason for which it cannot take part; empty when it can.
     remark : callable
-        What to say about it, asked for after the timing.
+        Remark, requested after the timing.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Contestant:
 
 @dataclass(frozen=True)
 class Check:
-    """How far off an answer is: `of(answer)` in `unit`, against what `name` says."""
+    """Error of an answer: `of(answer)` in `unit`, against the reference in `name`."""
 
     name: str
     unit: str
@@ -47,7 +47,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Workload:
-    """A job that several contestants do, servotwin first, and how their answers are judged.
+    """A job for several contestants, servotwin first, and the checks of their answers.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Decisions of the certified policy as workloads: from what is known to a setting proved on 256 machines."""
+"""Decisions of the certified policy as workloads: from the uncertainty to a setting verified on 256 machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`servotwin bench hostile`: does the loop stay in its certified band, whatever its twin does?"""
+"""`servotwin bench hostile`: measure that the loop stays in its certified band with hostile twins."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks import hostile, report
-from benchmarks.hostile import Outcome
-from benchmarks.hostiletwin import Kind
+from benchmarks.hostile import HostileOutcome
+from benchmarks.hostiletwin import TwinFault
 from servotwin.analysis.maps.pool import shared, workplace
 
 SCHEMA = "servotwin-bench-hostile/1"
 NAME = "hostile"
 MACHINES, QUICK = 200, 8
-RUBBING = 5  # for so many machines one more, with friction
+FRICTION_SHARE = 5  # for so many machines one more, with friction
 FRICTION = "any, and friction"
 HEADS = ("twin", "machines", "worst, bands", "outside", "updates applied", "fell back")
 
-Task = tuple[int, Kind, bool]
-"""Seed, twin, and whether the machine rubs."""
+EnduranceTask = tuple[int, TwinFault, bool]
+"""Seed, fault of the twin, and friction."""
 
 
 def endurance(
     date: str = "",
     output: Path | None = None,
     count: int = MACHINES,
-    kinds: Sequence[Kind] = hostile.KINDS,
+    kinds: Sequence[TwinFault] = hostile.KINDS,
     console: Console | None = None,
-) -> tuple[Outcome, ...]:
-    """Let machines endure their twins, show what came of it, and write JSON when asked to.
+) -> tuple[HostileOutcome, ...]:
+    """Let machines endure their twins, print the outcomes, and write JSON on request.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ def endurance(
     output : Path, optional
         File to write, suffix .json.
     count : int
-        Machines within what is stated of them; the kinds of twins take turns. A fifth as many more have friction.
-    kinds : sequence of Kind
+        Machines within the stated range; the kinds of twins take turns. A fifth as many more have friction.
+    kinds : sequence of TwinFault
     console : Console, optional
 
     Raises
@@ -54,7 +54,7 @@ def endurance(
     console = console or Console()
     report.check(output)
     tasks = [(seed, kinds[seed % len(kinds)], False) for seed in range(count)]
-    tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // RUBBING)]
+    tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // FRICTION_SHARE)]
     with workplace(), warnings.catch_warnings():
         # A process whose caches have grown is replaced by another; its jobs are not lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
@@ -67,13 +67,13 @@ def endurance(
     return outcomes
 
 
-def endured(task: Task) -> Outcome:
+def endured(task: EnduranceTask) -> HostileOutcome:
     """One machine with its twin."""
-    seed, kind, rubs = task
-    return hostile.endured(seed, kind, rubs=rubs)
+    seed, kind, friction = task
+    return hostile.endured(seed, kind, friction=friction)
 
 
-def verdict(outcomes: Sequence[Outcome]) -> str:
+def verdict(outcomes: Sequence[HostileOutcome]) -> str:
     """One sentence."""
     stated = [outcome for outcome in outcomes if not outcome.case.friction]
     band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in stated)
@@ -81,7 +81,7 @@ def verdict(outcomes: Sequence[Outcome]) -> str:
     return f"{inside} of {len(stated)} machines as stated stay within {limit}."
 
 
-def shown(outcomes: Sequence[Outcome]) -> Table:
+def shown(outcomes: Sequence[HostileOutcome]) -> Table:
     """A row for each kind of twin, and one for machines with friction."""
     result = Table(title="hostile: what the edge endures", title_justify="left", box=None, pad_edge=False)
     for head in HEADS:
@@ -93,11 +93,11 @@ def shown(outcomes: Sequence[Outcome]) -> Table:
     return result
 
 
-def _row(outcome: Outcome) -> str:
+def _row(outcome: HostileOutcome) -> str:
     return FRICTION if outcome.case.friction else outcome.kind.value
 
 
-def dumps(outcomes: Sequence[Outcome], date: str) -> str:
+def dumps(outcomes: Sequence[HostileOutcome], date: str) -> str:
     """The document: schema, date, machine, band, and every outcome."""
     band = hostile.band()
     rows = [

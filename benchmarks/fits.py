@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.contest import Contestant, Job
 from benchmarks.ours import NAME, run_wear
-from benchmarks.workloads import Wear
+from benchmarks.workloads import WearWorkload
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.paper.observer import Observer, observer
 from servotwin.estimation.window import Window
@@ -28,7 +28,7 @@ Predictor: TypeAlias = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class FitWindow:
     """A window, the gap known before it and the gap in its middle, rad."""
 
     window: Window
@@ -37,22 +37,22 @@ class Case:
 
 
 @cache
-def cases(workload: Wear) -> tuple[Case, ...]:
+def cases(workload: WearWorkload) -> tuple[FitWindow, ...]:
     """The first second after each reference step of W1's run."""
     run, gap = run_wear(workload), workload.gap.pieces(workload.duration)
     starts = [0.5 * workload.period * turn for turn in range(workload.turns)]
     windows = [Window.from_run(run, start, LENGTH) for start in starts]
     truths = [float(gap.value(window.mid_time)) for window in windows]
-    return tuple(Case(*case) for case in zip(windows, [0.0, *truths], truths, strict=False))
+    return tuple(FitWindow(*case) for case in zip(windows, [0.0, *truths], truths, strict=False))
 
 
-def ours(workload: Wear, method: str = "paper") -> Contestant:
+def ours(workload: WearWorkload, method: str = "paper") -> Contestant:
     """A method of the package; NaN where it refuses to answer."""
 
     def prepare() -> Job:
         given, servo = cases(workload), workload.servo
 
-        def gap(case: Case) -> float:
+        def gap(case: FitWindow) -> float:
             found = estimate_gap(case.window, servo, method=method, prior=case.prior)
             return found.gap if found.ok else math.nan
 
@@ -61,7 +61,7 @@ def ours(workload: Wear, method: str = "paper") -> Contestant:
     return Contestant(NAME if method == "paper" else f"{NAME}, {method}", prepare)
 
 
-def scipy_fits(workload: Wear, name: str, predictor: Callable[[Observer, Case], Predictor]) -> Contestant:
+def scipy_fits(workload: WearWorkload, name: str, predictor: Callable[[Observer, FitWindow], Predictor]) -> Contestant:
     """BFGS by scipy.optimize with its own differences; `predictor` says how the observer is run."""
 
     def prepare() -> Job:
@@ -72,7 +72,7 @@ def scipy_fits(workload: Wear, name: str, predictor: Callable[[Observer, Case], 
     return Contestant(name, prepare)
 
 
-def _fitted(case: Case, predict: Predictor) -> float:
+def _fitted(case: FitWindow, predict: Predictor) -> float:
     from scipy.optimize import minimize
 
     theta_m, position = _channels(case)
@@ -88,7 +88,7 @@ def _fitted(case: Case, predict: Predictor) -> float:
     return abs(float(minimize(cost, start, method="BFGS").x[0]))
 
 
-def with_lfilter(model: Observer, case: Case) -> Predictor:
+def with_lfilter(model: Observer, case: FitWindow) -> Predictor:
     """The observer as two transfer functions (scipy.signal); the position's part is filtered once."""
     from scipy import signal
 
@@ -99,7 +99,7 @@ def with_lfilter(model: Observer, case: Case) -> Predictor:
     return lambda screw: np.asarray(signal.lfilter(by_screw[0], denominator, screw) + fixed)
 
 
-def with_loop(model: Observer, case: Case) -> Predictor:
+def with_loop(model: Observer, case: FitWindow) -> Predictor:
     """The observer as a compiled loop over its states."""
     A, B, _, D = _sampled(model, case.window.sample_rate)
     position = _channels(case)[1]
@@ -131,22 +131,22 @@ def observed(A: Array, B: Array, D: Array, screw: Array, position: Array) -> Arr
     return out
 
 
-def _channels(case: Case) -> tuple[Array, Array]:
+def _channels(case: FitWindow) -> tuple[Array, Array]:
     assert case.window.theta_m is not None
     return case.window.theta_m, case.window.position
 
 
-def typical_error(workload: Wear, gaps: Array) -> float:
+def typical_error(workload: WearWorkload, gaps: Array) -> float:
     """Median error (deg) of the answers that are not plainly wrong; NaN when there is none."""
     errors = _errors(workload, gaps)
     sound = errors[errors <= WRONG]
     return math.degrees(float(np.median(sound))) if sound.size else math.nan
 
 
-def wrong_answers(workload: Wear, gaps: Array) -> float:
+def wrong_answers(workload: WearWorkload, gaps: Array) -> float:
     """Number of answers off by more than 1 deg; a refusal is not a wrong answer."""
     return float(np.count_nonzero(_errors(workload, gaps) > WRONG))
 
 
-def _errors(workload: Wear, gaps: Array) -> Array:
+def _errors(workload: WearWorkload, gaps: Array) -> Array:
     return np.abs(gaps - np.array([case.truth for case in cases(workload)]))

@@ -1,4 +1,4 @@
-"""`servotwin bench triage`: how often a glance misses a gap that moved, or sees one that did not, and what it takes."""
+"""`servotwin bench triage`: missed changes, false alarms and time of glances."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ GAPS, QUICK = 160, 8
 PER_GAP = 6
 MOVED_DEG = (0.0, 0.1, 0.2, 0.3, 0.5)
 KNOWN_DEG = 0.005
-"""How well the estimator knew the gap before."""
+"""Spread of the gap before the glance."""
 CONDITIONS = {"clean": None, "noise, floor 1 um": 1e-6, "noise, floor 10 um": 1e-5}
 """The paper's noise, on a white floor of so many m."""
 _UNITS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
 
 
-class Row(NamedTuple):
+class GlanceRow(NamedTuple):
     """One condition.
 
     Attributes
@@ -58,7 +58,7 @@ class Row(NamedTuple):
 
 def triage(
     date: str = "", output: Path | None = None, gaps: int = GAPS, console: Console | None = None
-) -> tuple[Row, ...]:
+) -> tuple[GlanceRow, ...]:
     """Glance at windows of the paper's loop whose gap has moved by some amounts; show, and write JSON when asked to.
 
     Parameters
@@ -84,17 +84,17 @@ def triage(
     return rows
 
 
-def _row(name: str, floor: float | None, gaps: int) -> Row:
+def _row(name: str, floor: float | None, gaps: int) -> GlanceRow:
     cases = list(_cases(floor, gaps))
     fits = [quick_fit(case.window, case.servo, case.gap) for case in cases]
     errors = np.degrees([fit.gap - case.gap for fit, case in zip(fits, cases, strict=True)])
     usual = 1.5 * float(np.median([fit.misfit for fit in fits]))
     rng = np.random.default_rng(1)
     messages = [_message(case) for case in cases]
-    seen = tuple(_seen(cases, messages, moved, usual, rng) for moved in MOVED_DEG)
-    taken = [_taken(case, message, usual) for case, message in zip(cases, messages, strict=True)]
+    seen = tuple(_estimated_share(cases, messages, moved, usual, rng) for moved in MOVED_DEG)
+    times = [_glance_time(case, message, usual) for case, message in zip(cases, messages, strict=True)]
     error, std = float(np.sqrt(np.mean(errors**2))), math.degrees(float(np.median([fit.std for fit in fits])))
-    return Row(name, len(cases), error, std, seen, min(taken), float(np.median(taken)))
+    return GlanceRow(name, len(cases), error, std, seen, min(times), float(np.median(times)))
 
 
 def _cases(floor: float | None, gaps: int) -> Iterator[Case]:
@@ -106,7 +106,7 @@ def _cases(floor: float | None, gaps: int) -> Iterator[Case]:
             yield case.noisy((floor or 0.0) * rng.standard_normal(case.window.position.size))
 
 
-def _seen(
+def _estimated_share(
     cases: Sequence[Case], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
 ) -> float:
     """Share of windows that would be estimated, the gap having moved by so much (deg) to either side."""
@@ -119,13 +119,13 @@ def _seen(
     return float(np.mean(found))
 
 
-def _taken(case: Case, message: WindowMessage, usual: float) -> float:
+def _glance_time(case: Case, message: WindowMessage, usual: float) -> float:
     """ms from bytes to verdict."""
     body, watch = encode(message), _watch(case.gap, usual)
     begin = time.perf_counter()
-    came = decode(body)
-    assert isinstance(came, WindowMessage)
-    glance(came, decode_window(came), case.servo, watch)
+    decoded = decode(body)
+    assert isinstance(decoded, WindowMessage)
+    glance(decoded, decode_window(decoded), case.servo, watch)
     return 1e3 * (time.perf_counter() - begin)
 
 
@@ -145,7 +145,7 @@ def _message(case: Case) -> WindowMessage:
     return WindowMessage("axis", "b", 1, 0.0, rate, tuple(packed), (), 0, "m", "reference", checksum(packed))
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[GlanceRow]) -> Table:
     heads = [f"{moved:g} deg" for moved in MOVED_DEG]
     table = Table(
         "gap moved by", "windows", "error deg", "stated", *heads, "ms, least", "median", box=None, pad_edge=False

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.contest import Contestant, Job
-from benchmarks.model import Model, model_of
-from benchmarks.workloads import Noisy, Sweep, Wear
+from benchmarks.workloads import LoopEquations, NoisyWorkload, SweepWorkload, WearWorkload, equations_of
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.linear import zero_order_hold
@@ -21,7 +20,7 @@ from servotwin.plant.linear import zero_order_hold
 NAME = "numba hold"
 
 
-class Hold(NamedTuple):
+class HeldLoop(NamedTuple):
     """The loop over one step; the last column of `motor` and `chain` is that of the input."""
 
     motor: Array
@@ -35,7 +34,7 @@ class Hold(NamedTuple):
     loop_step: float
 
 
-class Inputs(NamedTuple):
+class HoldInputs(NamedTuple):
     """Square wave (level, steps a half period), half gap c0 + c2 t^2 + c3 t^3, tolerance, noise (empty: none)."""
 
     level: float
@@ -47,14 +46,14 @@ class Inputs(NamedTuple):
     noise: Array
 
 
-def hold_of(model: Model, rate: float, loop_filter_hz: float | None = None) -> Hold:
+def hold_of(model: LoopEquations, rate: float, loop_filter_hz: float | None = None) -> HeldLoop:
     """The loop discretised at a rate, Hz."""
     step = 1.0 / rate
     motor = np.column_stack(zero_order_hold(model.motor_A, model.motor_B, step))
     chain = np.column_stack(zero_order_hold(model.chain_A, model.chain_B, step))
     loop_step = 1.0 if loop_filter_hz is None else -math.expm1(-2.0 * math.pi * loop_filter_hz * step)
     lag_step = -math.expm1(-step / model.Tf)
-    return Hold(motor, chain, model.position, step, model.Kp, model.Ki * step, model.N, lag_step, loop_step)
+    return HeldLoop(motor, chain, model.position, step, model.Kp, model.Ki * step, model.N, lag_step, loop_step)
 
 
 @compiled
@@ -70,7 +69,7 @@ def chain_row(M: Array, i: int, a: float, b: float, c: float, d: float, screw: f
 
 
 @compiled
-def run(h: Hold, inputs: Inputs, every: int, out: Array) -> None:
+def run(h: HeldLoop, inputs: HoldInputs, every: int, out: Array) -> None:
     """Positions, one every `every` steps, from rest."""
     current = speed = angle = screw = 0.0
     a = b = c = d = 0.0
@@ -107,30 +106,30 @@ def run(h: Hold, inputs: Inputs, every: int, out: Array) -> None:
 
 
 @compiled
-def run_members(h: Hold, level: float, half_gaps: Array, tolerances: Array, every: int, out: Array) -> None:
+def run_members(h: HeldLoop, level: float, half_gaps: Array, tolerances: Array, every: int, out: Array) -> None:
     """One run for each row of `out`, constant inputs."""
     nothing = np.empty(0)
     for k in range(len(out)):
-        inputs = Inputs(level, out.shape[1] * every, half_gaps[k], 0.0, 0.0, tolerances[k], nothing)
+        inputs = HoldInputs(level, out.shape[1] * every, half_gaps[k], 0.0, 0.0, tolerances[k], nothing)
         run(h, inputs, every, out[k])
 
 
-def wearing(workload: Wear, rate: float) -> Contestant:
+def wearing(workload: WearWorkload, rate: float) -> Contestant:
     """W1 at a rate (Hz) that is a multiple of the output's."""
 
     def prepare() -> Job:
-        hold, inputs = hold_of(model_of(workload.servo), rate), _wear_inputs(workload, rate, np.empty(0))
+        hold, inputs = hold_of(equations_of(workload.servo), rate), _wear_inputs(workload, rate, np.empty(0))
         return lambda: _recorded(hold, inputs, round(rate / workload.sample_rate), workload.samples)
 
     return Contestant(_name(rate), prepare)
 
 
-def noisy(workload: Noisy) -> Contestant:
+def noisy(workload: NoisyWorkload) -> Contestant:
     """The sampled run: here the hold is what was asked for, and only the contacts are off."""
     wear, rate = workload.wear, workload.wear.sample_rate
 
     def prepare() -> Job:
-        hold = hold_of(model_of(wear.servo), rate, workload.loop_filter_hz)
+        hold = hold_of(equations_of(wear.servo), rate, workload.loop_filter_hz)
 
         def job() -> Array:
             noise = workload.noise.samples(wear.samples, rate, np.random.default_rng(workload.seed))
@@ -141,12 +140,12 @@ def noisy(workload: Noisy) -> Contestant:
     return Contestant(_name(rate), prepare)
 
 
-def sweeping(workload: Sweep, rate: float, threads: int) -> Contestant:
+def sweeping(workload: SweepWorkload, rate: float, threads: int) -> Contestant:
     """W2 at a rate (Hz), the members dealt out to threads."""
 
     def prepare() -> Job:
         gaps, tolerances = workload.members
-        hold, every = hold_of(model_of(workload.servo), rate), round(rate / workload.sample_rate)
+        hold, every = hold_of(equations_of(workload.servo), rate), round(rate / workload.sample_rate)
         parts = [np.arange(first, gaps.size, threads) for first in range(threads)]
 
         def part(members: Array) -> Array:
@@ -166,15 +165,15 @@ def sweeping(workload: Sweep, rate: float, threads: int) -> Contestant:
     return Contestant(f"{_name(rate)}, {threads} thread{'s' * (threads > 1)}", prepare)
 
 
-def _recorded(hold: Hold, inputs: Inputs, every: int, samples: int) -> Array:
+def _recorded(hold: HeldLoop, inputs: HoldInputs, every: int, samples: int) -> Array:
     out = np.empty(samples)
     run(hold, inputs, every, out)
     return out
 
 
-def _wear_inputs(workload: Wear, rate: float, noise: Array) -> Inputs:
+def _wear_inputs(workload: WearWorkload, rate: float, noise: Array) -> HoldInputs:
     half_period = round(0.5 * workload.period * rate)
-    return Inputs(workload.amplitude, half_period, *workload.half_gap, workload.tolerance, noise)
+    return HoldInputs(workload.amplitude, half_period, *workload.half_gap, workload.tolerance, noise)
 
 
 def _name(rate: float) -> str:

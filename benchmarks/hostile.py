@@ -1,8 +1,8 @@
-"""Is the edge safe from its twin? Random machines, and twins that are silent, lie, repeat themselves or send anything.
+"""Endurance of the edge: random machines with twins that are silent, wrong, repeat themselves or send anything.
 
 The machines are those that the certified policy's default uncertainty stands for: stiffness within 15 %, damping 50 %,
 back-EMF and masses 10 % of the model, gaps from 0 to 60 deg, steps of 0.1 to 2.5 mm, input bias up to 0.1 V either way.
-Others have Coulomb friction worth as much instead, which nobody stated. Edge and twin know the model only. The fallback
+Others have undeclared Coulomb friction of the same size instead. Edge and twin know the model only. The fallback
 set, its band and the limits are those of every scenario with that policy.
 """
 
@@ -17,7 +17,7 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.hostiletwin import HostileTwin, Kind
+from benchmarks.hostiletwin import HostileTwin, TwinFault
 from servotwin.cosim.driver import Cosimulation
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
@@ -35,11 +35,11 @@ RATE = 1000.0  # Hz, ticks and records
 PERIOD = 20.0  # s of the reference's square wave
 DURATION = 100.0  # s
 MARGIN = WatchSettings().margin
-KINDS = (Kind.SILENT, Kind.LIES_HIGH, Kind.LIES_LOW, Kind.REPLAYS)
+KINDS = (TwinFault.SILENT, TwinFault.LIES_HIGH, TwinFault.LIES_LOW, TwinFault.REPLAYS)
 
 
 @dataclass(frozen=True)
-class Case:
+class HostileMachine:
     """One machine.
 
     Attributes
@@ -62,19 +62,19 @@ class Case:
 
 
 def model() -> Servo:
-    """What edge and twin know."""
+    """Make the model that edge and twin know."""
     return Servo.preset("paper").replace(sample_rate=RATE)
 
 
-def case(seed: int, rubs: bool = False) -> Case:
-    """The machine of a seed; `rubs`: with friction instead of an input bias."""
+def case(seed: int, friction: bool = False) -> HostileMachine:
+    """The machine of a seed; `friction`: with friction instead of an input bias."""
     draw, servo, known = random.Random(seed), model(), TwinSettings().uncertainty
     plant = {name: getattr(servo, name) * (1.0 + _within(draw, name, known)) for name in ("k", "c", "k_B", "m")}
     gap = draw.uniform(*known.gap)
     step = math.exp(draw.uniform(*map(math.log, known.step)))
     bias, theta_d0 = draw.uniform(*known.input_bias), draw.uniform(-0.5, 0.5) * gap
-    disturbed = (0.0, abs(bias) * servo.k_T / servo.R) if rubs else (bias, 0.0)
-    return Case(servo.replace(**plant), gap, theta_d0, step, *disturbed)
+    disturbed = (0.0, abs(bias) * servo.k_T / servo.R) if friction else (bias, 0.0)
+    return HostileMachine(servo.replace(**plant), gap, theta_d0, step, *disturbed)
 
 
 def _within(draw: random.Random, name: str, known: Uncertainty) -> float:
@@ -83,27 +83,27 @@ def _within(draw: random.Random, name: str, known: Uncertainty) -> float:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What happened to one machine.
+class HostileOutcome:
+    """Outcome of one machine.
 
     Attributes
     ----------
-    kind : Kind
-    case : Case
+    kind : TwinFault
+    case : HostileMachine
     worst : float
         Largest settled error, in the certified band's.
     outside : float
         s, longest stretch outside of the band.
     recovered : bool
-        Whether every step that began after the last fallback ended inside of what the watch allows.
+        True if every step after the last fallback ended inside the watch's margin.
     applied : int
         Updates put in force.
     fallbacks : tuple of Cause
     refused : Counter of Reason
     """
 
-    kind: Kind
-    case: Case
+    kind: TwinFault
+    case: HostileMachine
     worst: float
     outside: float
     recovered: bool
@@ -114,20 +114,20 @@ class Outcome:
 
 @cache
 def band(settings: TwinSettings | None = None) -> Band:
-    """What is certified for the whole stated range."""
+    """Band that is certified for the whole stated range."""
     fallback = scenario(case(0), 0, settings).agent_settings().supervision.fallback
     assert fallback is not None
     assert fallback.setting.band is not None
     return fallback.setting.band
 
 
-def endured(seed: int, kind: Kind, settings: TwinSettings | None = None, rubs: bool = False) -> Outcome:
+def endured(seed: int, kind: TwinFault, settings: TwinSettings | None = None, friction: bool = False) -> HostileOutcome:
     """The machine of a seed with a twin of a kind."""
-    machine, certified = case(seed, rubs), band(settings)
+    machine, certified = case(seed, friction), band(settings)
     loop, run = cosimulated(machine, kind, seed, settings)
     error = np.abs(_settled(run, certified.settling)) / certified.error
     last = max((fallback.sample for fallback in loop.fallbacks), default=0) / RATE
-    return Outcome(
+    return HostileOutcome(
         kind,
         machine,
         float(error.max()),
@@ -139,8 +139,8 @@ def endured(seed: int, kind: Kind, settings: TwinSettings | None = None, rubs: b
     )
 
 
-def scenario(machine: Case, seed: int, settings: TwinSettings | None = None) -> Scenario:
-    """What edge and twin take the machine for."""
+def scenario(machine: HostileMachine, seed: int, settings: TwinSettings | None = None) -> Scenario:
+    """Scenario with the model that edge and twin know."""
     return Scenario(
         model(),
         DURATION,
@@ -155,7 +155,9 @@ def scenario(machine: Case, seed: int, settings: TwinSettings | None = None) -> 
     )
 
 
-def cosimulated(machine: Case, kind: Kind, seed: int, settings: TwinSettings | None = None) -> tuple[Cosimulation, Run]:
+def cosimulated(
+    machine: HostileMachine, kind: TwinFault, seed: int, settings: TwinSettings | None = None
+) -> tuple[Cosimulation, Run]:
     """The machine with a twin of a kind."""
     known = scenario(machine, seed, settings)
     twin = HostileTwin.of(kind, known, machine.gap, random.Random(f"{kind} {seed}"))

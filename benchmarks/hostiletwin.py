@@ -1,4 +1,4 @@
-"""Twins that mean harm, or that fail: what an edge must endure."""
+"""Faulty and malicious twins for the edge's endurance test."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from servotwin.twin.wear import Expectation
 
 HONEST = 2  # windows that are answered before a twin falls silent
 FACTOR = 3.0  # of a lie, either way
-SPREAD = math.radians(0.05)  # of an estimate, so it says
+SPREAD = math.radians(0.05)  # of an estimate, as it states
 UNBOUNDED = Band(1.0, 1.0, 10.0, 1e6)
 
 
-class Kind(StrEnum):
-    """What is wrong with a twin."""
+class TwinFault(StrEnum):
+    """Fault of a twin."""
 
     NONE = "no twin"
     SILENT = "falls silent"
@@ -39,15 +39,15 @@ class Kind(StrEnum):
     WANTON = "anything in bounds"
 
 
-_LIES = {Kind.LIES_HIGH: FACTOR, Kind.LIES_LOW: 1.0 / FACTOR}
+_LIES = {TwinFault.LIES_HIGH: FACTOR, TwinFault.LIES_LOW: 1.0 / FACTOR}
 
 
-def deceived(scenario: Scenario, gap: float) -> Twin:
-    """The scenario's own twin with its certified policy, but that its estimator always says `gap` (rad)."""
+def deceived_twin(scenario: Scenario, gap: float) -> Twin:
+    """Make the scenario's own twin with an estimator that always returns `gap` (rad)."""
 
     def estimate(window: NumericWindow, _expected: Expectation) -> GapEstimate:
         interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
-        return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="told")
+        return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="constant")
 
     start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
     policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
@@ -56,60 +56,60 @@ def deceived(scenario: Scenario, gap: float) -> Twin:
 
 @dataclass
 class HostileTwin:
-    """A twin that is right in everything but one.
+    """A twin with one fault.
 
     Attributes
     ----------
-    kind : Kind
+    kind : TwinFault
     twin : Twin
-        What it would say otherwise.
+        The twin without the fault.
     own : Gains
         The servo's own.
     draw : random.Random
     """
 
-    kind: Kind
+    kind: TwinFault
     twin: Twin
     own: Gains
     draw: random.Random
     version: int = 0
     in_force: int = 0
     windows: int = 0
-    said: list[Update] = field(default_factory=list)
+    sent: list[Update] = field(default_factory=list)
 
     @classmethod
-    def of(cls, kind: Kind, scenario: Scenario, gap: float, draw: random.Random) -> HostileTwin:
+    def of(cls, kind: TwinFault, scenario: Scenario, gap: float, draw: random.Random) -> HostileTwin:
         """For a scenario whose machine has this gap (rad)."""
-        twin = deceived(scenario, gap * _LIES.get(kind, 1.0))
+        twin = deceived_twin(scenario, gap * _LIES.get(kind, 1.0))
         return cls(kind, twin, gains(scenario), draw)
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """What it says to a message."""
+        """Answer a message according to the fault."""
         self.windows += isinstance(message, Window)
-        if self.kind is Kind.NONE or (self.kind is Kind.SILENT and self.windows > HONEST):
+        if self.kind is TwinFault.NONE or (self.kind is TwinFault.SILENT and self.windows > HONEST):
             return []
         if isinstance(message, Receipt | Fallback):
             self.in_force = max(self.in_force, message.parameter_version)
-        if self.kind is Kind.WANTON:
+        if self.kind is TwinFault.WANTON:
             return self._wanton(message) if isinstance(message, Window) else []
         answer = self.twin.receive(message, now)
         repeated = self._repeated() if isinstance(message, Window) else ()
-        self.said += [each for each in answer if isinstance(each, Update)]
+        self.sent += [each for each in answer if isinstance(each, Update)]
         return [*repeated, *answer]
 
     def next_wake(self) -> float | None:
-        """It never speaks first."""
+        """None: it only answers."""
         return None
 
     def wake(self, _now: float) -> list[Message]:
-        """Nothing."""
+        """Send nothing."""
         return []
 
     def _repeated(self) -> Iterable[Update]:
         """An old update as it was, and one with the next number, on what is in force."""
-        if self.kind is not Kind.REPLAYS or not self.said:
+        if self.kind is not TwinFault.REPLAYS or not self.sent:
             return ()
-        again, renumbered = self.draw.choice(self.said), self.draw.choice(self.said)
+        again, renumbered = self.draw.choice(self.sent), self.draw.choice(self.sent)
         return again, structs.replace(renumbered, version=self._next(), base_version=self.in_force)
 
     def _next(self) -> int:
@@ -130,7 +130,7 @@ class HostileTwin:
         end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
         known = (None, None, none, "OK", Setting(tolerance, setting, UNBOUNDED), end)
         update = Update(window.servo, version, self.in_force, identity, window.start, *known)
-        self.said.append(update)
+        self.sent.append(update)
         return [Acknowledge(window.servo, window.boot, window.sequence), update]
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from benchmarks.contest import Contestant, Job, Workload
 from servotwin.hybrid.automaton import Array
@@ -13,11 +15,12 @@ from servotwin.hybrid.automaton import Array
 Clock: TypeAlias = Callable[[], float]
 Notice: TypeAlias = Callable[[str], None]
 MOST_REPEATS = 50
+SCHEMA = "servotwin-bench/1"
 
 
 @dataclass(frozen=True)
-class Row:
-    """What was measured of one contestant.
+class ContestantTimes:
+    """Measurements of one contestant.
 
     Attributes
     ----------
@@ -28,7 +31,7 @@ class Row:
     errors : dict
         By the name of the check.
     missing : str
-        Why it did not take part; all else is then empty.
+        Reason for which it did not take part; all else is then empty.
     """
 
     name: str
@@ -48,7 +51,7 @@ class Row:
         """Median of the rounds' medians, s."""
         return median(self.times)
 
-    def ratios(self, base: Row) -> tuple[float, ...]:
+    def ratios(self, base: ContestantTimes) -> tuple[float, ...]:
         """Time over that of `base` in the same round."""
         return tuple(own / other for own, other in zip(self.times, base.times, strict=True))
 
@@ -74,7 +77,7 @@ class _Runner:
         self.rounds.append(tuple(times))
 
 
-def race(workload: Workload, runs: int, block: float, clock: Clock, notice: Notice) -> tuple[Row, ...]:
+def race(workload: Workload, runs: int, block: float, clock: Clock, notice: Notice) -> tuple[ContestantTimes, ...]:
     """Measure all contestants of a workload.
 
     Parameters
@@ -83,11 +86,11 @@ def race(workload: Workload, runs: int, block: float, clock: Clock, notice: Noti
     runs : int
         Rounds.
     block : float
-        s: a shorter job is repeated within its turn until about so much has passed.
+        s: a shorter job is repeated within its turn for about this time.
     clock : callable
         Seconds.
     notice : callable
-        Told what is about to happen, once for each preparation, turn and check.
+        Called with the next activity, once for each preparation, turn and check.
     """
     runners = {c.name: _prepared(c, block, clock, notice) for c in workload.contestants if not c.missing}
     for number in range(runs):
@@ -98,7 +101,7 @@ def race(workload: Workload, runs: int, block: float, clock: Clock, notice: Noti
 
 
 def turns(workload: Workload, runs: int) -> int:
-    """How often `race` calls its notice."""
+    """Number of calls of the notice by `race`."""
     return (runs + 2) * sum(not c.missing for c in workload.contestants)
 
 
@@ -115,9 +118,63 @@ def _prepared(contestant: Contestant, block: float, clock: Clock, notice: Notice
     return _Runner(contestant, job, first, repeats, answer, [])
 
 
-def _row(contestant: Contestant, runner: _Runner | None, workload: Workload, notice: Notice) -> Row:
+def _row(contestant: Contestant, runner: _Runner | None, workload: Workload, notice: Notice) -> ContestantTimes:
     if runner is None:
-        return Row(contestant.name, 0.0, (), {}, "", contestant.missing)
+        return ContestantTimes(contestant.name, 0.0, (), {}, "", contestant.missing)
     notice(f"checking {contestant.name}")
     errors = {check.name: check.of(runner.answer) for check in workload.checks}
-    return Row(contestant.name, runner.first, tuple(runner.rounds), errors, contestant.remark(), "")
+    return ContestantTimes(contestant.name, runner.first, tuple(runner.rounds), errors, contestant.remark(), "")
+
+
+@dataclass(frozen=True)
+class WorkloadResult:
+    """A workload and the measurements of its contestants, servotwin first."""
+
+    workload: Workload
+    rows: tuple[ContestantTimes, ...]
+
+    def ratio(self, row: ContestantTimes) -> float:
+        """Median over the rounds of the time over servotwin's in the same round."""
+        return median(row.ratios(self.rows[0]))
+
+    def note(self, row: ContestantTimes) -> str:
+        """Remark beside the numbers."""
+        if row.missing:
+            return row.missing
+        return ", ".join(part for part in (self.workload.pace(row.median), row.remark) if part)
+
+
+def dumps(results: Sequence[WorkloadResult], machine: Mapping[str, Any], date: str, quick: bool) -> str:
+    """The document: schema, date, machine, and for each workload every run of every contestant."""
+    document = {
+        "schema": SCHEMA,
+        "date": date,
+        "quick": quick,
+        "machine": dict(machine),
+        "workloads": [_workload(result) for result in results],
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def _workload(result: WorkloadResult) -> dict[str, Any]:
+    return {
+        "name": result.workload.name,
+        "title": result.workload.title,
+        "units": {check.name: check.unit for check in result.workload.checks},
+        "contestants": [_row_json(result, row) for row in result.rows],
+    }
+
+
+def _row_json(result: WorkloadResult, row: ContestantTimes) -> dict[str, Any]:
+    if row.missing:
+        return {"name": row.name, "missing": row.missing}
+    return {
+        "name": row.name,
+        "median_s": row.median,
+        "ratio": result.ratio(row),
+        "ratios": list(row.ratios(result.rows[0])),
+        "first_s": row.first,
+        "rounds_s": [list(times) for times in row.rounds],
+        "errors": {name: None if math.isnan(value) else value for name, value in row.errors.items()},
+        "note": result.note(row),
+    }

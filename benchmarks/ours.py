@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contest import Contestant
-from benchmarks.workloads import Noisy, Sweep, Wear
+from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload
 from servotwin.hybrid.automaton import Array
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.ensemble import simulate_ensemble
 
 NAME = "servotwin"
-REFINED = 4  # how much finer the reference runs search for events
+REFINED = 4  # factor by which the reference runs search finer for events
 PERTURBATION = 1e-12  # of the step
 SENSITIVE = 1e-9  # of the step: members that the perturbation moves farther than this are not compared
 
 
-def run_wear(workload: Wear) -> Run:
+def run_wear(workload: WearWorkload) -> Run:
     """W1's run."""
     return simulate(
         workload.servo,
@@ -32,7 +32,7 @@ def run_wear(workload: Wear) -> Run:
     )
 
 
-def run_noisy(workload: Noisy, sample_rate: float | None = None) -> Run:
+def run_noisy(workload: NoisyWorkload, sample_rate: float | None = None) -> Run:
     """The sampled run, recorded at its own rate or at a multiple of it."""
     wear = workload.wear
     return simulate(
@@ -48,7 +48,7 @@ def run_noisy(workload: Noisy, sample_rate: float | None = None) -> Run:
     )
 
 
-def wearing(workload: Wear) -> Contestant:
+def wearing(workload: WearWorkload) -> Contestant:
     """W1."""
 
     def remark() -> str:
@@ -57,12 +57,12 @@ def wearing(workload: Wear) -> Contestant:
     return Contestant(NAME, lambda: lambda: run_wear(workload).position, remark=remark)
 
 
-def noisy(workload: Noisy) -> Contestant:
+def noisy(workload: NoisyWorkload) -> Contestant:
     """The sampled run."""
     return Contestant(NAME, lambda: lambda: run_noisy(workload).position)
 
 
-def sweeping(workload: Sweep, threads: int) -> Contestant:
+def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
     """W2."""
     gaps, tolerances = workload.members
     servo, duration = workload.servo, workload.duration
@@ -76,7 +76,7 @@ def sweeping(workload: Sweep, threads: int) -> Contestant:
 
 
 @cache
-def refined_wear(workload: Wear) -> Array:
+def refined_wear(workload: WearWorkload) -> Array:
     """W1's positions (N,) m from a search for events in steps `REFINED` times shorter."""
     simulation = Simulation(
         workload.servo,
@@ -90,13 +90,13 @@ def refined_wear(workload: Wear) -> Array:
 
 
 @cache
-def refined_noisy(workload: Noisy) -> Array:
+def refined_noisy(workload: NoisyWorkload) -> Array:
     """The sampled run's positions (N,) m with `REFINED` base steps a tick."""
     return run_noisy(workload, REFINED * workload.wear.sample_rate).position[::REFINED]
 
 
 @cache
-def refined_sweep(workload: Sweep) -> Array:
+def refined_sweep(workload: SweepWorkload) -> Array:
     """W2's positions (K, N) m, each member run by itself and searched `REFINED` times finer."""
     servo, duration, rate = workload.servo, workload.duration, workload.sample_rate
     members = zip(*(values.tolist() for values in workload.members), strict=True)
@@ -108,7 +108,7 @@ def refined_sweep(workload: Sweep) -> Array:
 
 
 @cache
-def comparable(workload: Sweep) -> NDArray[np.bool_]:
+def comparable(workload: SweepWorkload) -> NDArray[np.bool_]:
     """(K,) members of W2 that a perturbation of the step leaves where they are."""
     gaps, tolerances = workload.members
     runs = [

@@ -1,4 +1,4 @@
-"""scipy's solve_ivp (LSODA) with terminal events, started anew after each: right, and slow (asked for by --slow)."""
+"""scipy's solve_ivp (LSODA) with terminal events, restarted after each: right, and slow (option --slow)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from benchmarks.contest import Contestant, Job
-from benchmarks.model import Model, model_of
-from benchmarks.workloads import Wear
+from benchmarks.workloads import LoopEquations, WearWorkload, equations_of
 from servotwin.hybrid.automaton import Array
 
 NAME = "scipy LSODA, events"
@@ -22,11 +21,11 @@ Guard: TypeAlias = Callable[[float, Array], float]
 
 
 @dataclass
-class Loop:
-    """Where a run stands: contact -1 or +1, or 0 in the gap; whether the dead zone lets the error through."""
+class SwitchedLoop:
+    """State of a run: contact -1 or +1, or 0 in the gap; `on` while the error is outside the dead zone."""
 
-    model: Model
-    workload: Wear
+    model: LoopEquations
+    workload: WearWorkload
     reference: float = 0.0
     contact: int = 1
     on: bool = True
@@ -92,20 +91,20 @@ class Loop:
             self.contact = 1 if guard == 1 else -1
 
 
-def run(loop: Loop, end: float, times: Array, out: Array) -> None:
+def run(loop: SwitchedLoop, end: float, times: Array, out: Array) -> None:
     """Go on to `end`; positions at those of `times` (n,) that are passed."""
     from scipy.integrate import solve_ivp
 
     while loop.time < end:
         A, (constant, of_gap) = loop.matrix(), loop.drives()
         first = int(np.searchsorted(times, loop.time))
-        wanted = times[first : int(np.searchsorted(times, end, side="right"))]
+        requested = times[first : int(np.searchsorted(times, end, side="right"))]
         answer = solve_ivp(
             lambda t, x, A=A, c=constant, g=of_gap: A @ x + c + g * loop.half_gap(t),
             (loop.time, end),
             loop.state,
             method="LSODA",
-            t_eval=wanted,
+            t_eval=requested,
             events=[_terminal(guard, loop.time + BLIND) for guard in loop.guards()],
             jac=lambda _t, _x, A=A: A,
             rtol=RELATIVE,
@@ -130,15 +129,15 @@ def _terminal(guard: Guard, after: float) -> Any:
     return event
 
 
-def wearing(workload: Wear) -> Contestant:
+def wearing(workload: WearWorkload) -> Contestant:
     """W1."""
 
     def prepare() -> Job:
-        model = model_of(workload.servo)
+        model = equations_of(workload.servo)
         times = np.arange(workload.samples) / workload.sample_rate
 
         def job() -> Array:
-            loop, out = Loop(model, workload), np.zeros(workload.samples)
+            loop, out = SwitchedLoop(model, workload), np.zeros(workload.samples)
             for turn in range(workload.turns):
                 loop.reference = workload.level(turn)
                 loop.on = bool(abs(loop.reference - model.position @ loop.state[CHAIN:]) > workload.tolerance)

@@ -1,4 +1,4 @@
-"""How long a fresh process takes to its first result: interpreter, imports, tables and compiled code."""
+"""Time of a fresh process to its first result: interpreter, imports, tables and compiled code."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from benchmarks import hold, taylor
 from benchmarks.contest import Contestant, Job
 from servotwin.hybrid.automaton import Array
 
-_FIRST_RUN = "from benchmarks.workloads import Wear; from benchmarks import {module} as contestant; " + (
-    "contestant.wearing(Wear(duration=1.0, period=1.0){rate}).prepare()()"
+_FIRST_RUN = "from benchmarks.workloads import WearWorkload; from benchmarks import {module} as contestant; " + (
+    "contestant.wearing(WearWorkload(duration=1.0, period=1.0){rate}).prepare()()"
 )
 
 
@@ -40,7 +40,7 @@ def starting(module: str, name: str, rate: str = "", cached: bool = True, missin
 
 
 def starters(slow: bool) -> tuple[Contestant, ...]:
-    """Those that are compared; compiling servotwin anew takes half a minute and is asked for by --slow."""
+    """Contestants; a full compilation takes half a minute and needs --slow."""
     anew = (starting("ours", "servotwin, compiled anew", cached=False),) if slow else ()
     return (
         starting("ours", "servotwin, cached"),

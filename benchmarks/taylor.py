@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.contest import Contestant, Job
-from benchmarks.model import Model, model_of
-from benchmarks.workloads import Sweep, Wear
+from benchmarks.workloads import LoopEquations, SweepWorkload, WearWorkload, equations_of
 from servotwin.hybrid.automaton import Array
 
 NAME = "heyoka"
@@ -65,7 +64,7 @@ class Integrator:
         return np.asarray(np.tensordot(grid[:, CHAIN:], self.position, axes=(1, 0)))
 
 
-def build(model: Model, lanes: int = 1, tolerance: float = TOLERANCE) -> Integrator:
+def build(model: LoopEquations, lanes: int = 1, tolerance: float = TOLERANCE) -> Integrator:
     """Compile an integrator for so many runs at once."""
     import heyoka
 
@@ -83,7 +82,7 @@ def build(model: Model, lanes: int = 1, tolerance: float = TOLERANCE) -> Integra
     return Integrator(make(equations, tol=tolerance, t_events=events, **zeros), lanes, model.position)
 
 
-def _system(heyoka: Any, model: Model) -> tuple[list[Any], list[Any]]:
+def _system(heyoka: Any, model: LoopEquations) -> tuple[list[Any], list[Any]]:
     """Equations of motion, and the guards of `_callbacks`: a guard of the other contact mode is a constant."""
     current, speed, angle, integral, lagged = heyoka.make_vars("current", "speed", "angle", "integral", "lagged")
     chain = heyoka.make_vars(*(f"chain{i}" for i in range(model.position.size)))
@@ -117,7 +116,7 @@ def _dot(row: Array, terms: Any) -> Any:
 
 
 def _callbacks() -> tuple[Callable[..., bool], ...]:
-    """What the events change; the lane is given only by an integrator of several runs."""
+    """Make the callbacks of the events; only an integrator of several runs passes a lane."""
 
     def beyond(side: int) -> Callable[..., bool]:
         def switch(ta: Any, sign: int, *lane: int) -> bool:
@@ -147,11 +146,11 @@ def _callbacks() -> tuple[Callable[..., bool], ...]:
     return beyond(1), beyond(-1), release, contact(1), contact(-1)
 
 
-def wearing(workload: Wear) -> Contestant:
+def wearing(workload: WearWorkload) -> Contestant:
     """W1."""
 
     def prepare() -> Job:
-        integrator = build(model_of(workload.servo))
+        integrator = build(equations_of(workload.servo))
         times = np.arange(workload.samples) / workload.sample_rate
         ends = [round(turn * 0.5 * workload.period * workload.sample_rate) for turn in range(workload.turns + 1)]
 
@@ -173,14 +172,14 @@ def wearing(workload: Wear) -> Contestant:
     return Contestant(f"{NAME} {TOLERANCE:g}", prepare, MISSING)
 
 
-def sweeping(workload: Sweep, lanes: int, threads: int) -> Contestant:
+def sweeping(workload: SweepWorkload, lanes: int, threads: int) -> Contestant:
     """W2 with so many runs in an integrator and so many integrators at work."""
     gaps, tolerances = workload.members
     groups = [np.arange(first, min(first + lanes, gaps.size)) for first in range(0, gaps.size, lanes)]
     times = np.arange(workload.samples) / workload.sample_rate
 
     def prepare() -> Job:
-        integrators = [build(model_of(workload.servo), lanes) for _ in range(threads)]
+        integrators = [build(equations_of(workload.servo), lanes) for _ in range(threads)]
 
         def part(worker: int, out: Array) -> None:
             for group in groups[worker::threads]:

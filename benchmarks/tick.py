@@ -16,7 +16,7 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks import report
-from benchmarks.machine import cores
+from benchmarks.report import cores
 
 SCHEMA = "servotwin-bench-tick/1"
 NAME = "tick"

@@ -22,14 +22,14 @@ from servotwin.edge.recorder import as_floats
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
-from servotwin.edge_process.child import LinkChild, starter
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
-from servotwin.edge_process.control import Controlling
-from servotwin.edge_process.edge import Edge
+from servotwin.edge_process.control import ControlRole
+from servotwin.edge_process.edge import EdgeRuntime
+from servotwin.edge_process.link_child import LinkChild, link_command
+from servotwin.edge_process.monitoring import TickHistogram, summarise
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.run import calm, hurry
-from servotwin.edge_process.ticks import Counts, summary
+from servotwin.edge_process.run import set_realtime_priority, tame_garbage_collector
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Band, Setting
 
@@ -53,7 +53,7 @@ class PacedDrive:
 
     def __init__(self, rate: float, seconds: float, moving: bool) -> None:
         self.rate = rate
-        self.wake, self.answer, self.whole = Counts(), Counts(), Counts()
+        self.wake, self.answer, self.whole = TickHistogram(), TickHistogram(), TickHistogram()
         self.overruns = self.missed = 0
         self._end, self._moving = round(rate * seconds), moving
         self._number, self._position, self._zero, self._woken = 0, 0.0, 0.0, 0.0
@@ -106,13 +106,13 @@ def measured(rate: float, seconds: float, moving: bool, priority: int, folder: P
     file = folder / "edge.toml"
     file.write_text(edge_toml(settings), encoding="utf-8")
     drive, outlet = PacedDrive(rate, seconds, moving), PipeOutlet(False)
-    child = LinkChild(starter(file), outlet)
-    edge = Edge(settings, "bench", outlet, child, None, time.perf_counter, time.sleep)
-    role = Controlling(edge, drive)
-    child.tend(edge.clock())
+    child = LinkChild(link_command(file), outlet)
+    edge = EdgeRuntime(settings, "bench", outlet, child, None, time.perf_counter, time.sleep)
+    role = ControlRole(edge, drive)
+    child.check(edge.clock())
     time.sleep(1.0)  # until it listens: its start is not what is measured
-    calm()
-    hurried = hurry(priority)
+    tame_garbage_collector()
+    hurried = set_realtime_priority(priority)
     drive.connect()
     while role.step():
         pass
@@ -123,9 +123,9 @@ def measured(rate: float, seconds: float, moving: bool, priority: int, folder: P
     return {**told, **_result(drive, edge), "load": os.getloadavg()[0]}
 
 
-def _result(drive: PacedDrive, edge: Edge) -> dict[str, Any]:
+def _result(drive: PacedDrive, edge: EdgeRuntime) -> dict[str, Any]:
     times = {"wake": drive.wake, "answer": drive.answer, "whole": drive.whole}
-    told = {name: summary(counts.dumps(), counts.longest) for name, counts in times.items()}
+    told = {name: summarise(counts.dumps(), counts.longest) for name, counts in times.items()}
     return {**told, "overruns": drive.overruns, "missed": drive.missed, "dropped": dict(edge.agent.dropped)}
 
 

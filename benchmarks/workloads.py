@@ -1,4 +1,4 @@
-"""The inputs of the workloads: a servo that wears for 200 s, and an ensemble of gaps and tolerances."""
+"""Inputs of the workloads: a servo that wears for 200 s, an ensemble of gaps and tolerances, and the equations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def the_servo() -> Servo:
 
 
 @dataclass(frozen=True)
-class Wear:
+class WearWorkload:
     """A gap that opens along a smoothstep under a square-wave reference (W1, W3 and the sampled run).
 
     Parameters
@@ -88,7 +88,7 @@ class Wear:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class SweepWorkload:
     """Total gaps 0 .. 60 deg times tolerances 0 .. those for 20 deg, each run from rest to a step (W2).
 
     Parameters
@@ -127,10 +127,10 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Noisy:
+class NoisyWorkload:
     """The same wear with a sampled controller in measurement noise, behind the paper's loop filter (section 4.3)."""
 
-    wear: Wear
+    wear: WearWorkload
     noise_std: float = 0.22e-3
     loop_filter_hz: float = 20.0
     seed: int = 1
@@ -145,3 +145,49 @@ class Noisy:
         """The servo's own, sampled at the rate of the output."""
         servo, rate = self.wear.servo, self.wear.sample_rate
         return servo.controller.replace(sample_rate=rate, loop_filter_hz=self.loop_filter_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopEquations:
+    """Equations 1 to 14 as matrices: motor, chain and filtered PID; each solver adds gap and dead zone itself.
+
+    Attributes
+    ----------
+    motor_A, motor_B : (3, 3) and (3,) arrays
+        Of (current, speed, angle) and the voltage.
+    chain_A, chain_B : (4, 4) and (4,) arrays
+        Of the chain's states and the screw's angle; the rate of the screw is substituted away.
+    position : (4,) array
+        Row of the last mass.
+    Kp, Ki, N, Tf : float
+        N = Kd / Tf; the voltage is Kp e + Ki (integral of e) + N (e - lagged e).
+    """
+
+    motor_A: Array
+    motor_B: Array
+    chain_A: Array
+    chain_B: Array
+    position: Array
+    Kp: float
+    Ki: float
+    N: float
+    Tf: float
+
+
+def equations_of(servo: Servo) -> LoopEquations:
+    """Derive the equations of a servo with three masses, a rigid screw and its own continuous controller."""
+    A, B, _ = servo.motor()
+    chain, law = servo.chain(), servo.controller
+    # x' = A x + B_p d + B_v d' becomes z' = A z + (B_p + A B_v) d with z = x - B_v d; positions are not touched.
+    drive = servo.p * (chain.B_position + chain.A @ chain.B_velocity)
+    return LoopEquations(
+        motor_A=A,
+        motor_B=B,
+        chain_A=chain.A,
+        chain_B=drive,
+        position=chain.C_last,
+        Kp=law.Kp,
+        Ki=law.Ki,
+        N=law.Kd / law.Tf,
+        Tf=law.Tf,
+    )

@@ -12,7 +12,7 @@ from rich.table import Table
 from benchmarks.fleet.runs import Ran
 from benchmarks.fleet.setting import Scale
 from benchmarks.fleet.watch import EDGES, TWIN, WORKERS
-from benchmarks.machine import cores, machine
+from benchmarks.report import cores, machine
 
 ROLES = (EDGES, TWIN, WORKERS)
 ASKED_INGEST = 2000.0

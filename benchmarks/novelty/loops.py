@@ -14,7 +14,7 @@ import numpy as np
 from servotwin.analysis.maps.pool import shared
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.outlet import WITHHELD
+from servotwin.edge.outlet import FILTERED
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.signals import Array, SCurve
 
@@ -101,7 +101,7 @@ def summary(loop: Loop) -> Account:
     sent = [m for m in loop.messages if m.direction == "up"]
     rms = (float(np.sqrt(np.mean(np.square(x[known_from])))) for x in (held, known))
     return Account(
-        len(loop.windows) + loop.accounts[WITHHELD],
+        len(loop.windows) + loop.accounts[FILTERED],
         len(loop.windows),
         len(loop.applied),
         sum(len(m.data) for m in sent),

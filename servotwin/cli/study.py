@@ -79,7 +79,7 @@ def identify(
 
 
 def bench(context: typer.Context) -> None:
-    """Speed and accuracy beside what one would use instead; part of the source checkout: python -m benchmarks."""
+    """Measure speed and accuracy beside other solvers; part of the source checkout: python -m benchmarks."""
     try:
         from benchmarks.cli import app
     except ModuleNotFoundError as error:
@@ -88,4 +88,6 @@ def bench(context: typer.Context) -> None:
         raise InvalidInput(
             "servotwin bench: the benchmarks are part of the source checkout; run python -m benchmarks there"
         ) from None
-    app(context.args, prog_name="servotwin bench", standalone_mode=False)
+    status = app(context.args, prog_name="servotwin bench", standalone_mode=False)
+    if status == 130:  # Typer returns the status of an interrupt instead of raising it
+        raise KeyboardInterrupt

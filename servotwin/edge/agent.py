@@ -18,7 +18,7 @@ from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.cut import TIMED, Cut
 from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
-from servotwin.edge.outlet import Outlet, PackingOutlet
+from servotwin.edge.outlet import LocalOutlet, Outlet
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
@@ -73,11 +73,11 @@ class Agent:
     ) -> None:
         self.settings = settings
         self.windows_cut = 0
-        self.outlet = PackingOutlet(settings, outbox) if outlet is None else outlet
+        self.outlet = LocalOutlet(settings, outbox) if outlet is None else outlet
         capacity = max(settings.longest_samples + 1, settings.period_samples, settings.rest_samples)
         self._recorder = Recorder(tuple(CHANNELS), capacity)
         self._supervisor = Supervisor(settings, self._recorder, store)
-        if self.outlet.waiting:
+        if self.outlet.unacknowledged:
             self._supervisor.asked(0.0)
         self._granted = Granted(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
@@ -164,21 +164,21 @@ class Agent:
         if isinstance(message, Request):
             return self._requested(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
-            self.outlet.acknowledged(message)
+            self.outlet.acknowledge(message)
             self._heard(message.servo)
         return []
 
     def outlet_changed(self) -> None:
-        """What waits at the outlet has changed by itself: an earlier boot left something, or nothing is sent."""
-        if self.outlet.waiting:
+        """Take note that the outlet's unacknowledged windows have changed by themselves."""
+        if self.outlet.unacknowledged:
             self._supervisor.asked(self.time)
         else:
             self._supervisor.answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
-    def put_back(self, former: Parameters) -> list[Outgoing]:
+    def restore(self, former: Parameters) -> list[Outgoing]:
         """The drive does not take what is in force, and runs on those; returns what is to be sent now."""
-        said = self._supervisor.put_back(former)
+        said = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
         return [Outgoing(self.samples, each) for each in said]
 
@@ -199,7 +199,7 @@ class Agent:
     def _heard(self, servo: str) -> None:
         """The twin said something."""
         if servo == self.settings.servo:
-            self._supervisor.answered(self.time, more=self.outlet.waiting)
+            self._supervisor.answered(self.time, more=self.outlet.unacknowledged)
         self._deadline = self._next_deadline()
 
     def _requested(self, request: Request) -> list[Outgoing]:
@@ -256,7 +256,7 @@ class Agent:
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
         self._cut_at = self.samples
         self.outlet.offer(self._raw(opened, sequence), self.time)
-        if self.outlet.waiting:
+        if self.outlet.unacknowledged:
             self._supervisor.asked(self.time)
 
     def _raw(self, opened: Opened, sequence: int) -> Cut:

@@ -1,6 +1,7 @@
-"""Where the agent's cut windows go: the protocol, and the outlet that packs, keeps and repeats them in this process.
+"""Outlet of the agent's cut windows: the protocol, and the outlet that packs, keeps and repeats them in this process.
 
-The gateway's outlet hands them to a process of its own instead, so that neither packing nor the disk delays a sample.
+The edge process hands them to a link process instead, so that neither packing nor the disk delays a sample. Both write
+windows into an outbox by `WindowWriter`, and repeat them by one `servotwin.link.session.Session`.
 """
 
 from collections import Counter
@@ -11,88 +12,135 @@ from servotwin.edge.cut import Cut
 from servotwin.edge.packing import is_finite, pack
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.window_filter import WindowFilter
+from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
-from servotwin.link.session import Sender
+from servotwin.link.session import Session
 from servotwin.messages import Acknowledge, InvalidMessage, Window
 
 NOT_FINITE = "sample not finite"
-WITHHELD = "nothing new"
+FILTERED = "nothing new"
+"""Reasons of windows that are not sent."""
+
+UNFILTERED = "window not judged"
+"""Fault of a window whose filter failed."""
+
+_FILTER_STATE = "novelty"  # its name in outboxes on disk since the first filter
 
 
 class Outlet(Protocol):
-    """What the agent needs of whoever sends its windows; times are sample times, s."""
+    """Interface through which the agent sends its windows; times are sample times, s."""
 
     @property
     def next_time(self) -> float | None:
-        """When something is due next; None: never, or not known here."""
+        """Time at which something is due next; None: never, or not known here."""
 
     @property
-    def waiting(self) -> bool:
-        """Whether the twin owes the acknowledgement of a window."""
+    def unacknowledged(self) -> bool:
+        """The twin owes the acknowledgement of a window."""
 
     @property
     def dropped(self) -> Mapping[str, int]:
         """Windows that will never be sent (again) without having been acknowledged, by reason."""
 
     def offer(self, cut: Cut, now: float) -> None:
-        """Take charge of what was cut."""
+        """Take charge of a cut window."""
 
     def due(self, now: float) -> list[Window]:
-        """The windows that the agent is to send now, oldest first."""
+        """Return the windows that the agent is to send now, oldest first; each counts as sent."""
 
-    def acknowledged(self, message: Acknowledge) -> bool:
-        """The twin has a window of this servo; False when that was known."""
+    def acknowledge(self, message: Acknowledge) -> bool:
+        """Take the twin's acknowledgement of a window; False when the window was not kept any more."""
 
 
-class PackingOutlet:
-    """Packs at once, keeps in an outbox, repeats until acknowledged.
+class WindowWriter:
+    """Filters the cut windows of one boot, packs them and puts them into an outbox.
+
+    Parameters
+    ----------
+    settings : AgentSettings
+        Of that boot; its window filter goes on from the state that an earlier boot left in the outbox.
+    outbox : Outbox
+    faults : Counter, optional
+        Counts the windows whose filter failed, which are then sent; None: such an error is raised.
+    """
+
+    def __init__(self, settings: AgentSettings, outbox: Outbox, faults: Counter[str] | None = None) -> None:
+        self._settings, self._outbox, self._faults = settings, outbox, faults
+        self._filter: WindowFilter | None = None
+        if settings.window_filter is not None:
+            try:
+                self._filter = settings.window_filter.start(outbox.value(_FILTER_STATE))
+            except InvalidInput:
+                self._filter = settings.window_filter.start()
+
+    def write(self, cut: Cut) -> None:
+        """Put a window into the outbox, or count why it is not sent."""
+        wanted = self._filtered(cut) if is_finite(cut) else cut
+        if wanted is None:
+            self._outbox.count_dropped(FILTERED)
+            return
+        try:
+            window = pack(wanted, self._settings)
+        except InvalidMessage:
+            self._outbox.count_dropped(NOT_FINITE)
+        else:
+            self._outbox.put(window)
+
+    def _filtered(self, cut: Cut) -> Cut | None:
+        if self._filter is None:
+            return cut
+        try:
+            wanted = self._filter(cut)
+        except Exception:
+            if self._faults is None:
+                raise
+            self._faults[UNFILTERED] += 1
+            return cut
+        self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
+        return wanted
+
+
+class LocalOutlet:
+    """Keeps windows in an outbox of this process; the agent sends them, and repeats them until they are acknowledged.
 
     Parameters
     ----------
     settings : AgentSettings
     outbox : Outbox, optional
-        In memory by default; what it already holds is due at once.
+        In memory by default; windows that it already holds are due at once.
     """
 
     def __init__(self, settings: AgentSettings, outbox: Outbox | None = None) -> None:
-        self._settings = settings
-        self._filter: WindowFilter | None = None if settings.window_filter is None else settings.window_filter.start()
         self.outbox = MemoryOutbox() if outbox is None else outbox
-        self._sender = Sender(self.outbox, settings.retry)
-        self._lost: Counter[str] = Counter()
+        self._writer = WindowWriter(settings, self.outbox)
+        self._session = Session(self.outbox, settings.retry)
 
     @property
     def next_time(self) -> float | None:
-        """When a window is due next, s; None: everything is acknowledged or dropped."""
-        return self._sender.next_time
+        """Time at which a window is due next, s; None: everything is acknowledged or dropped."""
+        return self._session.next_time
 
     @property
-    def waiting(self) -> bool:
-        """Whether the twin owes the acknowledgement of a window."""
+    def unacknowledged(self) -> bool:
+        """The twin owes the acknowledgement of a window."""
         return bool(self.outbox.pending())
 
     @property
-    def dropped(self) -> Counter[str]:
+    def dropped(self) -> Mapping[str, int]:
         """Windows that will never be sent (again) without having been acknowledged, by reason."""
-        return self._lost + Counter(self.outbox.dropped)
+        return self.outbox.dropped
 
-    def offer(self, cut: Cut, now: float) -> None:
-        """Judge, pack and keep; one that holds a sample which is not finite is counted only."""
-        wanted = cut if self._filter is None or not is_finite(cut) else self._filter(cut)
-        if wanted is None:
-            self._lost[WITHHELD] += 1
-            return
-        try:
-            window = pack(wanted, self._settings)
-        except InvalidMessage:
-            self._lost[NOT_FINITE] += 1
-        else:
-            self._sender.offer(window, now)
+    def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
+        """Take charge of a cut window: it is due at once."""
+        self._writer.write(cut)
 
     def due(self, now: float) -> list[Window]:
-        """The windows to send now, oldest first; each counts as sent."""
-        return self._sender.due(now)
+        """Return the windows to send now, oldest first; each counts as sent."""
+        keys = [item for item in self._session.due(now) if not isinstance(item, bytes)]
+        for key in keys:
+            self._session.retry_later(key, now)
+        return [self.outbox.get(key) for key in keys]
 
-    def acknowledged(self, message: Acknowledge) -> bool:
-        """The twin has a window; False when that was known."""
-        return self._sender.acknowledged(message)
+    def acknowledge(self, message: Acknowledge) -> bool:
+        """Forget a window that the twin has; False when it was not kept any more."""
+        return self._session.acknowledge((message.boot, message.sequence))

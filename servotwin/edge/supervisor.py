@@ -66,9 +66,9 @@ class Supervisor:
         """Take an update from the twin."""
         return self._take(switch.offer(self._state, update, self._rules, self._here, self._error))
 
-    def put_back(self, former: Parameters) -> Said:
+    def restore(self, former: Parameters) -> Said:
         """The drive runs on those, as it does not take what is in force."""
-        return self._take(switch.put_back(self._state, former, self._here))
+        return self._take(switch.restore(self._state, former, self._here))
 
     def asked(self, now: float) -> None:
         """A window is on its way to the twin."""

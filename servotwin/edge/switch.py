@@ -123,7 +123,7 @@ def fall_back(state: Switch, fallback: FallbackSet, verdict: Verdict, here: Inst
     return _leave(state, new, fallback.setting.gains, verdict, fallback.refuse_s, here)
 
 
-def put_back(state: Switch, former: Parameters, here: Instant) -> Step:
+def restore(state: Switch, former: Parameters, here: Instant) -> Step:
     """What the drive runs on, as it does not take what is in force; what waits is refused."""
     new = replace(former, data_time=here.time, window=None)
     return _leave(state, new, former.setting.gains, Verdict(Cause.DRIVE, 0.0, 0.0), REFUSED_S, here)

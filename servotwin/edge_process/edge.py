@@ -1,4 +1,4 @@
-"""What both roles have in common: the agent of each boot, its outlet, the link process, and what is told of them."""
+"""Runtime of one edge, the same in both roles: the agent of each boot, its outlet, the link process, the status."""
 
 from __future__ import annotations
 
@@ -14,41 +14,40 @@ from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process.config import EdgeConfig
-from servotwin.edge_process.frames import TicksFrame, Value
-from servotwin.edge_process.log import say
+from servotwin.edge_process.frames import StatusFrame, Value
+from servotwin.edge_process.monitoring import TickHistogram, log
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.ticks import Counts
 
 Clock = Callable[[], float]
-CHILD_S, TOLD_S, PIECE_S = 0.1, 1.0, 0.005
-LET_UP_S = 1.0
-BRIDGED_S = 1.0
+CHECK_PERIOD_S, STATUS_PERIOD_S, PAUSE_S = 0.1, 1.0, 0.005
+LONGEST_WAIT_FOR_LINK_S = 1.0
+LONGEST_GAP_S = 1.0
 """Time without samples after which a new boot begins."""
 
 
-class Child(Protocol):
-    """Whatever takes what the outlet sends."""
+class LinkProcessChild(Protocol):
+    """The process that takes what the outlet sends."""
 
-    def tend(self, now: float) -> None:
-        """See that it runs."""
+    def check(self, now: float) -> None:
+        """Restart it where it has ended."""
 
 
-class Carried:
-    """The store of an agent whose disk is the link process's: begins with what it is given, hands on what is proved."""
+class LinkParameterStore:
+    """Parameter store of an agent whose disk belongs to the link process."""
 
     def __init__(self, first: Parameters | None, outlet: PipeOutlet) -> None:
         self._first, self._outlet = first, outlet
 
     def save(self, parameters: Parameters) -> None:
-        """Let it be kept."""
+        """Have parameters stored by the link process."""
         self._outlet.save(parameters)
 
     def load(self) -> Parameters | None:
-        """What to begin with."""
+        """Return the parameters stored by an earlier boot."""
         return self._first
 
 
-class Edge:
+class EdgeRuntime:
     """One servo's edge, without its drive.
 
     Parameters
@@ -57,9 +56,9 @@ class Edge:
     boot : str
         This start's name; where samples are missing a boot begins within it, named after it.
     outlet : PipeOutlet
-    child : Child
+    child : LinkProcessChild
     first : Parameters, optional
-        Kept from an earlier start.
+        Stored by an earlier start.
     clock, pause : callable
         Monotonic, s; wait for so long, s.
 
@@ -74,7 +73,7 @@ class Edge:
         config: EdgeConfig,
         boot: str,
         outlet: PipeOutlet,
-        child: Child,
+        child: LinkProcessChild,
         first: Parameters | None,
         clock: Clock,
         pause: Callable[[float], None],
@@ -82,95 +81,95 @@ class Edge:
         self.config, self.clock, self.pause = config, clock, pause
         self.counts: Counter[str] = Counter()
         self.due: int | None = None
-        self.ticks = Counts()
+        self.ticks = TickHistogram()
         self._boot, self._boots = boot, 0
         self._outlet, self._child = outlet, child
-        self._child_due = self._told_due = clock()
-        self.agent = self._begun(first)
+        self._check_due = self._status_due = clock()
+        self.agent = self._new_agent(first)
 
     def skip(self, missing: int, wanted: float, voltage: float) -> None:
-        """Other samples than those that were due: a few that are missing cost the windows that they were in.
+        """Go on at other samples than those due; a few that are missing cost the windows that they were in.
 
         Parameters
         ----------
         missing : int
-            Samples; negative: they are counted anew.
+            Samples; negative: they are counted from 0 again.
         wanted, voltage : float
-            m and V meanwhile, as far as known.
+            Reference and voltage meanwhile, m and V, as far as known.
         """
-        if not 0 < missing <= BRIDGED_S * self.config.agent.sample_rate:
-            self._begin("samples missing" if missing > 0 else "machine counts anew")
+        if not 0 < missing <= LONGEST_GAP_S * self.config.agent.sample_rate:
+            self._new_boot("samples missing" if missing > 0 else "machine counts anew")
             return
         self.counts["samples missed"] += missing
-        unseen = array("d", [nan]) * missing
-        held, given = array("d", [wanted]) * missing, array("d", [voltage]) * missing
-        self.send(self.agent.absorb_block(held, unseen, unseen, given))
+        unknown = array("d", [nan]) * missing
+        references, voltages = array("d", [wanted]) * missing, array("d", [voltage]) * missing
+        self.send(self.agent.absorb_block(references, unknown, unknown, voltages))
 
-    def _begin(self, why: str) -> None:
-        """Too many samples are missing, or they are counted anew: a new boot, on the parameters in force."""
+    def _new_boot(self, why: str) -> None:
+        """Begin a new boot, on the parameters in force."""
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
-        self.agent = self._begun(StoredParameters.of(self.agent.parameters).parameters())
+        self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters())
 
     def exchange(self) -> None:
-        """Send a piece of what waits, and let the agent hear what has come."""
-        heard = self._outlet.exchange()
-        if heard is None:
+        """Exchange a piece with the link process, and give the agent what has come."""
+        received = self._outlet.exchange()
+        if received is None:
             return
-        for message in heard.messages:
+        for message in received.messages:
             self.send(self.agent.receive(message))
-        if heard.standing:
+        if received.pending_changed:
             self.agent.outlet_changed()
-        if heard.back:
-            self._outlet.say(self.agent.hello())
+        if received.reconnected:
+            self._outlet.send_letter(self.agent.hello())
 
-    def send(self, sent: list[Outgoing]) -> None:
-        """What the agent says."""
-        for each in sent:
-            self._outlet.say(each.message)
+    def send(self, letters: list[Outgoing]) -> None:
+        """Send the agent's letters."""
+        for each in letters:
+            self._outlet.send_letter(each.message)
 
-    def tend(self) -> None:
-        """Now and then: the link process, and the status."""
+    def supervise(self) -> None:
+        """Check the link process and send the status, each when it is due."""
         now = self.clock()
-        if now < self._child_due:
+        if now < self._check_due:
             return
-        self._child_due = now + CHILD_S
-        self._child.tend(now)
-        if now >= self._told_due:
-            self._told_due = now + TOLD_S
-            self._outlet.tell(self._told())
+        self._check_due = now + CHECK_PERIOD_S
+        self._child.check(now)
+        if now >= self._status_due:
+            self._status_due = now + STATUS_PERIOD_S
+            self._outlet.send_status(self._status())
 
     def wait_for_link(self) -> None:
-        """Until the link process is not far behind, a while at most; for a drive whose samples wait."""
-        end = self.clock() + LET_UP_S
-        while self._outlet.behind and self.clock() < end:
+        """Wait while the link process is far behind, a second at most; for a drive whose samples wait."""
+        end = self.clock() + LONGEST_WAIT_FOR_LINK_S
+        while self._outlet.congested and self.clock() < end:
             self.exchange()
-            self.tend()
-            self.pause(PIECE_S)
+            self.supervise()
+            self.pause(PAUSE_S)
 
     def finish(self, seconds: float) -> None:
-        """Give the link process a while to take what is left, while it takes any, and a last word on how it went."""
-        end, told, left = self.clock() + seconds, False, self._outlet.untaken
-        while self.clock() < end and not (told and self._outlet.settled):
+        """Wait until the link process has taken what is left, while it takes any, and send it a last status."""
+        end, status_sent, left = self.clock() + seconds, False, self._outlet.untaken
+        while self.clock() < end and not (status_sent and self._outlet.idle):
             if self._outlet.untaken < left:
                 end, left = self.clock() + seconds, self._outlet.untaken
-            if self._outlet.settled:
-                self._outlet.tell(self._told())
-                told = True
+            if self._outlet.idle:
+                self._outlet.send_status(self._status())
+                status_sent = True
             self.exchange()
-            self._child.tend(self.clock())
-            self.pause(PIECE_S)
+            self._child.check(self.clock())
+            self.pause(PAUSE_S)
 
-    def _begun(self, first: Parameters | None) -> Agent:
+    def _new_agent(self, first: Parameters | None) -> Agent:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
         self._outlet.boot = boot
         settings = replace(self.config.agent, boot=boot)
-        agent = Agent(settings, store=Carried(first, self._outlet), outlet=self._outlet)
-        self._outlet.say(agent.hello())
-        say("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
+        agent = Agent(settings, store=LinkParameterStore(first, self._outlet), outlet=self._outlet)
+        self._outlet.send_letter(agent.hello())
+        log("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
         return agent
 
-    def _told(self) -> TicksFrame:
+    def _status(self) -> StatusFrame:
         agent, p = self.agent, self.agent.parameters
         values: dict[str, Value] = {
             "version": p.version,
@@ -183,11 +182,11 @@ class Edge:
             **_gains(agent.controller or self.config.controller),
             **self.counts,
         }
-        return TicksFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())
+        return StatusFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())
 
 
 def _gains(law: Controller | None) -> dict[str, Value]:
-    """Of the controller in force, as far as it is known here."""
+    """Gains of the controller in force, as far as they are known here."""
     if law is None:
         return {}
     return {

@@ -1,7 +1,7 @@
-"""What the control process and the link process say to each other.
+"""Frames between the control process and the link process.
 
-Whatever must not be lost carries a serial and is kept by the control process until the link process has it on disk
-(`Done`), so that either may be killed at any time.
+A frame that must not be lost carries a serial. The control process keeps it until the link process has its content on
+disk (`AckFrame`), so that either may be killed at any time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from servotwin.messages import InvalidMessage
 Value = float | int | str | bool | None
 
 
-class CutFrame(Struct, frozen=True, array_like=True, tag="cut"):
+class WindowFrame(Struct, frozen=True, array_like=True, tag="window"):
     """A cut window, raw: doubles as this machine has them."""
 
     serial: int
@@ -34,10 +34,18 @@ class CutFrame(Struct, frozen=True, array_like=True, tag="cut"):
 
     @property
     def cut(self) -> Cut:
-        """The cut."""
+        """The cut that the frame carries."""
         signals = {name: _doubles(data) for name, data in self.signals.items()}
-        names = (self.first, self.sequence, self.reason, self.parameter_version, self.before)
-        return Cut(*names, signals, self.gap, self.basis)
+        return Cut(
+            first=self.first,
+            sequence=self.sequence,
+            reason=self.reason,
+            parameter_version=self.parameter_version,
+            before=self.before,
+            signals=signals,
+            gap=self.gap,
+            basis=self.basis,
+        )
 
 
 class LetterFrame(Struct, frozen=True, array_like=True, tag="letter"):
@@ -48,20 +56,20 @@ class LetterFrame(Struct, frozen=True, array_like=True, tag="letter"):
 
 
 class SaveFrame(Struct, frozen=True, array_like=True, tag="save"):
-    """Parameters that were proved at the machine: to be kept on disk."""
+    """Parameters that kept their band at the machine, to be stored on disk."""
 
     serial: int
     parameters: StoredParameters
 
 
-class HandledFrame(Struct, frozen=True, array_like=True, tag="handled"):
-    """The twin's message of this serial was handled."""
+class ProcessedFrame(Struct, frozen=True, array_like=True, tag="processed"):
+    """The agent has processed the twin's message of this serial."""
 
     serial: int
 
 
-class TicksFrame(Struct, frozen=True, array_like=True, tag="ticks"):
-    """What the control process says of itself, about once a second: `ticks` are counts by microseconds."""
+class StatusFrame(Struct, frozen=True, array_like=True, tag="status"):
+    """Status of the control process, about once a second; `ticks` is a histogram of tick times by microseconds."""
 
     boot: str
     samples: int
@@ -70,32 +78,32 @@ class TicksFrame(Struct, frozen=True, array_like=True, tag="ticks"):
     ticks: bytes
 
 
-class DoneFrame(Struct, frozen=True, array_like=True, tag="done"):
-    """The link process has taken what carried this serial."""
+class AckFrame(Struct, frozen=True, array_like=True, tag="ack"):
+    """Acknowledgement: the link process need not be sent the frame of this serial again."""
 
     serial: int
 
 
-class HeardFrame(Struct, frozen=True, array_like=True, tag="heard"):
-    """A message for the agent; serial 0: an acknowledgement, not counted among the twin's."""
+class MessageFrame(Struct, frozen=True, array_like=True, tag="message"):
+    """A message for the agent; serial 0: an acknowledgement of a window, which has no serial of the twin's."""
 
     serial: int
     body: bytes
 
 
-class StandingFrame(Struct, frozen=True, array_like=True, tag="standing"):
-    """Windows that wait for the twin's acknowledgement, and those given up, by reason."""
+class PendingFrame(Struct, frozen=True, array_like=True, tag="pending"):
+    """Number of windows that wait for the twin's acknowledgement, and of those dropped, by reason."""
 
-    waiting: int
+    pending: int
     dropped: dict[str, int]
 
 
-class BackFrame(Struct, frozen=True, array_like=True, tag="back"):
+class ReconnectedFrame(Struct, frozen=True, array_like=True, tag="reconnected"):
     """The twin is reached again."""
 
 
-ToLink = CutFrame | LetterFrame | SaveFrame | HandledFrame | TicksFrame
-ToControl = DoneFrame | HeardFrame | StandingFrame | BackFrame
+ToLink = WindowFrame | LetterFrame | SaveFrame | ProcessedFrame | StatusFrame
+ToControl = AckFrame | MessageFrame | PendingFrame | ReconnectedFrame
 
 encode = msgspec.msgpack.Encoder().encode
 _to_link: msgspec.msgpack.Decoder[ToLink] = msgspec.msgpack.Decoder(ToLink)
@@ -103,7 +111,7 @@ _to_control: msgspec.msgpack.Decoder[ToControl] = msgspec.msgpack.Decoder(ToCont
 
 
 def to_link(data: bytes) -> ToLink:
-    """A frame for the link process; raises InvalidMessage."""
+    """Decode a frame for the link process; raises InvalidMessage."""
     try:
         return _to_link.decode(data)
     except (msgspec.MsgspecError, ValueError) as error:
@@ -111,18 +119,28 @@ def to_link(data: bytes) -> ToLink:
 
 
 def to_control(data: bytes) -> ToControl:
-    """A frame for the control process; raises InvalidMessage."""
+    """Decode a frame for the control process; raises InvalidMessage."""
     try:
         return _to_control.decode(data)
     except (msgspec.MsgspecError, ValueError) as error:
         raise InvalidMessage(f"frame not understood: {error}") from None
 
 
-def framed(cut: Cut, boot: str, serial: int) -> CutFrame:
-    """A cut as it crosses."""
+def window_frame(cut: Cut, boot: str, serial: int) -> WindowFrame:
+    """Make the frame that carries a cut."""
     signals = {name: values.tobytes() for name, values in cut.signals.items()}
-    names = (cut.first, cut.sequence, cut.reason, cut.parameter_version, cut.before)
-    return CutFrame(serial, boot, *names, signals, cut.gap, cut.basis)
+    return WindowFrame(
+        serial=serial,
+        boot=boot,
+        first=cut.first,
+        sequence=cut.sequence,
+        reason=cut.reason,
+        parameter_version=cut.parameter_version,
+        before=cut.before,
+        signals=signals,
+        gap=cut.gap,
+        basis=cut.basis,
+    )
 
 
 def _doubles(data: bytes) -> array[float]:

@@ -1,4 +1,4 @@
-"""The link process: packs, judges, keeps, sends and listens, so that the control process waits for none of it.
+"""The link process: filters, packs, stores, sends and receives, so that the control process waits for none of it.
 
 `python -m servotwin.edge_process.link_process edge.toml FD`; it ends when the other end of the socket FD is closed.
 """
@@ -18,28 +18,28 @@ from contextlib import suppress
 from threading import Event, Thread
 from typing import Any
 
-from servotwin.edge.outlet import WITHHELD
+from servotwin.edge.outlet import FILTERED
 from servotwin.edge_process import frames
-from servotwin.edge_process.config import EdgeConfig, token_of
+from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.config_file import load
-from servotwin.edge_process.keeping import Keeper
-from servotwin.edge_process.log import Troubles, say
-from servotwin.edge_process.status import write_status
-from servotwin.edge_process.ticks import summary
-from servotwin.edge_process.twin_link import courier_of, listener_of, transport_of
+from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
+from servotwin.edge_process.monitoring import TroubleLog, log, summarise, write_status
 from servotwin.errors import InvalidInput
+from servotwin.link.client import Receiver, Sender
+from servotwin.link.session import Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.link.transport import Transport
 from servotwin.messages import Acknowledge, InvalidMessage, encode
 from servotwin.runtime.frames import FrameSocket
 
 NICE = 10
-TEND_S = 1.0
-SHORTEST_S = 0.1
-"""Between two polls that bring nothing: a twin that does not wait, since it ends, is not asked as often as it goes."""
+STATUS_PERIOD_S = 1.0
+SHORTEST_POLL_S = 0.1
+"""Time between two polls that bring nothing: a twin that is about to end does not wait with its answer."""
 
 
 class LinkProcess:
-    """One child of a control process.
+    """Link process of a control process.
 
     Parameters
     ----------
@@ -52,25 +52,30 @@ class LinkProcess:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
         keeping = config.keeping
         self.outbox = SqliteOutbox(config.path(keeping.outbox), config.agent.servo, keeping.windows, keeping.bytes)
-        self.outbox.settle()
-        self._keeper = Keeper(config, self.outbox)
+        self.outbox.flush()
+        self._handler = FrameHandler(config, self.outbox)
+        self._token, self._token_replaced = _token(config), False
         self._transport = transport_of(config)
-        self._courier = courier_of(config, self.outbox, self._transport, random.random)
-        self._listener = listener_of(config, self.outbox, self._transport, random.random)
-        self._news, self._stopping = Event(), Event()
+        self._session = Session(self.outbox, config.agent.retry, random.random)
+        self._sender = self._receiver = None
+        if self._transport is not None:
+            cursor, retry = self.outbox.number(CURSOR), config.agent.retry
+            self._sender = Sender(self._session, self._transport)
+            self._receiver = Receiver(self._transport, config.agent.servo, self._token, cursor, retry, random.random)
+        self._outbox_changed, self._stopping = Event(), Event()
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._outgoing: list[bytes] = []
         self._broken: list[BaseException] = []
-        self._ticks: frames.TicksFrame | None = None
-        self._told = (-1, Counter[str]())
+        self._control: frames.StatusFrame | None = None
+        self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
-        self._troubles, self._given_up = Troubles(), dict[str, int]()
-        self._token, self._renewed = _token(config), False
+        self._troubles, self._dropped = TroubleLog(), dict[str, int]()
 
     def run(self) -> None:
-        """Until the control process is gone."""
-        threads = [Thread(target=self._guarded, args=(work,)) for work in self._works()]
+        """Run until the control process is gone."""
+        loops = [] if self._transport is None else [self._send, self._receive]
+        threads = [Thread(target=self._guarded, args=(loop,)) for loop in loops]
         for thread in threads:
             thread.start()
         try:
@@ -80,113 +85,109 @@ class LinkProcess:
         if self._broken:
             raise self._broken[0]
 
-    def _works(self) -> list[Callable[[], None]]:
-        return [] if self._transport is None else [self._send, self._listen]
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """A thread that fails ends the process: the control process starts another."""
+    def _guarded(self, loop: Callable[[], None]) -> None:
+        """Run a thread's loop; an error ends the process, and the control process starts another."""
         try:
-            work()
+            loop()
         except BaseException as error:
             self._broken.append(error)
             self._emit(b"")
 
     def _serve(self) -> None:
-        tended = 0.0
-        while not (self._pipe.broken or self._broken or self._renewed):
-            self._stand()
+        checked = 0.0
+        while not (self._pipe.broken or self._broken or self._token_replaced):
+            self._send_pending()
             while self._outgoing:
                 self._pipe.post(self._outgoing.pop(0))
             self._pipe.send()
-            left = max(0.0, tended + TEND_S - time.monotonic())
-            wanting = [self._end] if self._pipe.backlog else []
-            readable, _, _ = select.select([self._end, self._woken], wanting, [], left)
+            left = max(0.0, checked + STATUS_PERIOD_S - time.monotonic())
+            writers = [self._end] if self._pipe.backlog else []
+            readable, _, _ = select.select([self._end, self._woken], writers, [], left)
             if self._woken in readable:
                 self._woken.recv(4096)
             if self._end in readable:
-                self._receive()
-            if time.monotonic() >= tended + TEND_S:
-                tended = time.monotonic()
-                self._tend()
+                self._receive_frames()
+            if time.monotonic() >= checked + STATUS_PERIOD_S:
+                checked = time.monotonic()
+                self._check()
 
-    def _receive(self) -> None:
+    def _receive_frames(self) -> None:
         for data in self._pipe.receive():
             try:
-                self._take(frames.to_link(data))
+                self._handle(frames.to_link(data))
             except InvalidMessage:
                 self._faults["frame not understood"] += 1
 
-    def _take(self, frame: frames.ToLink) -> None:
-        if isinstance(frame, frames.TicksFrame):
-            self._ticks = frame
+    def _handle(self, frame: frames.ToLink) -> None:
+        if isinstance(frame, frames.StatusFrame):
+            self._control = frame
             return
-        for serial in self._keeper.take(frame):
-            self._pipe.post(frames.encode(frames.DoneFrame(serial)))
-        self._news.set()
+        for serial in self._handler.handle(frame):
+            self._pipe.post(frames.encode(frames.AckFrame(serial)))
+        self._outbox_changed.set()
 
-    def _tend(self) -> None:
-        for serial in self._keeper.tend():
-            self._pipe.post(frames.encode(frames.DoneFrame(serial)))
-        self._look()
-        self._renew()
+    def _check(self) -> None:
+        for serial in self._handler.retry():
+            self._pipe.post(frames.encode(frames.AckFrame(serial)))
+        self._log_troubles()
+        self._check_token()
         try:
             write_status(self._config.path(self._config.keeping.status), self._status())
         except OSError:
             self._faults["status not written"] += 1
 
-    def _renew(self) -> None:
-        """A token that was replaced since: the link process that comes after this one reads it."""
-        if self._courier is None or self._listener is None or not (self._courier.trouble or self._listener.trouble):
+    def _check_token(self) -> None:
+        """End where the token was replaced: the next link process reads the new one."""
+        if self._receiver is None or not (self._session.trouble or self._receiver.trouble):
             return
         with suppress(InvalidInput):  # it is being replaced just now
-            self._renewed = _token(self._config) != self._token
-        if self._renewed:
-            say("token replaced")
+            self._token_replaced = _token(self._config) != self._token
+        if self._token_replaced:
+            log("token replaced")
 
-    def _look(self) -> None:
-        """Let whoever reads the log know what has gone wrong since, and what is well again."""
+    def _log_troubles(self) -> None:
+        """Log what has gone wrong since, and what is well again."""
         if self._stopping.is_set():
             return
-        look = self._troubles.look
-        look("disk", "" if self.outbox.safe else self.outbox.trouble)
-        if self._courier is not None and self._listener is not None:
-            look("to the twin", self._courier.trouble)
-            look("from the twin", self._listener.trouble)
-        dropped = {why: number for why, number in self.outbox.dropped.items() if why != WITHHELD}
-        if dropped != self._given_up:
-            self._given_up = dropped
-            say("windows dropped", **dropped)
+        self._troubles.update("disk", "" if self.outbox.flushed else self.outbox.trouble)
+        if self._receiver is not None:
+            self._troubles.update("to the twin", self._session.trouble)
+            self._troubles.update("from the twin", self._receiver.trouble)
+        dropped = {why: number for why, number in self.outbox.dropped.items() if why != FILTERED}
+        if dropped != self._dropped:
+            self._dropped = dropped
+            log("windows dropped", **dropped)
 
-    def _stand(self) -> None:
-        """Tell the control process what waits, when that has changed: before it hears of an acknowledgement."""
+    def _send_pending(self) -> None:
+        """Tell the control process how many windows are pending, when that has changed: before an acknowledgement."""
         now = len(self.outbox.pending()), Counter(self.outbox.dropped)
-        if now != self._told:
-            self._told = now
-            self._pipe.post(frames.encode(frames.StandingFrame(now[0], dict(now[1]))))
+        if now != self._pending:
+            self._pending = now
+            self._pipe.post(frames.encode(frames.PendingFrame(now[0], dict(now[1]))))
 
     def _send(self) -> None:
-        assert self._courier is not None
+        assert self._sender is not None
         while not self._stopping.is_set():
-            self._news.clear()
-            sent = self._courier.step(time.monotonic())
+            self._outbox_changed.clear()
+            sent = self._sender.step(time.monotonic())
             if sent.window is not None:
                 acknowledge = Acknowledge(self._config.agent.servo, *sent.window)
-                self._emit(frames.encode(frames.HeardFrame(0, encode(acknowledge))))
-            if sent.back:
-                self._emit(frames.encode(frames.BackFrame()))
+                self._emit(frames.encode(frames.MessageFrame(0, encode(acknowledge))))
+            if sent.reconnected:
+                self._emit(frames.encode(frames.ReconnectedFrame()))
             if sent.wait_s > 0.0:
-                self._news.wait(min(sent.wait_s, 3600.0))
+                self._outbox_changed.wait(min(sent.wait_s, 3600.0))
 
-    def _listen(self) -> None:
-        assert self._listener is not None
+    def _receive(self) -> None:
+        assert self._receiver is not None
         while not self._stopping.is_set():
-            told = self._listener.step()
-            for serial, body in told.messages:
-                self._emit(frames.encode(frames.HeardFrame(serial, body)))
-            self._stopping.wait(told.wait_s if told.messages else max(told.wait_s, SHORTEST_S))
+            received = self._receiver.step()
+            for serial, body in received.messages:
+                self._emit(frames.encode(frames.MessageFrame(serial, body)))
+            self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, SHORTEST_POLL_S))
 
     def _emit(self, frame: bytes) -> None:
-        """From another thread: let the main one send it."""
+        """Have the main thread send a frame; called from another."""
         if frame:
             self._outgoing.append(frame)
         with suppress(BlockingIOError):  # as many as fit are enough to wake it
@@ -194,42 +195,69 @@ class LinkProcess:
 
     def _end_all(self, threads: list[Thread]) -> None:
         self._stopping.set()
-        self._news.set()
+        self._outbox_changed.set()
         if self._transport is not None:
             self._transport.close()
         for thread in threads:
             thread.join()
-        self._tend()
+        self._check()
         self.outbox.close()
         for end in (self._wake, self._woken):
             end.close()
         self._pipe.close()
 
     def _status(self) -> dict[str, Any]:
-        ticks, box = self._ticks, self.outbox
-        known: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
-        if ticks is not None:
-            longest = float(ticks.values.get("longest_tick_s") or 0.0)
-            known |= {"boot": ticks.boot, "samples": ticks.samples, **ticks.values}
-            known["tick"] = summary(ticks.ticks, longest)
-        known["windows"] = {
+        control, box = self._control, self.outbox
+        status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
+        if control is not None:
+            longest = float(control.values.get("longest_tick_s") or 0.0)
+            status |= {"boot": control.boot, "samples": control.samples, **control.values}
+            status["tick"] = summarise(control.ticks, longest)
+        status["windows"] = {
             "waiting": len(box.pending()),
             "letters_waiting": len(box.letters()),
-            "dropped": {**(ticks.dropped if ticks is not None else {}), **box.dropped},
+            "dropped": {**(control.dropped if control is not None else {}), **box.dropped},
         }
-        known["disk"] = {
-            "safe": box.safe,
+        status["disk"] = {
+            "safe": box.flushed,
             "trouble": box.trouble,
-            "faults": dict(box.faults + self._faults + self._keeper.faults),
+            "faults": dict(box.faults + self._faults + self._handler.faults),
         }
-        if self._courier is not None and self._listener is not None:
-            known["up"] = {"trouble": self._courier.trouble, **self._courier.counts}
-            known["down"] = {"trouble": self._listener.trouble, **self._listener.counts}
-        return {**known, "link_process": os.getpid(), "written": time.time()}
+        if self._receiver is not None:
+            status["up"] = {"trouble": self._session.trouble, **self._session.counts}
+            status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
+        return {**status, "link_process": os.getpid(), "written": time.time()}
+
+
+def transport_of(config: EdgeConfig) -> Transport | None:
+    """Make the transport that a configuration asks for; None: there is no twin."""
+    twin = config.twin
+    if twin is None:
+        return None
+    ca_file = None if twin.ca_file is None else str(config.path(twin.ca_file))
+    return _TRANSPORTS["mqtt" if twin.over_mqtt else "http"](config, twin, _token(config), ca_file)
+
+
+def _http(config: EdgeConfig, twin: TwinLink, token: str, ca_file: str | None) -> Transport:
+    from servotwin.link.http import HttpTransport
+
+    return HttpTransport(twin.url, config.agent.servo, token, ca_file, twin.timeout_s, twin.wait_s)
+
+
+def _mqtt(config: EdgeConfig, twin: TwinLink, token: str, ca_file: str | None) -> Transport:
+    from servotwin.link.broker import Broker
+    from servotwin.link.mqtt import MqttTransport
+
+    broker = Broker(twin.url, twin.user, password_of(twin, config.folder), ca_file)
+    return MqttTransport(broker, config.agent.servo, token, twin.timeout_s, twin.wait_s)
+
+
+_TRANSPORTS: dict[str, Callable[[EdgeConfig, TwinLink, str, str | None], Transport]] = {"http": _http, "mqtt": _mqtt}
+"""Transports by name; each is imported when it is asked for."""
 
 
 def _token(config: EdgeConfig) -> str:
-    """The servo's; empty where there is no twin."""
+    """Token of the servo; empty where there is no twin."""
     return "" if config.twin is None else token_of(config.twin, config.folder)
 
 
@@ -243,7 +271,7 @@ def main(arguments: list[str]) -> int:
     try:
         LinkProcess(load(path), end).run()
     except Exception as error:
-        say("link process failed", error=f"{type(error).__name__}: {error}")
+        log("link process failed", error=f"{type(error).__name__}: {error}")
         return 1
     return 0
 

@@ -1,5 +1,5 @@
-"""The control process's outlet: what the agent cuts, says and proves goes to the link process, and is kept until it has
-taken it; no call waits for anything.
+"""Outlet of the control process: windows, letters and parameters go to the link process, and are kept until it has
+acknowledged them; no call waits for anything.
 """
 
 from __future__ import annotations
@@ -11,21 +11,31 @@ from servotwin.edge.cut import Cut
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
-from servotwin.edge_process.frames import BackFrame, DoneFrame, HeardFrame, StandingFrame
+from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame
 from servotwin.messages import Acknowledge, InvalidMessage, Message, Window, decode, encode
 from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
 MOST = 64_000_000
-"""Bytes that are kept for a link process that does not take them."""
+"""Bytes that are kept for a link process that does not acknowledge them."""
 
 
-class Heard:
-    """What came from the link process: messages for the agent, and whether the agent must look or say hello."""
+class Received:
+    """Frames of the link process, as the agent needs them.
+
+    Attributes
+    ----------
+    messages : list of Message
+        From the twin.
+    pending_changed : bool
+        The number of windows that wait for the twin's acknowledgement may have changed.
+    reconnected : bool
+        The twin is reached again: the agent says hello.
+    """
 
     def __init__(self) -> None:
         self.messages: list[Message] = []
-        self.standing = self.back = False
+        self.pending_changed = self.reconnected = False
 
 
 class PipeOutlet:
@@ -33,29 +43,29 @@ class PipeOutlet:
 
     Parameters
     ----------
-    owed : bool
-        Whether there is a twin at all, who owes acknowledgements.
+    has_twin : bool
+        False: nobody owes acknowledgements.
     """
 
     next_time: float | None = None
 
-    def __init__(self, owed: bool) -> None:
-        self._owed = owed
+    def __init__(self, has_twin: bool) -> None:
+        self._has_twin = has_twin
         self.boot = ""
         self._pipe: FrameSocket | None = None
         self._serial = 0
-        self._handled = 0
-        self._kept: dict[int, bytes] = {}
-        self._cuts: set[int] = set()
+        self._processed = 0
+        self._unacknowledged: dict[int, bytes] = {}
+        self._windows: set[int] = set()
         self._size = 0
-        self._waiting = 0
+        self._pending = 0
         self._lost: Counter[str] = Counter()
         self._dropped: Mapping[str, int] = {}
 
     @property
-    def waiting(self) -> bool:
-        """Whether the twin owes the acknowledgement of a window."""
-        return self._owed and (self._waiting > 0 or bool(self._cuts))
+    def unacknowledged(self) -> bool:
+        """The twin owes the acknowledgement of a window."""
+        return self._has_twin and (self._pending > 0 or bool(self._windows))
 
     @property
     def dropped(self) -> Counter[str]:
@@ -64,127 +74,128 @@ class PipeOutlet:
 
     @property
     def lost(self) -> Counter[str]:
-        """Of those, what never came to the link process."""
+        """Those of them that no link process has taken."""
         return self._lost
 
     @property
     def connected(self) -> bool:
-        """Whether a link process listens."""
+        """A link process is there."""
         return self._pipe is not None and not self._pipe.broken
 
     @property
-    def settled(self) -> bool:
-        """Whether the link process has taken everything."""
-        return not self._kept and (self._pipe is None or self._pipe.backlog == 0)
+    def idle(self) -> bool:
+        """The link process has acknowledged everything."""
+        return not self._unacknowledged and (self._pipe is None or self._pipe.backlog == 0)
 
     @property
     def untaken(self) -> int:
-        """Windows that no link process is known to have on the disk."""
-        return len(self._cuts)
+        """Number of windows that no link process is known to have on the disk."""
+        return len(self._windows)
 
     @property
-    def behind(self) -> bool:
-        """Whether the link process has so much to take that windows may have to be given up soon."""
+    def congested(self) -> bool:
+        """The link process is so far behind that windows may have to be given up soon."""
         return self._size > MOST // 2
 
     def connect(self, pipe: FrameSocket) -> None:
-        """A new link process: it is given everything that the last one may not have taken."""
+        """Use a new link process, and send it everything that the last one has not acknowledged."""
         self.disconnect()
         self._pipe = pipe
-        for frame in self._kept.values():
+        for frame in self._unacknowledged.values():
             pipe.post(frame)
 
     def disconnect(self) -> None:
-        """There is no link process."""
+        """Close the connection to the link process."""
         if self._pipe is not None:
             self._pipe.close()
         self._pipe = None
 
     def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
-        """Take charge of what was cut."""
-        serial = self._keep(frames.framed(cut, self.boot, self._next()))
-        self._cuts.add(serial)
+        """Take charge of a cut window."""
+        serial = self._send(frames.window_frame(cut, self.boot, self._next_serial()))
+        self._windows.add(serial)
         while self._size > MOST:
-            self._give_up(next(iter(self._kept)))
+            self._give_up(next(iter(self._unacknowledged)))
 
     def due(self, now: float) -> list[Window]:  # noqa: ARG002
-        """Nothing: the link process sends."""
+        """Return nothing: the link process sends."""
         return []
 
-    def acknowledged(self, message: Acknowledge) -> bool:  # noqa: ARG002
-        """The link process knows first, and tells how many wait."""
+    def acknowledge(self, message: Acknowledge) -> bool:  # noqa: ARG002
+        """Do nothing: the link process knows first, and sends how many windows are pending."""
         return True
 
-    def say(self, message: Message) -> None:
+    def send_letter(self, message: Message) -> None:
         """Send a letter to the twin."""
-        self._keep(frames.LetterFrame(self._next(), encode(message)))
+        self._send(frames.LetterFrame(self._next_serial(), encode(message)))
 
     def save(self, parameters: Parameters) -> None:
-        """Let these parameters be kept on disk."""
-        self._keep(frames.SaveFrame(self._next(), StoredParameters.of(parameters)))
+        """Have parameters stored on disk."""
+        self._send(frames.SaveFrame(self._next_serial(), StoredParameters.of(parameters)))
 
-    def tell(self, frame: frames.TicksFrame) -> None:
-        """Something that may be lost; left out when the link process is behind."""
+    def send_status(self, frame: frames.StatusFrame) -> None:
+        """Send a status, which may be lost; nothing is sent while the link process is behind."""
         if self._pipe is not None and self._pipe.backlog == 0:
             self._pipe.post(frames.encode(frame))
 
-    def exchange(self) -> Heard | None:
-        """Send a piece, take a piece; None: nothing came."""
+    def exchange(self) -> Received | None:
+        """Send a piece and receive a piece; None: nothing came."""
         pipe = self._pipe
         if pipe is None or pipe.broken:
             return None
         pipe.send()
         try:
-            came = pipe.receive()
-            return self._hear(came) if came else None
+            bodies = pipe.receive()
+            return self._receive(bodies) if bodies else None
         except (FrameError, InvalidMessage):
             pipe.broken = True
             return None
 
-    def _hear(self, came: list[bytes]) -> Heard:
-        heard = Heard()
-        for data in came:
+    def _receive(self, bodies: list[bytes]) -> Received:
+        received = Received()
+        for data in bodies:
             frame = frames.to_control(data)
-            if isinstance(frame, DoneFrame):
-                heard.standing |= frame.serial in self._cuts  # perhaps nothing is owed now, and nobody else says so
-                self._done(frame.serial)
-            elif isinstance(frame, HeardFrame):
-                self._message(frame, heard)
-            elif isinstance(frame, StandingFrame):
-                self._waiting, self._dropped = frame.waiting, frame.dropped
-                heard.standing = True
-            elif isinstance(frame, BackFrame):
-                heard.back = True
-        return heard
+            if isinstance(frame, AckFrame):
+                # The link process sends no PendingFrame where the window was filtered out.
+                received.pending_changed |= frame.serial in self._windows
+                self._acknowledge(frame.serial)
+            elif isinstance(frame, MessageFrame):
+                self._message(frame, received)
+            elif isinstance(frame, PendingFrame):
+                self._pending, self._dropped = frame.pending, frame.dropped
+                received.pending_changed = True
+            elif isinstance(frame, ReconnectedFrame):
+                received.reconnected = True
+        return received
 
-    def _message(self, frame: HeardFrame, heard: Heard) -> None:
-        """A message of the twin's counts once, whoever repeats it."""
-        if frame.serial == 0 or frame.serial > self._handled:
-            heard.messages.append(decode(frame.body))
+    def _message(self, frame: MessageFrame, received: Received) -> None:
+        """Take a message of the twin's once, however often it is repeated."""
+        if frame.serial == 0 or frame.serial > self._processed:
+            received.messages.append(decode(frame.body))
         if frame.serial > 0:
-            self._handled = max(self._handled, frame.serial)
+            self._processed = max(self._processed, frame.serial)
             if self._pipe is not None:
-                self._pipe.post(frames.encode(frames.HandledFrame(frame.serial)))
+                self._pipe.post(frames.encode(frames.ProcessedFrame(frame.serial)))
 
-    def _next(self) -> int:
+    def _next_serial(self) -> int:
         self._serial += 1
         return self._serial
 
-    def _keep(self, frame: frames.CutFrame | frames.LetterFrame | frames.SaveFrame) -> int:
+    def _send(self, frame: frames.WindowFrame | frames.LetterFrame | frames.SaveFrame) -> int:
         data = frames.encode(frame)
-        self._kept[frame.serial] = data
+        self._unacknowledged[frame.serial] = data
         self._size += len(data)
         if self._pipe is not None:
             self._pipe.post(data)
         return frame.serial
 
-    def _done(self, serial: int) -> None:
-        self._size -= len(self._kept.pop(serial, b""))
-        self._cuts.discard(serial)
+    def _acknowledge(self, serial: int) -> None:
+        self._size -= len(self._unacknowledged.pop(serial, b""))
+        self._windows.discard(serial)
 
     def _give_up(self, serial: int) -> None:
-        """A link process so far behind is given up too: the next one gets what is still kept."""
+        """Drop a frame, and the link process with it: the next one gets what is left."""
         if self._pipe is not None:
             self._pipe.broken = True
-        self._lost[BEHIND if serial in self._cuts else "letter: " + BEHIND] += 1
-        self._done(serial)
+        self._lost[BEHIND if serial in self._windows else "letter: " + BEHIND] += 1
+        self._acknowledge(serial)

@@ -60,9 +60,9 @@ def _compile(function: _Function, **options: Any) -> _Function:
             "one that may in the environment variable NUMBA_CACHE_DIR"
         ) from None
     # A set of strings is written in another order by every process.
-    told = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
-    dispatcher.options_told = repr(sorted(told.items()))
-    dispatcher.stamp = stamp(function, dispatcher.options_told)
+    sorted_options = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
+    dispatcher.options_key = repr(sorted(sorted_options.items()))
+    dispatcher.stamp = stamp(function, dispatcher.options_key)
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
     return cast(_Function, dispatcher)

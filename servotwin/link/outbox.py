@@ -1,14 +1,19 @@
-"""Windows kept until the twin has them: the protocol, and the in-memory one."""
+"""Outbox of an edge: windows and letters kept until the twin has them; the protocol, and the one in memory.
+
+A letter is an encoded hello, receipt, fallback or answer. `servotwin.link.sqlite_outbox` is the outbox on disk.
+"""
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from hashlib import blake2b
 from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
-from servotwin.messages import Window
+from servotwin.link.transport import Parcel, deflated
+from servotwin.messages import Window, encode
 
 Key = tuple[str, int]
-"""(boot, sequence): which window of this servo."""
+"""(boot, sequence): identifies a window of a servo."""
 
 FULL = "outbox full"
 
@@ -21,23 +26,50 @@ class Dropped(NamedTuple):
 
 
 class Outbox(Protocol):
-    """What the session needs from a store of unacknowledged windows; it is bounded and counts what it drops."""
+    """Bounded store of unacknowledged messages, which counts the windows it drops."""
 
     @property
     def dropped(self) -> Mapping[str, int]:
         """Windows given up so far, by reason."""
 
     def put(self, window: Window) -> Sequence[Dropped]:
-        """Keep a window; returns what had to go to make room, oldest first."""
+        """Keep a window; return what was dropped to make room, oldest first."""
 
     def get(self, key: Key) -> Window:
-        """The window; KeyError when it is not (or no longer) kept."""
+        """Return a window; KeyError when it is not (or no longer) kept."""
+
+    def parcel(self, key: Key) -> Parcel:
+        """Return a window as it is sent; KeyError when it is not (or no longer) kept."""
 
     def remove(self, key: Key) -> bool:
         """Forget an acknowledged window; False when it was not there."""
 
+    def drop(self, key: Key, reason: str) -> None:
+        """Give a window up, for a reason that is counted."""
+
+    def count_dropped(self, reason: str) -> None:
+        """Count a window that was given up before it was put here."""
+
     def pending(self) -> Sequence[Key]:
-        """Keys of everything kept, oldest first."""
+        """Keys of all windows, oldest first."""
+
+    def put_letter(self, body: bytes) -> None:
+        """Keep a letter (an encoded message); the same one twice is one."""
+
+    def letters(self) -> Sequence[bytes]:
+        """Digests of all letters, oldest first."""
+
+    def letter(self, digest: bytes) -> Parcel:
+        """Return a letter as it is sent; KeyError when it is not kept."""
+
+    def remove_letter(self, digest: bytes) -> bool:
+        """Forget a letter; False when it was not there."""
+
+    def set_value(self, name: str, value: bytes) -> None:
+        """Keep some bytes under a name."""
+
+    def value(self, name: str) -> bytes | None:
+        """Return the bytes kept under a name."""
 
 
 class MemoryOutbox:
@@ -47,13 +79,17 @@ class MemoryOutbox:
     ----------
     capacity : int
         Windows kept at most; the oldest are dropped first.
+    servo : str
+        For parcels; "" where none is asked for.
     """
 
-    def __init__(self, capacity: int = 256) -> None:
+    def __init__(self, capacity: int = 256, servo: str = "") -> None:
         if capacity < 1:
             raise InvalidInput(f"outbox capacity = {capacity!r} windows: must be at least 1")
-        self._capacity = capacity
+        self._capacity, self._servo = capacity, servo
         self._windows: dict[Key, Window] = {}
+        self._letters: dict[bytes, bytes] = {}
+        self._values: dict[str, bytes] = {}
         self._dropped: Counter[str] = Counter()
         self.recently_dropped: deque[Dropped] = deque(maxlen=1000)
 
@@ -63,24 +99,65 @@ class MemoryOutbox:
         return self._dropped
 
     def put(self, window: Window) -> list[Dropped]:
-        """Keep a window; returns what had to go to make room, oldest first."""
+        """Keep a window; return what was dropped to make room, oldest first."""
         self._windows[window.boot, window.sequence] = window
         excess = len(self._windows) - self._capacity
         drops = [Dropped(key, FULL) for key in list(self._windows)[: max(0, excess)]]
-        for drop in drops:
-            del self._windows[drop.key]
-            self._dropped[drop.reason] += 1
-        self.recently_dropped.extend(drops)
+        for each in drops:
+            self.drop(*each)
         return drops
 
     def get(self, key: Key) -> Window:
-        """The window; KeyError when it is not (or no longer) kept."""
+        """Return a window; KeyError when it is not (or no longer) kept."""
         return self._windows[key]
+
+    def parcel(self, key: Key) -> Parcel:
+        """Return a window as it is sent; KeyError when it is not (or no longer) kept."""
+        return Parcel(self._servo, *deflated(encode(self._windows[key])), *key)
 
     def remove(self, key: Key) -> bool:
         """Forget an acknowledged window; False when it was not there."""
         return self._windows.pop(key, None) is not None
 
+    def drop(self, key: Key, reason: str) -> None:
+        """Give a window up, for a reason that is counted."""
+        if self.remove(key):
+            self.count_dropped(reason)
+            self.recently_dropped.append(Dropped(key, reason))
+
+    def count_dropped(self, reason: str) -> None:
+        """Count a window that was given up before it was put here."""
+        self._dropped[reason] += 1
+
     def pending(self) -> list[Key]:
-        """Keys of everything kept, oldest first."""
+        """Keys of all windows, oldest first."""
         return list(self._windows)
+
+    def put_letter(self, body: bytes) -> None:
+        """Keep a letter; the same one twice is one."""
+        self._letters[letter_digest(body)] = body
+
+    def letters(self) -> list[bytes]:
+        """Digests of all letters, oldest first."""
+        return list(self._letters)
+
+    def letter(self, digest: bytes) -> Parcel:
+        """Return a letter as it is sent; KeyError when it is not kept."""
+        return Parcel(self._servo, self._letters[digest])
+
+    def remove_letter(self, digest: bytes) -> bool:
+        """Forget a letter; False when it was not there."""
+        return self._letters.pop(digest, None) is not None
+
+    def set_value(self, name: str, value: bytes) -> None:
+        """Keep some bytes under a name."""
+        self._values[name] = value
+
+    def value(self, name: str) -> bytes | None:
+        """Return the bytes kept under a name."""
+        return self._values.get(name)
+
+
+def letter_digest(body: bytes) -> bytes:
+    """Digest that identifies a letter."""
+    return blake2b(body, digest_size=16).digest()

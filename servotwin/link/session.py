@@ -1,63 +1,121 @@
-"""The edge's half of the session: windows repeated until they are acknowledged; no I/O, time comes in.
+"""The edge's half of the link without I/O: what to send when, and what follows from the twin's answer.
 
-Every window is sent at least once and repeated with growing pauses. The twin acknowledges a window after it has stored
-it under its unique (servo, boot, sequence), and a repeated one again, since the first acknowledgement may have been
-lost: so each window counts once, over any transport.
+Everything in the outbox is repeated until the twin acknowledges it. Letters go before windows, the oldest first. Time
+comes from outside. A transport that answers each message (`link.client.Sender`) reports the answer at once; one that
+does not (the simulated link) reports that a message was sent, and later the acknowledgement.
 """
 
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import inf
 
 from servotwin.link.outbox import Key, Outbox
-from servotwin.messages import Acknowledge, Window
-from servotwin.runtime.retry import Retry
+from servotwin.messages import Refusal
+from servotwin.runtime.retry import Backoff, Retry
+
+Item = Key | bytes
+"""A window's key, or a letter's digest."""
 
 
 @dataclass(slots=True)
 class _Attempt:
-    """When a window is due, and how long to wait after that."""
+    """A message that was tried: not again before `due`."""
 
     due: float
-    pause: float
+    backoff: Backoff
 
 
-class Sender:
-    """What to send, and when.
+class Session:
+    """Retries, acknowledgements and refusals of one servo's messages to its twin.
 
     Parameters
     ----------
     outbox : Outbox
-        What it already holds (after a restart) is due at once.
-    retry : Retry
+        What it already holds, after a restart, is due at once.
+    retry : Retry, optional
+        Pauses, for each message and for the link as a whole.
+    chance : callable, optional
+        Uniform in 0 .. 1, which spreads the pauses; 1 by default, so that nothing is random.
+
+    Attributes
+    ----------
+    counts : Counter
+        Messages delivered, tries that failed, refusals by reason.
+    trouble : str
+        Why nothing is delivered; empty: it is.
     """
 
-    def __init__(self, outbox: Outbox, retry: Retry | None = None) -> None:
-        self._outbox = outbox
-        self._retry = retry or Retry()
-        self._attempts: dict[Key, _Attempt] = {key: _Attempt(-inf, self._retry.first_s) for key in outbox.pending()}
+    def __init__(self, outbox: Outbox, retry: Retry | None = None, chance: Callable[[], float] = lambda: 1.0) -> None:
+        self.outbox = outbox
+        self.counts: Counter[str] = Counter()
+        self.trouble = ""
+        self._retry, self._chance = retry or Retry(), chance
+        self._backoff, self._not_before = Backoff(self._retry), -inf
+        self._attempts: dict[Item, _Attempt] = {}
 
     @property
     def next_time(self) -> float | None:
-        """When something is due next, s; None: everything is acknowledged or dropped."""
-        return min((attempt.due for attempt in self._attempts.values()), default=None)
+        """When something is due next, s; None: the outbox is empty."""
+        dues = [self._due_time(item) for item in self._items()]
+        return max(self._not_before, min(dues)) if dues else None
 
-    def offer(self, window: Window, now: float) -> None:
-        """Take charge of a window: it is due now."""
-        self._attempts[window.boot, window.sequence] = _Attempt(now, self._retry.first_s)
-        for drop in self._outbox.put(window):
-            self._attempts.pop(drop.key, None)
+    def pause_left(self, now: float) -> float:
+        """Time for which nothing is sent, s."""
+        return max(0.0, self._not_before - now)
 
-    def due(self, now: float) -> list[Window]:
-        """The windows to send now, oldest first; each counts as sent."""
-        keys = [key for key, attempt in self._attempts.items() if attempt.due <= now]
-        for key in keys:
-            attempt = self._attempts[key]
-            attempt.due = now + attempt.pause
-            attempt.pause = min(attempt.pause * self._retry.factor, self._retry.longest_s)
-        return [self._outbox.get(key) for key in keys]
+    def due(self, now: float) -> Iterator[Item]:
+        """Yield what is to be sent now, in order."""
+        if now >= self._not_before:
+            yield from (item for item in self._items() if self._due_time(item) <= now)
 
-    def acknowledged(self, message: Acknowledge) -> bool:
-        """The twin has a window; False when that was known."""
-        key = message.boot, message.sequence
-        self._attempts.pop(key, None)
-        return self._outbox.remove(key)
+    def retry_later(self, item: Item, now: float, after_s: float = 0.0) -> None:
+        """Let a message that was sent, or could not be read, be due again after its next pause, at least `after_s`."""
+        attempt = self._attempts.setdefault(item, _Attempt(now, Backoff(self._retry)))
+        attempt.due = now + max(after_s, attempt.backoff.failed(self._chance()))
+
+    def acknowledge(self, item: Item) -> bool:
+        """Remove a message that the twin has; False when it was not in the outbox."""
+        self._attempts.pop(item, None)
+        return self.outbox.remove_letter(item) if isinstance(item, bytes) else self.outbox.remove(item)
+
+    def delivered(self, item: Item) -> bool:
+        """Note that the twin has answered, and has the message; True when it was out of reach before."""
+        reconnected, self.trouble = bool(self.trouble), ""
+        self._backoff.succeeded()
+        self.counts["letters" if isinstance(item, bytes) else "windows"] += 1
+        self.acknowledge(item)
+        return reconnected
+
+    def refused(self, item: Item, now: float, reason: Refusal, detail: str, after_s: float) -> None:
+        """Drop and count what is never taken; retry later what is too early; else pause for all."""
+        self.counts[f"refused: {reason.value}"] += 1
+        if not reason.passing:
+            if isinstance(item, bytes):
+                self.outbox.remove_letter(item)
+            else:
+                self.outbox.drop(item, reason.value)
+        elif reason is Refusal.FUTURE:
+            self.retry_later(item, now, after_s)
+        else:
+            self._pause(now, "refused", detail, after_s)
+
+    def unreachable(self, now: float, detail: str) -> None:
+        """Pause for all messages."""
+        self._pause(now, "unreachable", detail, 0.0)
+
+    def _pause(self, now: float, count: str, trouble: str, after_s: float) -> None:
+        self.counts[count] += 1
+        self.trouble = trouble
+        self._not_before = now + max(after_s, self._backoff.failed(self._chance()))
+
+    def _items(self) -> list[Item]:
+        items: list[Item] = [*self.outbox.letters(), *self.outbox.pending()]
+        if self._attempts:
+            for dropped in self._attempts.keys() - set(items):
+                del self._attempts[dropped]
+        return items
+
+    def _due_time(self, item: Item) -> float:
+        attempt = self._attempts.get(item)
+        return -inf if attempt is None else attempt.due

@@ -1,8 +1,8 @@
 """An outbox on disk: windows and letters that outlive the process, and what else the link has to remember.
 
 The disk may be full, read-only or broken; the outbox goes on. What it knows is in memory first (an index, and the few
-rows that the disk still owes), and every change is written in one transaction before it counts as done; a change that
-cannot be written is owed and tried again. Every statement may be repeated, so that nothing depends on how far one got.
+rows that the disk does not have yet), and every change is written in one transaction before it counts as done; a change
+that cannot be written is tried again. Every statement may be repeated, so that nothing depends on how far one got.
 """
 
 from __future__ import annotations
@@ -12,14 +12,12 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import blake2b
 from pathlib import Path
 from threading import RLock
-from typing import Any
+from typing import Any, NamedTuple
 
 from servotwin.errors import InvalidInput
-from servotwin.link.eviction import Kept, excess, is_plain
-from servotwin.link.outbox import FULL, Dropped, Key
+from servotwin.link.outbox import FULL, Dropped, Key, letter_digest
 from servotwin.link.sqlite_file import (
     COUNT,
     DELETE,
@@ -33,19 +31,28 @@ from servotwin.link.sqlite_file import (
     put_aside,
     was_read_only,
 )
-from servotwin.link.transport import DEFLATE, Parcel, squeezed
+from servotwin.link.transport import DEFLATE, Parcel, deflated
 from servotwin.messages import Window, decode, encode
 
 BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
-MOST_OWED = 16_000_000
-"""Bytes of windows that are held in memory while the disk cannot be written."""
+MOST_UNWRITTEN = 16_000_000
+"""Bytes of windows kept in memory while the disk cannot be written."""
 MOST_LETTERS = 10_000
+UNINFORMATIVE = ("periodic",)
+"""Reasons, by their first word, of windows that are dropped first."""
 
 _DROPPED = "dropped: "
 
 
+class _Entry(NamedTuple):
+    """Window as the index knows it: its bytes, and whether its reason is one of `UNINFORMATIVE`."""
+
+    size: int
+    uninformative: bool
+
+
 class SqliteOutbox:
-    """Unacknowledged windows, letters not taken, and counts; to be used from any thread.
+    """Unacknowledged windows and letters, counts and values; for use from any thread.
 
     When it is full the oldest uninformative windows go first, then the oldest.
 
@@ -65,15 +72,15 @@ class SqliteOutbox:
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
         self._read_only = False
-        self._index: dict[Key, Kept] = {}
+        self._index: dict[Key, _Entry] = {}
         self._letters: dict[bytes, None] = {}
         self._counts: Counter[str] = Counter()
         self._notes: dict[str, bytes] = {}
-        self._held = False
-        self._owed: dict[tuple[Any, ...], Statement] = {}
+        self._in_transaction = False
+        self._unwritten: dict[tuple[Any, ...], Statement] = {}
         self.faults: Counter[str] = Counter()
         self.trouble = ""
-        self.settle()
+        self.flush()
 
     @property
     def dropped(self) -> Mapping[str, int]:
@@ -82,24 +89,24 @@ class SqliteOutbox:
         return {name.removeprefix(_DROPPED): number for name, number in counts if name.startswith(_DROPPED)}
 
     @property
-    def safe(self) -> bool:
-        """Whether everything is on the disk."""
+    def flushed(self) -> bool:
+        """Everything is on the disk."""
         with self._lock:
-            return not self._owed and self._connection is not None
+            return not self._unwritten and self._connection is not None
 
     def put(self, window: Window) -> list[Dropped]:
-        """Keep a window, on the disk when this returns unless `safe` is False; what had to go to make room."""
-        body, encoding = squeezed(encode(window))
+        """Keep a window, on the disk when this returns unless `flushed` is False; what had to go to make room."""
+        body, encoding = deflated(encode(window))
         key = window.boot, window.sequence
         with self._lock:
             if key in self._index:
                 return []
-            self._index[key] = Kept(len(body), is_plain(window.reason))
-            self._owed["window", key] = Statement(INSERT, (*key, window.reason, encoding, body))
-            drops = [Dropped(each, FULL) for each in excess(self._index, self._windows, self._size)]
+            self._index[key] = _Entry(len(body), _is_uninformative(window.reason))
+            self._unwritten["window", key] = Statement(INSERT, (*key, window.reason, encoding, body))
+            drops = [Dropped(each, FULL) for each in _excess(self._index, self._windows, self._size)]
             for drop in drops:
                 self._forget(drop.key, drop.reason)
-            self.settle()
+            self.flush()
             return drops
 
     def get(self, key: Key) -> Window:
@@ -114,11 +121,11 @@ class SqliteOutbox:
         with self._lock:
             if key not in self._index:
                 raise KeyError(key)
-            owed = self._owed.get(("window", key))
+            unwritten = self._unwritten.get(("window", key))
             row = self._read("SELECT encoding, body FROM windows WHERE boot = ? AND sequence = ?", key)
-            if owed is None and not row:
+            if unwritten is None and not row:
                 raise KeyError(key)
-            encoding, body = owed.values[3:] if owed is not None else row[0]
+            encoding, body = unwritten.values[3:] if unwritten is not None else row[0]
             return Parcel(self._servo, body, encoding, *key)
 
     def remove(self, key: Key) -> bool:
@@ -127,7 +134,7 @@ class SqliteOutbox:
             known = key in self._index
             if known:
                 self._forget(key)
-                self.settle()
+                self.flush()
             return known
 
     def drop(self, key: Key, reason: str) -> None:
@@ -135,29 +142,29 @@ class SqliteOutbox:
         with self._lock:
             if key in self._index:
                 self._forget(key, reason)
-                self.settle()
+                self.flush()
 
-    def lost(self, reason: str) -> None:
-        """Count a window that was given up before it came here."""
+    def count_dropped(self, reason: str) -> None:
+        """Count a window that was given up before it was put here."""
         with self._lock:
             self._count(_DROPPED + reason)
-            self.settle()
+            self.flush()
 
     def pending(self) -> list[Key]:
         """Keys of every window kept, oldest first."""
         with self._lock:
             return list(self._index)
 
-    def post(self, body: bytes) -> None:
+    def put_letter(self, body: bytes) -> None:
         """Keep a letter (an encoded message) until it is taken; the same one twice is one."""
-        digest = blake2b(body, digest_size=16).digest()
+        digest = letter_digest(body)
         with self._lock:
             self._letters[digest] = None
-            self._owed["letter", digest] = Statement(POST, (digest, body))
+            self._unwritten["letter", digest] = Statement(POST, (digest, body))
             if len(self._letters) > MOST_LETTERS:
                 self._count(_DROPPED + LETTERS)
-                self.taken(next(iter(self._letters)))
-            self.settle()
+                self.remove_letter(next(iter(self._letters)))
+            self.flush()
 
     def letters(self) -> list[bytes]:
         """Digests of the letters kept, oldest first."""
@@ -166,61 +173,63 @@ class SqliteOutbox:
     def letter(self, digest: bytes) -> Parcel:
         """A letter as it is sent; KeyError when it is not kept."""
         with self._lock:
-            owed = self._owed.get(("letter", digest)) if digest in self._letters else None
+            unwritten = self._unwritten.get(("letter", digest)) if digest in self._letters else None
             row = self._read("SELECT body FROM letters WHERE digest = ?", (digest,))
-            if digest not in self._letters or (owed is None and not row):
+            if digest not in self._letters or (unwritten is None and not row):
                 raise KeyError(digest)
-            return Parcel(self._servo, owed.values[1] if owed is not None else row[0][0])
+            return Parcel(self._servo, unwritten.values[1] if unwritten is not None else row[0][0])
 
-    def taken(self, digest: bytes) -> None:
-        """Forget a letter."""
+    def remove_letter(self, digest: bytes) -> bool:
+        """Forget a letter; False when it was not there."""
         with self._lock:
+            known = digest in self._letters
             self._letters.pop(digest, None)
-            self._owed["letter", digest] = Statement(TAKE, (digest,))
-            self.settle()
+            self._unwritten["letter", digest] = Statement(TAKE, (digest,))
+            self.flush()
+            return known
 
-    def recall(self, what: str) -> int:
-        """A number that was remembered; 0 at first."""
-        return self._counts[what]
+    def number(self, name: str) -> int:
+        """Return the number kept under a name; 0 at first."""
+        return self._counts[name]
 
-    def remember(self, what: str, number: int) -> None:
-        """Keep a number."""
+    def set_number(self, name: str, number: int) -> None:
+        """Keep a number under a name."""
         with self._lock:
-            self._counts[what] = number
-            self._owed["count", what] = Statement(COUNT, (what, number))
-            self.settle()
+            self._counts[name] = number
+            self._unwritten["count", name] = Statement(COUNT, (name, number))
+            self.flush()
 
-    def note(self, name: str, value: bytes) -> None:
-        """Keep some bytes."""
+    def set_value(self, name: str, value: bytes) -> None:
+        """Keep some bytes under a name."""
         with self._lock:
             self._notes[name] = value
-            self._owed["note", name] = Statement(NOTE, (name, value))
-            self.settle()
+            self._unwritten["note", name] = Statement(NOTE, (name, value))
+            self.flush()
 
-    def noted(self, name: str) -> bytes | None:
-        """Bytes that were kept under this name."""
+    def value(self, name: str) -> bytes | None:
+        """Return the bytes kept under a name."""
         return self._notes.get(name)
 
     @contextmanager
-    def together(self) -> Iterator[None]:
-        """Whatever is done inside is written as one, at the end."""
+    def transaction(self) -> Iterator[None]:
+        """Write whatever is changed inside as one, at the end."""
         with self._lock:
-            self._held = True
+            self._in_transaction = True
             try:
                 yield
             finally:
-                self._held = False
-                self.settle()
+                self._in_transaction = False
+                self.flush()
 
-    def settle(self) -> bool:
-        """Write what is owed; whether nothing is left. To be called now and then: it is how the outbox recovers."""
+    def flush(self) -> bool:
+        """Write what the disk does not have; False where some is left. Call it now and then: so the outbox recovers."""
         with self._lock:
             try:
-                if not self._held:
+                if not self._in_transaction:
                     self._write()
             except (sqlite3.Error, OSError) as error:
                 self._failed(error)
-            return self.safe
+            return self.flushed
 
     def close(self) -> None:
         """Let go of the file."""
@@ -236,22 +245,25 @@ class SqliteOutbox:
         if self._read_only:
             self.close()  # first: connections of one process to one file share what they know of it
             self._connection = connect(self._path, check=False)
-        if self._owed:
+        if self._unwritten:
             self._connection.execute("BEGIN IMMEDIATE")
-            for statement in self._owed.values():
+            for statement in self._unwritten.values():
                 self._connection.execute(statement.text, statement.values)
             self._connection.execute("COMMIT")
-            self._owed.clear()
+            self._unwritten.clear()
         self.trouble = ""
 
     def _load(self, connection: sqlite3.Connection) -> None:
-        """What the file holds, before what is owed to it."""
+        """What the file holds, before what is to be written to it."""
         windows = connection.execute("SELECT boot, sequence, reason, length(body) FROM windows ORDER BY place")
-        found = {(boot, number): Kept(size, is_plain(reason)) for boot, number, reason, size in windows}
+        found = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
-        self._index = {**{key: kept for key, kept in found.items() if ("window", key) not in self._owed}, **self._index}
-        self._letters = {**{each: None for each in letters if ("letter", each) not in self._owed}, **self._letters}
+        self._index = {
+            **{key: entry for key, entry in found.items() if ("window", key) not in self._unwritten},
+            **self._index,
+        }
+        self._letters = {**{each: None for each in letters if ("letter", each) not in self._unwritten}, **self._letters}
         self._counts = Counter(counts) | self._counts
         self._notes = dict(connection.execute("SELECT name, value FROM notes").fetchall()) | self._notes
 
@@ -265,11 +277,11 @@ class SqliteOutbox:
         self._read_only = was_read_only(error) and self._connection is not None
         if self._connection is not None and self._connection.in_transaction:
             self._rolled_back(self._connection)
-        held = [(key, owed) for key, owed in self._owed.items() if owed.text == INSERT]
-        size = sum(len(owed.values[4]) for _, owed in held)
-        while size > MOST_OWED:
-            key, owed = held.pop(0)
-            size -= len(owed.values[4])
+        windows = [(key, statement) for key, statement in self._unwritten.items() if statement.text == INSERT]
+        size = sum(len(statement.values[4]) for _, statement in windows)
+        while size > MOST_UNWRITTEN:
+            key, statement = windows.pop(0)
+            size -= len(statement.values[4])
             self._forget(key[1], UNWRITABLE)
 
     def _rolled_back(self, connection: sqlite3.Connection) -> None:
@@ -279,23 +291,23 @@ class SqliteOutbox:
             self.close()
 
     def _begin_anew(self) -> None:
-        """Put the broken file aside; what is not owed to it is lost, and counted."""
+        """Put the broken file aside; what is not in memory is lost, and counted."""
         self.close()
         self.faults[BROKEN] += 1
-        kept = {key for kind, key in self._owed if kind == "window"}
+        kept = {key for kind, key in self._unwritten if kind == "window"}
         for key in [key for key in self._index if key not in kept]:
             del self._index[key]
             self._count(_DROPPED + BROKEN)
-        self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._owed}
+        self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._unwritten}
         self._count(BROKEN)
-        self._owed |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
-        self._owed |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
+        self._unwritten |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
+        self._unwritten |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
         try:
             put_aside(self._path)
         except OSError as error:
             self.trouble = str(error)
             return
-        self.settle()
+        self.flush()
 
     def _read(self, text: str, values: tuple[Any, ...]) -> list[Any]:
         try:
@@ -306,10 +318,26 @@ class SqliteOutbox:
 
     def _forget(self, key: Key, reason: str | None = None) -> None:
         self._index.pop(key, None)
-        self._owed["window", key] = Statement(DELETE, key)
+        self._unwritten["window", key] = Statement(DELETE, key)
         if reason is not None:
             self._count(_DROPPED + reason)
 
     def _count(self, what: str) -> None:
         self._counts[what] += 1
-        self._owed["count", what] = Statement(COUNT, (what, self._counts[what]))
+        self._unwritten["count", what] = Statement(COUNT, (what, self._counts[what]))
+
+
+def _is_uninformative(reason: str) -> bool:
+    return reason.partition(" ")[0].rstrip(",:;") in UNINFORMATIVE
+
+
+def _excess(index: Mapping[Key, _Entry], windows: int, size: int) -> list[Key]:
+    """Keys to drop so that at most so many windows and bytes are left; `index` is in order of age."""
+    over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
+    dropped: list[Key] = []
+    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):
+        if over <= 0 and heavy <= 0:
+            break
+        dropped.append(key)
+        over, heavy = over - 1, heavy - entry.size
+    return dropped

@@ -11,8 +11,8 @@ from servotwin.messages import Refusal
 DEFLATE = "deflate"
 
 
-def squeezed(body: bytes) -> tuple[bytes, str]:
-    """The body and its encoding: deflated where that makes it smaller."""
+def deflated(body: bytes) -> tuple[bytes, str]:
+    """Deflate the body where that makes it smaller; return it and its encoding."""
     smaller = zlib.compress(body, 1)
     return (smaller, DEFLATE) if len(smaller) < len(body) else (body, "")
 

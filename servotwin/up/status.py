@@ -16,7 +16,7 @@ import msgspec
 
 from servotwin.drives.simulated.diary import MachineState, read_state
 from servotwin.drives.simulated.settings import MachineSettings
-from servotwin.edge_process.status import read_status
+from servotwin.edge_process.monitoring import read_status
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.up.folder import MACHINE

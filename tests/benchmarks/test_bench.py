@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from benchmarks import catalogue, command, machine, solver, taylor
+from benchmarks import catalogue, command, report, solver, taylor
 from benchmarks.contest import Check, Contestant, Workload
 from benchmarks.measure import race, turns
 from benchmarks.workloads import UNIT
@@ -231,13 +231,13 @@ def test_an_interrupt_leaves_no_file(tmp_path, monkeypatch):
 def test_the_machine_is_described_without_its_name(tmp_path):
     import platform
 
-    found = machine.machine()
+    found = report.machine()
     assert {"cpu", "cores", "system", "python", "numpy", "numba"} <= set(found)
     assert platform.node() not in map(str, found.values())
     listing = tmp_path / "cpuinfo"
     listing.write_text("processor : 0\nmodel name : A Processor\nmodel name : A Processor\n")
-    assert machine._cpu(listing) == "A Processor"
-    assert machine._cpu(tmp_path / "none")
+    assert report._cpu(listing) == "A Processor"
+    assert report._cpu(tmp_path / "none")
 
 
 @pytest.mark.parametrize(("ratio", "text"), [(0.3712, "0.371"), (42.86, "42.9"), (2310.4, "2,310")])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks import fits, hold, ours, solver, taylor
-from benchmarks.workloads import UNIT, Noisy, Sweep, Wear
+from benchmarks.workloads import UNIT, NoisyWorkload, SweepWorkload, WearWorkload
 from servotwin.estimation.paper.observer import observer
 
-WEAR = Wear(duration=4.0, period=2.0)
-SWEEP = Sweep(side=3, duration=1.0)
+WEAR = WearWorkload(duration=4.0, period=2.0)
+SWEEP = SweepWorkload(side=3, duration=1.0)
 
 
 def error(contestant, wanted):
@@ -20,7 +20,7 @@ def error(contestant, wanted):
 def test_servotwin_does_not_hang_on_its_search_for_events():
     assert error(ours.wearing(WEAR), ours.refined_wear(WEAR)) < 1e-11
     assert error(ours.sweeping(SWEEP, 2), ours.refined_sweep(SWEEP)) < 1e-11
-    noisy = Noisy(WEAR)
+    noisy = NoisyWorkload(WEAR)
     assert error(ours.noisy(noisy), ours.refined_noisy(noisy)) < 1e-9
 
 
@@ -36,7 +36,7 @@ def test_hold_converges_over_the_ensemble():
 
 
 def test_hold_misses_only_the_contacts_of_a_sampled_run():
-    noisy = Noisy(WEAR)
+    noisy = NoisyWorkload(WEAR)
     assert 0.0 < error(hold.noisy(noisy), ours.refined_noisy(noisy)) < 1e-3
 
 
@@ -46,7 +46,7 @@ def test_threads_change_nothing():
 
 
 def test_solver_agrees():
-    wear = Wear(duration=2.0, period=1.0)
+    wear = WearWorkload(duration=2.0, period=1.0)
     assert error(solver.wearing(wear), ours.refined_wear(wear)) < 1e-6
 
 
@@ -58,7 +58,7 @@ def test_heyoka_agrees():
 
 
 def test_predictors_are_the_observer():
-    case, model = fits.cases(Wear(duration=8.0, period=4.0))[2], observer(WEAR.servo, fits.ALPHA)
+    case, model = fits.cases(WearWorkload(duration=8.0, period=4.0))[2], observer(WEAR.servo, fits.ALPHA)
     theta_m, position = case.window.theta_m, case.window.position
     wanted = model.estimate(theta_m, position, case.window.sample_rate)
     # The package's observer starts one sample earlier.
@@ -68,7 +68,7 @@ def test_predictors_are_the_observer():
 
 
 def test_fits_find_the_gap():
-    wear = Wear(duration=8.0, period=4.0, final_gap=math.radians(20.0))
+    wear = WearWorkload(duration=8.0, period=4.0, final_gap=math.radians(20.0))
     contestants = fits.ours(wear), fits.scipy_fits(wear, "scipy", fits.with_loop), fits.ours(wear, "whitened")
     found = [contestant.prepare()() for contestant in contestants]
     paper, scipy, whitened = (fits.typical_error(wear, gaps) for gaps in found)
@@ -86,5 +86,5 @@ def test_wrong_answers_are_counted_and_refusals_are_not():
 
 def test_sensitive_members_are_left_out():
     assert ours.comparable(SWEEP).all()
-    long = Sweep(side=4, duration=20.0)
+    long = SweepWorkload(side=4, duration=20.0)
     assert 0.5 < np.mean(ours.comparable(long)) <= 1.0

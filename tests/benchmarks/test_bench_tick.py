@@ -10,7 +10,7 @@ from rich.console import Console
 
 from benchmarks import tick
 from benchmarks.tickloop import PacedDrive
-from servotwin.edge_process.ticks import BINS, Counts, summary
+from servotwin.edge_process.monitoring import BINS, TickHistogram, summarise
 
 
 def test_a_run_counts_every_instant_as_a_sample_or_as_missed() -> None:
@@ -33,7 +33,7 @@ def test_the_loop_imports_no_numbers_library() -> None:
 
 
 def test_the_document_holds_every_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    times = {name: summary(Counts().dumps(), 0.0) for name in ("wake", "answer", "whole")}
+    times = {name: summarise(TickHistogram().dumps(), 0.0) for name in ("wake", "answer", "whole")}
     fake = {"overruns": 0, "missed": 0, "windows": 1, "pack_s": 1e-3, "put_s": 1e-3, "load": 0.5, **times}
     monkeypatch.setattr(tick, "measured", lambda case, _: {"rate_hz": case[0], "realtime": case[2], **fake})
     tick.ticks("today", tmp_path / "tick.json", console=Console(quiet=True))
@@ -56,7 +56,7 @@ def test_a_missed_instant_is_a_missing_number(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_is_longer_than_the_bins_is_told_as_the_longest() -> None:
-    counts = Counts()
+    counts = TickHistogram()
     for _ in range(10):
         counts.add(2 * BINS * 1e-6)
-    assert summary(counts.dumps(), counts.longest)["median_us"] == pytest.approx(2 * BINS)
+    assert summarise(counts.dumps(), counts.longest)["median_us"] == pytest.approx(2 * BINS)

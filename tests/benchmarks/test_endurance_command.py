@@ -8,18 +8,18 @@ import pytest
 from rich.console import Console
 
 from benchmarks import alone, endurance, hostile
-from benchmarks.hostile import Outcome
-from benchmarks.hostiletwin import Kind
+from benchmarks.hostile import HostileOutcome
+from benchmarks.hostiletwin import TwinFault
 from servotwin.errors import InvalidInput
 from servotwin.messages import Cause, Reason
 
-WORST = {Kind.SILENT: 0.5, Kind.LIES_HIGH: 1.5, Kind.LIES_LOW: 0.25, Kind.REPLAYS: 0.75}
+WORST = {TwinFault.SILENT: 0.5, TwinFault.LIES_HIGH: 1.5, TwinFault.LIES_LOW: 0.25, TwinFault.REPLAYS: 0.75}
 
 
-def fake(seed: int, kind: Kind, rubs: bool) -> Outcome:
-    fallbacks = (Cause.SILENCE,) if kind is Kind.SILENT else ()
+def fake(seed: int, kind: TwinFault, friction: bool) -> HostileOutcome:
+    fallbacks = (Cause.SILENCE,) if kind is TwinFault.SILENT else ()
     refused = Counter({Reason.OLD_DATA: 2, Reason.EXPIRED: seed})
-    return Outcome(kind, hostile.case(seed, rubs), WORST[kind], 0.0, True, seed, fallbacks, refused)
+    return HostileOutcome(kind, hostile.case(seed, friction), WORST[kind], 0.0, True, seed, fallbacks, refused)
 
 
 def told(text: Console) -> str:
@@ -38,8 +38,8 @@ def test_every_kind_has_its_row_in_the_order_of_the_kinds(found) -> None:
     outcomes, text, _ = found
     assert [outcome.kind for outcome in outcomes] == [*hostile.KINDS, *hostile.KINDS, hostile.KINDS[0]]
     rows = {kind: next(line.split() for line in text.splitlines() if line.startswith(kind.value)) for kind in WORST}
-    assert rows[Kind.LIES_HIGH][-5:] == ["2", "1.50", "2", "6", "0"]
-    assert rows[Kind.SILENT][-5:] == ["2", "0.50", "0", "4", "2"]
+    assert rows[TwinFault.LIES_HIGH][-5:] == ["2", "1.50", "2", "6", "0"]
+    assert rows[TwinFault.SILENT][-5:] == ["2", "0.50", "0", "4", "2"]
     rubbing = next(line.split() for line in text.splitlines() if line.startswith(endurance.FRICTION))
     assert rubbing[-5:] == ["1", "0.50", "0", "0", "1"]
     assert "6 of 8 machines as stated stay within 0.12" in text

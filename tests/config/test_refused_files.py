@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from selfsigned import self_made
 
-from servotwin.edge_process.checks import check
 from servotwin.edge_process.config_file import load
+from servotwin.edge_process.startup import check
 from servotwin.errors import InvalidInput
 
 MODELS = '[models.a]\nservo = "paper"\n[models.a.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "a"\n'
@@ -162,6 +162,6 @@ def test_a_broker_without_its_library_is_refused(tmp_path: Path, monkeypatch: py
     (tmp_path / "token").chmod(0o600)
     (tmp_path / "edge.toml").write_text(f'{EDGE}[twin]\nurl = "mqtt://h"\n{TOKEN}')
     check(load(tmp_path / "edge.toml"))
-    monkeypatch.setattr("servotwin.edge_process.checks.find_spec", lambda _name: None)
-    with pytest.raises(InvalidInput, match=r"needs paho-mqtt: pip install 'servotwin\[mqtt\]'"):
+    monkeypatch.setattr("servotwin.runtime.extras.find_spec", lambda _name: None)
+    with pytest.raises(InvalidInput, match=r"needs paho-mqtt, .*pip install 'servotwin\[mqtt\]'"):
         check(load(tmp_path / "edge.toml"))

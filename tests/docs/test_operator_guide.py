@@ -56,7 +56,7 @@ def rows(title: str) -> Iterator[list[str]]:
 
 
 def named(title: str) -> list[str]:
-    """What the first cells name."""
+    """Names in the first cells."""
     return [name for cells in rows(title) for name in NAME.findall(cells[0])]
 
 
@@ -149,26 +149,26 @@ def test_every_line_of_the_twin_s_log_is_explained() -> None:
 
 
 def test_every_line_of_an_edge_s_log_is_explained() -> None:
-    said = calls("edge_process", "say") - {"trouble"}
-    places = calls("edge_process", "look", "troubles.look")
+    said = calls("edge_process", "log") - {"trouble"}
+    places = calls("edge_process", ".update", "troubles.update")
     explained = [cells[0] for cells in rows("Log of an edge")]
     assert {f"`trouble` where `{place}`" for place in places} == {each for each in explained if "where" in each}
     assert {each.strip("`") for each in explained if "where" not in each} == said
 
 
 def test_every_reason_for_which_a_window_is_dropped_is_explained() -> None:
-    reasons = (outlet.WITHHELD, outlet.NOT_FINITE, outbox.FULL, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE,
+    reasons = (outlet.FILTERED, outlet.NOT_FINITE, outbox.FULL, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE,
                sqlite_outbox.LETTERS, pipe_outlet.BEHIND)  # fmt: skip
     assert sorted(named("Windows that are dropped")) == sorted(reasons)
 
 
 def test_every_field_of_an_edge_s_status_is_explained() -> None:
-    fields = set().union(*(keys("edge_process", name) for name in ("_status", "_told", "_gains", "summary")))
+    fields = set().union(*(keys("edge_process", name) for name in ("_status", "_gains", "summarise")))
     fields |= counted("edge_process", "self.counts", "edge.counts", ".counts") | counted("link", "self.counts")
     text = section("Status of an edge")
     assert fields - set(NAME.findall(text)) == set()
     faults = counted("edge_process", "self.faults", "self._faults")
-    faults |= {sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE, "window not judged"}
+    faults |= {sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE, outlet.UNFILTERED}
     assert faults - set(NAME.findall(text)) == set()
 
 

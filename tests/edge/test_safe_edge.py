@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import hostile
-from benchmarks.hostiletwin import HONEST, HostileTwin, Kind
+from benchmarks.hostiletwin import HONEST, HostileTwin, TwinFault
 from servotwin.control.controller import Controller
 from servotwin.cosim import Cosimulation, simulation_of
 from servotwin.messages import Cause, Gains, Reason
@@ -60,7 +60,7 @@ def test_a_swap_does_not_move_the_voltage_on_identical_inputs(rate: float | None
 
 def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -> None:
     for seed in range(500, 510):
-        assert hostile.endured(seed, Kind.NONE, QUICK).worst < 1.0
+        assert hostile.endured(seed, TwinFault.NONE, QUICK).worst < 1.0
 
 
 def test_a_lie_about_the_gap_alone_cannot_leave_the_band() -> None:
@@ -73,34 +73,36 @@ def test_a_lie_about_the_gap_alone_cannot_leave_the_band() -> None:
 
 
 @pytest.mark.parametrize("kind", hostile.KINDS)
-def test_the_loop_stays_in_the_certified_band(kind: Kind) -> None:
+def test_the_loop_stays_in_the_certified_band(kind: TwinFault) -> None:
     outcome = hostile.endured(20, kind, QUICK)
     assert outcome.worst <= 1.0
     assert outcome.outside == 0.0
 
 
 def test_silence_ends_in_the_fallback_set() -> None:
-    outcome = hostile.endured(21, Kind.SILENT, QUICK)
+    outcome = hostile.endured(21, TwinFault.SILENT, QUICK)
     assert outcome.fallbacks == (Cause.SILENCE,)
     assert 1 <= outcome.applied <= HONEST
 
 
 def test_old_updates_are_refused_however_they_are_numbered() -> None:
-    outcome = hostile.endured(24, Kind.REPLAYS, QUICK)
+    outcome = hostile.endured(24, TwinFault.REPLAYS, QUICK)
     assert outcome.refused[Reason.OLD_DATA] > 0
     assert outcome.refused[Reason.OLD_VERSION] > 0
 
 
 def test_what_leaves_the_band_is_brought_back() -> None:
     """Settings that nobody certified, in bounds and a little beyond: every loop recovers."""
-    outcomes = [hostile.endured(seed, Kind.WANTON, QUICK) for seed in (33, 36)]
+    outcomes = [hostile.endured(seed, TwinFault.WANTON, QUICK) for seed in (33, 36)]
     assert all(outcome.recovered for outcome in outcomes)
     assert any(Cause.ERROR in outcome.fallbacks for outcome in outcomes)
     assert sum(outcome.refused[Reason.GAINS_OUT_OF_BOUNDS] for outcome in outcomes) > 0
     assert max(outcome.worst for outcome in outcomes) < 4.0
 
 
-def cosimulated(kind: Kind, gap: float, machine: hostile.Case) -> tuple[Cosimulation, Simulation, HostileTwin]:
+def cosimulated(
+    kind: TwinFault, gap: float, machine: hostile.HostileMachine
+) -> tuple[Cosimulation, Simulation, HostileTwin]:
     """The first 30 s."""
     scenario = hostile.scenario(machine, 3, QUICK).replace(duration=30.0)
     twin = HostileTwin.of(kind, scenario, gap, random.Random(3))
@@ -114,16 +116,16 @@ def cosimulated(kind: Kind, gap: float, machine: hostile.Case) -> tuple[Cosimula
 def test_equal_seeds_give_equal_bytes() -> None:
     digests = set()
     for _ in range(2):
-        loop, plant, _twin = cosimulated(Kind.WANTON, 0.1, hostile.case(3))
+        loop, plant, _twin = cosimulated(TwinFault.WANTON, 0.1, hostile.case(3))
         digests.add(loop.loop(plant.run()).digest())
     assert len(digests) == 1
 
 
 def test_the_machine_runs_on_what_the_edge_put_in_force() -> None:
     machine = replace(hostile.case(3), input_bias=0.03, friction=0.0)
-    loop, plant, twin = cosimulated(Kind.LIES_LOW, 0.3, machine)
+    loop, plant, twin = cosimulated(TwinFault.LIES_LOW, 0.3, machine)
     assert loop.agent.parameters.version > 0
     assert isinstance(loop.agent.parameters.setting.gains, Gains)
     assert plant.controller == loop.agent.controller
-    assert plant.controller.feedforward == twin.said[-1].setting.gains.feedforward
+    assert plant.controller.feedforward == twin.sent[-1].setting.gains.feedforward
     assert plant.controller.feedforward == pytest.approx(-0.03, abs=2e-3)

@@ -22,7 +22,7 @@ from servotwin.control import Controller, start, tick
 from servotwin.edge.agent import Agent
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.simulated import LinkSettings, SimulatedLink
-from servotwin.messages import Acknowledge, Update, decode, encode, unpack_channel
+from servotwin.messages import Acknowledge, Setting, Update, decode, encode, unpack_channel
 
 controller = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=100.0)
 clock, agent, at_twin = VirtualClock(), Agent(AgentSettings("axis-1", "b0", 100.0)), []

@@ -51,7 +51,7 @@ def windows_of(folder: Path) -> list[Window]:
     """What waits in the outbox, in order."""
     outbox = SqliteOutbox(folder / "outbox.sqlite", "axis")
     try:
-        outbox.settle()
+        outbox.flush()
         return [outbox.get(key) for key in outbox.pending()]
     finally:
         outbox.close()

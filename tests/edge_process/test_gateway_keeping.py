@@ -1,4 +1,4 @@
-"""The link process without a process: keeper, boots, counts, troubles."""
+"""The link process without a process: handler, boots, counts, troubles."""
 
 import math
 from collections.abc import Iterator
@@ -14,51 +14,49 @@ from hypothesis import strategies as st
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import FileParameterStore, StoredParameters
 from servotwin.edge_process import frames
-from servotwin.edge_process.boots import next_boot
-from servotwin.edge_process.keeping import Keeper
-from servotwin.edge_process.log import Troubles
-from servotwin.edge_process.run import first_parameters
-from servotwin.edge_process.ticks import Counts, summary
+from servotwin.edge_process.frame_handler import FrameHandler
+from servotwin.edge_process.monitoring import TickHistogram, TroubleLog, summarise
+from servotwin.edge_process.startup import next_boot, stored_parameters
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Setting
 
 
 @pytest.fixture
-def keeper(tmp_path: Path) -> Iterator[Keeper]:
+def handler(tmp_path: Path) -> Iterator[FrameHandler]:
     outbox = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1")
-    yield Keeper(replace(CONFIG, folder=tmp_path), outbox)
+    yield FrameHandler(replace(CONFIG, folder=tmp_path), outbox)
     outbox.close()
 
 
-def test_a_cut_that_comes_again_is_kept_and_counted_once(keeper: Keeper, tmp_path: Path) -> None:
+def test_a_cut_that_comes_again_is_kept_and_counted_once(handler: FrameHandler, tmp_path: Path) -> None:
     bad = cut(1)
     bad.signals["position"][3] = math.nan
     for serial, each in enumerate([cut(0), bad, cut(0), bad, cut(2)], 1):
-        assert keeper.take(frames.framed(each, "b1", serial)) == [serial]
-    outbox = keeper._outbox
+        assert handler.handle(frames.window_frame(each, "b1", serial)) == [serial]
+    outbox = handler._outbox
     assert outbox.pending() == [("b1", 0), ("b1", 2)]
     assert outbox.dropped == {"sample not finite": 1}
     assert outbox.get(("b1", 0)).boot == "b1"
 
 
-def test_proved_parameters_are_written_or_tried_again(keeper: Keeper, tmp_path: Path) -> None:
+def test_proved_parameters_are_written_or_tried_again(handler: FrameHandler, tmp_path: Path) -> None:
     store = FileParameterStore(tmp_path / "parameters.json")
     (tmp_path / "parameters.json.new").mkdir()
-    assert keeper.take(frames.SaveFrame(1, StoredParameters.of(Parameters(1, Setting(1e-4))))) == []
-    assert keeper.take(frames.SaveFrame(2, StoredParameters.of(Parameters(2, Setting(2e-4))))) == [1]
-    assert keeper.faults["parameters not written"] == 2
+    assert handler.handle(frames.SaveFrame(1, StoredParameters.of(Parameters(1, Setting(1e-4))))) == []
+    assert handler.handle(frames.SaveFrame(2, StoredParameters.of(Parameters(2, Setting(2e-4))))) == [1]
+    assert handler.faults["parameters not written"] == 2
     (tmp_path / "parameters.json.new").rmdir()
-    assert keeper.tend() == [2]
-    assert keeper.tend() == []
+    assert handler.retry() == [2]
+    assert handler.retry() == []
     found = store.load()
     assert found is not None
     assert found.version == 2
 
 
-def test_the_cursor_only_rises(keeper: Keeper) -> None:
+def test_the_cursor_only_rises(handler: FrameHandler) -> None:
     for serial in (3, 7, 5):
-        keeper.take(frames.HandledFrame(serial))
-    assert keeper._outbox.recall("cursor") == 7
+        handler.handle(frames.ProcessedFrame(serial))
+    assert handler._outbox.number("cursor") == 7
 
 
 def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
@@ -71,22 +69,22 @@ def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> 
 
 def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:
     file = tmp_path / "parameters.json"
-    assert first_parameters(file) is None
+    assert stored_parameters(file) is None
     FileParameterStore(file).save(Parameters(4, Setting(1e-4)))
-    found = first_parameters(file)
+    found = stored_parameters(file)
     assert found is not None
     assert found.version == 4
     file.write_text("rubbish")
-    assert first_parameters(file) is None
+    assert stored_parameters(file) is None
     assert (tmp_path / "parameters.json.broken").read_text() == "rubbish"
 
 
 @given(st.lists(st.floats(0.0, 2e-3), min_size=1, max_size=300))
 def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float]) -> None:
-    counts = Counts()
+    counts = TickHistogram()
     for each in durations:
         counts.add(each)
-    found = summary(counts.dumps(), counts.longest)
+    found = summarise(counts.dumps(), counts.longest)
     ordered = sorted(durations)
     for name, share in (("median_us", 0.5), ("p99_us", 0.99)):
         exact = ordered[max(0, math.ceil(share * len(ordered)) - 1)] * 1e6
@@ -96,10 +94,10 @@ def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float
 
 
 def test_a_trouble_is_told_when_it_comes_when_it_is_another_one_and_when_it_is_over(capfd: pytest.CaptureFixture[str]):
-    troubles = Troubles()
+    troubles = TroubleLog()
     for why in ("", "", "refused", "refused", "away", "", ""):
-        troubles.look("to the twin", why)
-    troubles.look("disk", "")
+        troubles.update("to the twin", why)
+    troubles.update("disk", "")
     told = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
     assert [(line["event"], line["where"], line.get("why")) for line in told] == [
         ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)

@@ -15,15 +15,17 @@ from servotwin.control.gains import gains_of
 from servotwin.edge.cut import Cut
 from servotwin.edge.drive import DriveLost
 from servotwin.edge.limits import Limits
+from servotwin.edge.outlet import UNFILTERED
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge_process import frames, keeping, log
+from servotwin.edge_process import frame_handler, frames, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
-from servotwin.edge_process.keeping import UNJUDGED, Keeper
+from servotwin.edge_process.frame_handler import FrameHandler
+from servotwin.edge_process.monitoring import TickHistogram
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.run import Stop, go_on, permitted
-from servotwin.edge_process.ticks import Counts
+from servotwin.edge_process.run import StopSignal, run_role
+from servotwin.edge_process.startup import permitted
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Setting
 
@@ -32,9 +34,25 @@ SETTINGS = AgentSettings("axis-1", UNBOOTED, 100.0, 0.1, limits=Limits(maximum=1
 CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
 
 
-def cut(sequence: int, position: float = 1e-3) -> frames.CutFrame:
+class FailingFilter:
+    longest_pause_s = math.inf
+
+    def check(self, sample_rate: float) -> None:
+        """Any rate will do."""
+
+    def start(self, _saved: bytes | None = None) -> "FailingFilter":
+        return self
+
+    def __call__(self, _cut: Cut) -> Cut | None:
+        raise ZeroDivisionError
+
+    def dumps(self) -> bytes:
+        return b""
+
+
+def cut(sequence: int, position: float = 1e-3) -> frames.WindowFrame:
     signals = {name: array("d", [0.0, position]) for name in CHANNELS}
-    return frames.framed(Cut(7, sequence, "reference", 3, 0.0, signals), "b1", 10 + sequence)
+    return frames.window_frame(Cut(7, sequence, "reference", 3, 0.0, signals), "b1", 10 + sequence)
 
 
 @pytest.fixture
@@ -46,60 +64,58 @@ def outbox(tmp_path: Path) -> Iterator[SqliteOutbox]:
 
 
 @pytest.fixture
-def keeper(outbox: SqliteOutbox, tmp_path: Path) -> Keeper:
-    return Keeper(replace(CONFIG, folder=tmp_path), outbox)
+def handler(outbox: SqliteOutbox, tmp_path: Path) -> FrameHandler:
+    return FrameHandler(replace(CONFIG, folder=tmp_path), outbox)
 
 
-def test_what_is_not_on_the_disk_stays_with_the_control_process_too(keeper: Keeper, tmp_path: Path) -> None:
-    assert keeper.take(cut(0)) == []
-    assert keeper.take(frames.LetterFrame(20, b"letter")) == []
-    assert keeper.tend() == []
+def test_what_is_not_on_the_disk_stays_with_the_control_process_too(handler: FrameHandler, tmp_path: Path) -> None:
+    assert handler.handle(cut(0)) == []
+    assert handler.handle(frames.LetterFrame(20, b"letter")) == []
+    assert handler.retry() == []
     (tmp_path / "disk").mkdir()
-    assert keeper.tend() == [10, 20]
-    assert keeper.take(cut(1)) == [11]
+    assert handler.retry() == [10, 20]
+    assert handler.handle(cut(1)) == [11]
 
 
-def test_what_the_twin_has_need_not_be_on_the_disk(keeper: Keeper, outbox: SqliteOutbox) -> None:
-    keeper.take(cut(0))
-    keeper.take(cut(1))
+def test_what_the_twin_has_need_not_be_on_the_disk(handler: FrameHandler, outbox: SqliteOutbox) -> None:
+    handler.handle(cut(0))
+    handler.handle(cut(1))
     outbox.remove(("b1", 0))
-    assert keeper.tend() == [10]
+    assert handler.retry() == [10]
 
 
-def test_what_waits_for_the_disk_is_bounded(keeper: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeping, "MOST_OWED", 3 * 64)
-    assert [keeper.take(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
+def test_what_waits_for_the_disk_is_bounded(handler: FrameHandler, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_handler, "MOST_UNWRITTEN", 3 * 64)
+    assert [handler.handle(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
 
 
 def test_a_window_that_cannot_be_judged_is_sent(
-    keeper: Keeper, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+    handler: FrameHandler, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def judge(_: Cut) -> Cut:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(keeper, "_judge", lambda _: judge)
-    keeper.take(cut(0))
+    monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
+    handler.handle(cut(0))
     assert outbox.pending() == [("b1", 0)]
-    assert keeper.faults == {UNJUDGED: 1}
+    assert handler.faults == {UNFILTERED: 1}
 
 
 def test_a_window_with_a_bad_sample_is_not_news(
-    keeper: Keeper, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+    handler: FrameHandler, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keeper, "_judge", lambda _: pytest.fail)
-    keeper.take(cut(0, math.nan))
+    monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
+    handler.handle(cut(0, math.nan))
     assert outbox.pending() == []
     assert outbox.dropped == {"sample not finite": 1}
+    assert not handler.faults
 
 
 def test_an_edge_hears_that_nothing_is_owed_any_more() -> None:
     """A window that was delivered before its link process died: the next one only says that it is done."""
     box = PipeOutlet(True)
     box.offer(cut(0).cut, 0.0)
-    assert box.waiting
-    heard = box._hear([frames.encode(frames.DoneFrame(1))])
-    assert heard.standing
-    assert not box.waiting
+    assert box.unacknowledged
+    heard = box._receive([frames.encode(frames.AckFrame(1))])
+    assert heard.pending_changed
+    assert not box.unacknowledged
 
 
 def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +123,7 @@ def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPat
     with os.fdopen(reader, "rb") as out, os.fdopen(writer, "w", encoding="utf-8") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
         for k in range(2000):
-            log.say("event", number=k)
+            monitoring.log("event", number=k)
         os.set_blocking(out.fileno(), False)
         assert out.read().startswith(b'{"time":')
         monkeypatch.undo()
@@ -116,10 +132,10 @@ def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPat
 def test_without_a_standard_error_nothing_is_said(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    log.say("heard")
+    monitoring.log("heard")
     with monkeypatch.context() as context:
         context.setattr(sys, "stderr", None)
-        log.say("unheard")
+        monitoring.log("unheard")
     out, said = capfd.readouterr()
     assert out == ""
     assert "heard" in said
@@ -147,7 +163,7 @@ class Failing:
 def test_whatever_ends_the_loop_the_drive_gets_the_safe_voltage(error: Exception, stopped: int) -> None:
     role = Failing(error)
     with pytest.raises(type(error), match=str(error)):
-        go_on(Stop(), role)
+        run_role(StopSignal(), role)
     assert role.stopped == stopped
 
 
@@ -156,7 +172,7 @@ def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
     good = Parameters(3, Setting(1e-3, gains))
     assert permitted(good, SETTINGS) is good
     assert permitted(None, SETTINGS) is None
-    assert permitted(replace(good, tolerance=1.1e-3), SETTINGS) is None
+    assert permitted(replace(good, setting=Setting(1.1e-3)), SETTINGS) is None
     assert permitted(good, replace(SETTINGS, limits=Limits(maximum=1e-4))) is None
     assert permitted(good, replace(SETTINGS, controller=None)) is None
     assert permitted(good, replace(SETTINGS, controller=LAW.replace(Kp=20.0))) is None
@@ -165,7 +181,7 @@ def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
 
 
 def test_ticks_are_counted_for_years() -> None:
-    counts = Counts()
+    counts = TickHistogram()
     counts.bins[30] = 2**40
     counts.add(30.5e-6)
     assert counts.bins[30] == 2**40 + 1

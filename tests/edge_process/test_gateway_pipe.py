@@ -25,8 +25,8 @@ def far() -> Iterator[Far]:
 
 
 def test_a_cut_crosses_as_it_is() -> None:
-    frame = frames.to_link(frames.encode(frames.framed(cut(), "b0", 5)))
-    assert isinstance(frame, frames.CutFrame)
+    frame = frames.to_link(frames.encode(frames.window_frame(cut(), "b0", 5)))
+    assert isinstance(frame, frames.WindowFrame)
     assert (frame.cut, frame.boot, frame.serial) == (cut(), "b0", 5)
     with pytest.raises(InvalidMessage):
         frames.to_link(b"rubbish")
@@ -38,27 +38,27 @@ def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Fa
     box = PipeOutlet(True)
     box.boot = "b0"
     box.offer(cut(0), 0.0)
-    assert box.waiting
+    assert box.unacknowledged
     box.connect(far.near)
-    box.say(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
+    box.send_letter(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
     box.save(Parameters(3, Setting(1e-4)))
     pumped(box)
-    assert [type(frame).__name__ for frame in far.heard()] == ["CutFrame", "LetterFrame", "SaveFrame"]
-    far.say(frames.StandingFrame(1, {"outbox full": 2}), frames.DoneFrame(1), frames.DoneFrame(2))
+    assert [type(frame).__name__ for frame in far.heard()] == ["WindowFrame", "LetterFrame", "SaveFrame"]
+    far.say(frames.PendingFrame(1, {"outbox full": 2}), frames.AckFrame(1), frames.AckFrame(2))
     heard = box.exchange()
     assert heard is not None
-    assert heard.standing
-    assert box.waiting
+    assert heard.pending_changed
+    assert box.unacknowledged
     assert box.dropped == {"outbox full": 2}
     again = Far()
     box.connect(again.near)
     pumped(box)
     assert [type(frame).__name__ for frame in again.heard()] == ["SaveFrame"]
-    assert not box.settled
-    again.say(frames.DoneFrame(3), frames.StandingFrame(0, {}))
+    assert not box.idle
+    again.say(frames.AckFrame(3), frames.PendingFrame(0, {}))
     pumped(box)
-    assert box.settled
-    assert not box.waiting
+    assert box.idle
+    assert not box.unacknowledged
     again.close()
 
 
@@ -66,13 +66,18 @@ def test_the_twins_messages_count_once_whoever_repeats_them(far: Far) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     body = encode(Acknowledge("axis-1", "b0", 0))
-    far.say(frames.HeardFrame(4, body), frames.HeardFrame(0, body), frames.HeardFrame(4, body), frames.BackFrame())
+    far.say(
+        frames.MessageFrame(4, body),
+        frames.MessageFrame(0, body),
+        frames.MessageFrame(4, body),
+        frames.ReconnectedFrame(),
+    )
     heard = box.exchange()
     assert heard is not None
     assert len(heard.messages) == 2
-    assert heard.back
+    assert heard.reconnected
     pumped(box)
-    assert far.heard() == [frames.HandledFrame(4), frames.HandledFrame(4)]
+    assert far.heard() == [frames.ProcessedFrame(4), frames.ProcessedFrame(4)]
 
 
 def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
@@ -83,14 +88,14 @@ def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
     box.connect(far.near)
     for k in range(20):
         box.offer(cut(k, 500), 0.0)
-    assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.framed(cut(0, 500), "", 1)))
+    assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.window_frame(cut(0, 500), "", 1)))
     assert not box.connected
 
 
 def test_without_a_twin_nobody_owes_an_answer() -> None:
     box = PipeOutlet(False)
     box.offer(cut(), 0.0)
-    assert not box.waiting
+    assert not box.unacknowledged
 
 
 def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:

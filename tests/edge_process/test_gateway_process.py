@@ -23,9 +23,9 @@ from servotwin.edge.limits import Limits
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
-from servotwin.edge_process.status import read_status
+from servotwin.edge_process.monitoring import read_status
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Hello, Receipt, Refusal, Update, Window
+from servotwin.messages import Hello, Receipt, Refusal, Setting, Update, Window
 from servotwin.runtime.retry import Retry
 
 RATE = 500.0
@@ -84,7 +84,7 @@ class Gateway:
 
     def outbox(self) -> list[tuple[str, int]]:
         box = SqliteOutbox(self.folder / "outbox.sqlite", "axis-1")
-        box.settle()
+        box.flush()
         keys = box.pending()
         box.close()
         return keys
@@ -207,7 +207,7 @@ def test_a_terminal_that_is_closed_leaves_the_safe_voltage(gateway: Gateway, mac
 
 def update(window: Window, version: int) -> Update:
     known = (None, None, (None, None))
-    identity, values = (window.boot, window.sequence), (1e-5 * version, window.start + 1000.0)
+    identity, values = (window.boot, window.sequence), (Setting(1e-5 * version), window.start + 1000.0)
     return Update("axis-1", version, version - 1, identity, window.start, *known, "OK", *values)
 
 

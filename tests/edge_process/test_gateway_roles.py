@@ -15,11 +15,11 @@ from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
 from servotwin.edge_process.config import EdgeConfig
-from servotwin.edge_process.control import Controlling, Law
-from servotwin.edge_process.edge import Edge
+from servotwin.edge_process.control import ControlRole, GuardedLaw
+from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.outlet import BEHIND, PipeOutlet
-from servotwin.edge_process.run import Stop, until
-from servotwin.edge_process.supervise import Supervising
+from servotwin.edge_process.run import StopSignal, until
+from servotwin.edge_process.supervise import SupervisingRole
 from servotwin.errors import InvalidInput
 from servotwin.messages import (
     Answer,
@@ -50,7 +50,7 @@ def test_the_law_never_gives_what_is_no_number_and_forgets_it(
     samples: list[tuple[float, float]], limited: bool
 ) -> None:
     controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
-    guarded = Law(controller.law(1e-5), 2, 0.0)
+    guarded = GuardedLaw(controller.law(1e-5), 2, 0.0)
     for reference, position in samples:
         assert math.isfinite(guarded.tick(reference, position))
     for _ in range(4):
@@ -60,7 +60,7 @@ def test_the_law_never_gives_what_is_no_number_and_forgets_it(
 
 def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
     law = LAW.replace(Ki=500.0).law()
-    guarded, plain = Law(law, 2, 0.5), start(0.0)
+    guarded, plain = GuardedLaw(law, 2, 0.5), start(0.0)
     for k in range(5):
         plain = tick(law, plain, 1e-3, 1e-4 * k)
         assert guarded.tick(1e-3, 1e-4 * k) == plain.voltage
@@ -116,13 +116,13 @@ class Clock:
 
 
 class NoChild:
-    def tend(self, now: float) -> None:
+    def check(self, now: float) -> None:
         """No link process."""
 
 
-def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> Edge:
+def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> EdgeRuntime:
     clock = Clock()
-    return Edge(config, "b0", box, NoChild(), None, clock, clock.pause)
+    return EdgeRuntime(config, "b0", box, NoChild(), None, clock, clock.pause)
 
 
 def samples(first: int, count: int, reference: float = 1e-3) -> list[Sample]:
@@ -144,10 +144,10 @@ def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> No
     box.connect(far.near)
     edge = edge_of(box)
     drive = ScriptedDrive([*samples(0, 30)])
-    role = Controlling(edge, drive)
+    role = ControlRole(edge, drive)
     for _ in range(15):
         role.step()
-    far.say(frames.HeardFrame(1, encode(update(1, 5e-3 / 10))))
+    far.say(frames.MessageFrame(1, encode(update(1, 5e-3 / 10))))
     for _ in range(10):
         role.step()
     assert edge.agent.parameters.version == 1
@@ -163,10 +163,10 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
     box.connect(far.near)
     edge = edge_of(box)
     drive = ScriptedDrive([*samples(0, 15), *samples(1000, 15), *samples(0, 3)])
-    role = Controlling(edge, drive)
+    role = ControlRole(edge, drive)
     for _ in range(14):
         role.step()
-    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(10):
         role.step()
     assert (edge.agent.settings.boot, edge.agent.parameters.version) == ("b0.1", 1)
@@ -181,10 +181,10 @@ def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box)
-    role = Controlling(edge, ScriptedDrive([*samples(0, 15), *then]))
+    role = ControlRole(edge, ScriptedDrive([*samples(0, 15), *then]))
     for _ in range(14):
         role.step()
-    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
     role.step()
     assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 0.0))
     voltage = role.law.voltage
@@ -197,12 +197,12 @@ def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far
 def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
-    edge, stop = edge_of(box), Stop()
+    edge, stop = edge_of(box), StopSignal()
     drive = ScriptedDrive([*samples(0, 5), DriveLost("gone"), *samples(5, 5), None])
     roles = []
 
-    def role_of() -> Controlling:
-        roles.append(Controlling(edge, drive))
+    def role_of() -> ControlRole:
+        roles.append(ControlRole(edge, drive))
         return roles[-1]
 
     until(stop, edge, drive, role_of)
@@ -224,13 +224,13 @@ def test_a_drive_that_was_right_before_may_come_right_again() -> None:
             raise refused
 
     drive.connect = connect
-    until(Stop(), edge, drive, lambda: Controlling(edge, drive))
+    until(StopSignal(), edge, drive, lambda: ControlRole(edge, drive))
     assert (refusals, edge.counts["drive lost"], edge.agent.samples) == ([], 2, 10)
 
 
-@pytest.mark.parametrize("role", [Controlling, Supervising])
+@pytest.mark.parametrize("role", [ControlRole, SupervisingRole])
 def test_another_machine_under_the_due_number_begins_a_new_boot(role: type) -> None:
-    supervised = role is Supervising
+    supervised = role is SupervisingRole
     edge = edge_of(PipeOutlet(False), SUPERVISED if supervised else CONFIG)
     given = [block(0, 5), block(5, 5), block(10, 5)] if supervised else samples(0, 3)
     drive = ScriptedDrive(given)
@@ -249,7 +249,7 @@ def test_a_drive_of_another_rate_is_refused() -> None:
     drive = ScriptedDrive([])
     drive.rate = 99.0
     with pytest.raises(InvalidInput, match=r"sample_rate_hz = 100.0 Hz: the drive's rate is 99.0 Hz"):
-        until(Stop(), edge_of(PipeOutlet(False)), drive, lambda: Controlling(edge_of(PipeOutlet(False)), drive))
+        until(StopSignal(), edge_of(PipeOutlet(False)), drive, lambda: ControlRole(edge_of(PipeOutlet(False)), drive))
 
 
 def block(first: int, count: int, reference: float = 1e-3) -> Block:
@@ -259,13 +259,13 @@ def block(first: int, count: int, reference: float = 1e-3) -> Block:
 SUPERVISED = replace(CONFIG, role="supervise")
 
 
-def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, Edge, ScriptedDrive, Supervising]:
+def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, EdgeRuntime, ScriptedDrive, SupervisingRole]:
     """A connected edge that has supervised a first block."""
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box, SUPERVISED)
     drive = ScriptedDrive([block(5 * k, 5) for k in range(blocks)])
-    role = Supervising(edge, drive)
+    role = SupervisingRole(edge, drive)
     role.step()
     return box, edge, drive, role
 
@@ -273,11 +273,11 @@ def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, Edge, ScriptedDrive,
 def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
     box, _, drive, role = supervising(far, 12)
     assert [p.version for p in drive.voltages] == [0]
-    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
         role.step()
     assert [p.version for p in drive.voltages] == [0, 1]
-    far.say(frames.HeardFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
+    far.say(frames.MessageFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
     for _ in range(2):
         role.step()
     assert "move 0.0005" in drive.log
@@ -293,14 +293,14 @@ def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> Non
     """The agent runs on what the drive runs on, under a version of its own; the twin hears of it after the receipt."""
     box, edge, drive, role = supervising(far, 40)
     drive.refuse = True
-    far.say(frames.HeardFrame(1, encode(update(1, 1e-4))))
+    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
         role.step()
     drive.refuse = False
     for _ in range(3):
         role.step()
     in_force = edge.agent.parameters
-    assert (in_force.version, in_force.setting.tolerance) == (2, drive.voltages[0].tolerance)
+    assert (in_force.version, in_force.setting.tolerance) == (2, drive.voltages[0].setting.tolerance)
     assert [p.version for p in drive.voltages] == [0]
     pumped(box)
     receipt, fallback = letters(far, (Receipt, Fallback))
@@ -322,8 +322,10 @@ def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monke
         edge = edge_of(box, SUPERVISED)
         drive = ScriptedDrive([block(10 * k, 10, 1e-3 * k) for k in range(12)])
         drive.patient = patient
-        monkeypatch.setattr(edge, "pause", lambda _, box=box: [box._done(serial) for serial in list(box._kept)[:1]])
-        role = Supervising(edge, drive)
+        monkeypatch.setattr(
+            edge, "pause", lambda _, box=box: [box._acknowledge(serial) for serial in list(box._unacknowledged)[:1]]
+        )
+        role = SupervisingRole(edge, drive)
         for _ in range(12):
             role.step()
         dropped[patient] = box.dropped[BEHIND]
@@ -340,8 +342,8 @@ def test_the_end_waits_while_the_link_process_takes_what_is_left(monkeypatch: py
 
     def pause(seconds: float) -> None:
         clock.pause(200.0 * seconds)
-        if len(box._cuts) > 3:
-            box._done(min(box._cuts))
+        if len(box._windows) > 3:
+            box._acknowledge(min(box._windows))
 
     monkeypatch.setattr(edge, "pause", pause)
     edge.finish(3.0)
@@ -354,7 +356,7 @@ def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:
     edge = edge_of(box, SUPERVISED)
     drive = ScriptedDrive([block(0, 5), block(8, 5), block(13, 0), block(500, 5), None])
     drive.refuse = True
-    role = Supervising(edge, drive)
+    role = SupervisingRole(edge, drive)
     while role.step():
         pass
     assert edge.counts["parameters refused by the drive"] >= 1

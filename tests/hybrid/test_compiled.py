@@ -42,7 +42,7 @@ def test_every_helper_stands_above_its_callers() -> None:
         if not found.name.endswith(("__main__", "migrations.env")):  # both run when imported
             for value in vars(importlib.import_module(found.name)).values():
                 if hasattr(value, "stamp") and hasattr(value, "py_func"):
-                    assert stamp(value.py_func, value.options_told) == value.stamp, value
+                    assert stamp(value.py_func, value.options_key) == value.stamp, value
 
 
 def helper_plus_one(x: float) -> float:

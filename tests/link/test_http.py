@@ -12,7 +12,7 @@ from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
 from servotwin.link.http import HttpTransport
-from servotwin.link.transport import Parcel, Refused, Unreachable, squeezed
+from servotwin.link.transport import Parcel, Refused, Unreachable, deflated
 from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Window, checksum, encode, pack_channel
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
@@ -24,7 +24,7 @@ def window(sequence: int) -> Window:
 
 
 def parcel(sequence: int) -> Parcel:
-    return Parcel("axis-1", *squeezed(encode(window(sequence))), "b0", sequence)
+    return Parcel("axis-1", *deflated(encode(window(sequence))), "b0", sequence)
 
 
 LETTER = Parcel("axis-1", encode(HELLO))
@@ -192,9 +192,9 @@ def test_closing_wakes_whoever_listens(twin: FakeTwin) -> None:
 
 def test_deflate_is_used_where_it_helps() -> None:
     body = encode(window(0))
-    small, encoding = squeezed(body)
+    small, encoding = deflated(body)
     assert (encoding, zlib.decompress(small)) == ("deflate", body)
-    assert squeezed(b"abc") == (b"abc", "")
+    assert deflated(b"abc") == (b"abc", "")
 
 
 def test_over_tls_the_certificate_is_checked(twin: FakeTwin, certificate: Path) -> None:

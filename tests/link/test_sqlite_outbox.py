@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
-from servotwin.link.session import Sender
+from servotwin.link.session import Session
 from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
 from servotwin.messages import Window, checksum, pack_channel
@@ -52,12 +52,12 @@ def sequences(box: SqliteOutbox) -> list[int]:
 def test_what_was_put_is_there_after_a_restart(outbox: SqliteOutbox, path: Path) -> None:
     for k in range(3):
         assert outbox.put(window(k)) == []
-    assert outbox.safe
+    assert outbox.flushed
     assert outbox.remove(("b0", 1))
     assert not outbox.remove(("b0", 1))
-    outbox.post(b"letter")
-    outbox.post(b"letter")
-    outbox.remember("cursor", 7)
+    outbox.put_letter(b"letter")
+    outbox.put_letter(b"letter")
+    outbox.set_number("cursor", 7)
     fresh = again(outbox, path)
     assert sequences(fresh) == [0, 2]
     assert [fresh.get(key) for key in fresh.pending()] == [window(0), window(2)]
@@ -65,18 +65,21 @@ def test_what_was_put_is_there_after_a_restart(outbox: SqliteOutbox, path: Path)
         fresh.get(("b0", 1))
     (digest,) = fresh.letters()
     assert fresh.letter(digest).body == b"letter"
-    assert fresh.recall("cursor") == 7
-    fresh.taken(digest)
+    assert fresh.number("cursor") == 7
+    fresh.remove_letter(digest)
     last = again(fresh, path)
-    assert (last.letters(), last.recall("never")) == ([], 0)
+    assert (last.letters(), last.number("never")) == ([], 0)
     last.close()
 
 
 def test_it_serves_the_session(outbox: SqliteOutbox) -> None:
-    sender = Sender(outbox, Retry(1.0))
-    sender.offer(window(0), 0.0)
-    assert sender.due(0.0) == [window(0)]
-    assert sender.next_time == 1.0
+    session = Session(outbox, Retry(1.0))
+    outbox.put(window(0))
+    (key,) = session.due(0.0)
+    assert isinstance(key, tuple)
+    assert outbox.get(key) == window(0)
+    session.retry_later(key, 0.0)
+    assert session.next_time == 1.0
 
 
 def test_the_same_window_again_is_one(outbox: SqliteOutbox) -> None:
@@ -146,13 +149,13 @@ def test_kill_9_loses_nothing_that_was_put(path: Path) -> None:
 def test_a_full_disk_is_counted_and_survived(outbox: SqliteOutbox, path: Path) -> None:
     """A limit on the size of files stands for the disk; the database grows into it."""
     outbox.put(window(0))
-    outbox.remember("cursor", 3)
+    outbox.set_number("cursor", 3)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, before[1]))
     try:
         for k in range(1, 40):
             outbox.put(window(k, samples=5000))
-        assert not outbox.safe
+        assert not outbox.flushed
         assert outbox.faults[UNWRITABLE] > 0
         assert outbox.trouble
         assert sequences(outbox) == list(range(40))
@@ -160,12 +163,12 @@ def test_a_full_disk_is_counted_and_survived(outbox: SqliteOutbox, path: Path) -
         assert outbox.remove(("b0", 5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert outbox.settle()
-    assert outbox.safe
+    assert outbox.flush()
+    assert outbox.flushed
     assert outbox.trouble == ""
     fresh = again(outbox, path)
     assert sequences(fresh) == [k for k in range(40) if k != 5]
-    assert (fresh.recall("cursor"), fresh.dropped) == (3, {})
+    assert (fresh.number("cursor"), fresh.dropped) == (3, {})
     fresh.close()
 
 
@@ -183,14 +186,14 @@ def test_a_read_only_file_is_counted_and_survived(
     outbox.close()
     with monkeypatch.context() as patch:
         patch.setattr("servotwin.link.sqlite_outbox.connect", read_only)
-        outbox.settle()
+        outbox.flush()
         outbox.put(window(1))
-        outbox.post(b"letter")
+        outbox.put_letter(b"letter")
         outbox.remove(("b0", 0))
-        assert (sequences(outbox), outbox.safe) == ([1], False)
-        assert not outbox.settle()
+        assert (sequences(outbox), outbox.flushed) == ([1], False)
+        assert not outbox.flush()
         assert "readonly" in outbox.trouble
-    assert outbox.settle()
+    assert outbox.flush()
     fresh = again(outbox, path)
     assert (sequences(fresh), len(fresh.letters())) == ([1], 1)
     fresh.close()
@@ -200,16 +203,16 @@ def test_a_folder_that_is_not_there_yet_is_no_reason_to_stop(tmp_path: Path) -> 
     path = tmp_path / "later" / "outbox.sqlite"
     box = SqliteOutbox(path, "axis-1")
     box.put(window(0))
-    assert not box.safe
+    assert not box.flushed
     path.parent.mkdir()
-    assert box.settle()
+    assert box.flush()
     fresh = again(box, path)
     assert sequences(fresh) == [0]
     fresh.close()
 
 
 def test_what_memory_holds_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("servotwin.link.sqlite_outbox.MOST_OWED", 1000)
+    monkeypatch.setattr("servotwin.link.sqlite_outbox.MOST_UNWRITTEN", 1000)
     box = SqliteOutbox(tmp_path / "never" / "outbox.sqlite", "axis-1")
     for k in range(50):
         box.put(window(k))
@@ -227,10 +230,10 @@ def test_a_broken_file_is_put_aside(outbox: SqliteOutbox, path: Path, wal: bool)
         path.with_name(path.name + "-wal").write_bytes(b"rubbish" * 50)
     fresh = SqliteOutbox(path, "axis-1")
     fresh.put(window(1))
-    assert fresh.safe
+    assert fresh.flushed
     assert sequences(fresh) == [1]
     assert fresh.faults == {BROKEN: 1}
-    assert fresh.recall(BROKEN) == 1
+    assert fresh.number(BROKEN) == 1
     assert (path.parent / "outbox.sqlite.broken-1").read_bytes().startswith(b"no database")
     fresh.close()
 
@@ -274,12 +277,12 @@ def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPa
         elif kind == "d":
             box.drop(("b0", number), "too_large")
         elif kind == "l":
-            box.post(bytes([number]))
+            box.put_letter(bytes([number]))
             letters.add(number)
         elif box.letters():
             digest = box.letters()[0]
             letters.discard(box.letter(digest).body[0])
-            box.taken(digest)
+            box.remove_letter(digest)
         if restart:
             box = again(box, path, windows=4)
         assert put == removed + len(box.pending()) + sum(box.dropped.values())

@@ -18,7 +18,7 @@ from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent, Outgoing
-from servotwin.edge.outlet import WITHHELD
+from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.messages import Window
@@ -41,7 +41,7 @@ def looped(name: str, growth_deg: float, duration: float, rules: NoveltyRules | 
 def test_without_wear_next_to_nothing_is_sent() -> None:
     loop = looped("fig15", 0.0, 200.0, NoveltyRules())
     assert Counter(window.reason for window in loop.windows) == {FIRST: 1}
-    assert loop.accounts == {"delivered": 1, WITHHELD: 9}
+    assert loop.accounts == {"delivered": 1, FILTERED: 9}
     every = looped("fig15", 0.0, 200.0, None)
     assert len(every.windows) == 10
     assert {window.reason for window in every.windows} == {"reference"}
@@ -124,7 +124,7 @@ def test_a_reference_that_never_changes_is_looked_at_all_the_same(block: int) ->
     windows = [(each.sample, each.message.reason) for each in sent if isinstance(each.message, Window)]
     assert [w for w in windows if w[0] <= 2000] == [(1000, FIRST), (2000, FIRST)]
     assert [reason for _, reason in windows if reason == PERIODIC]
-    assert edge.dropped[WITHHELD] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
+    assert edge.dropped[FILTERED] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
 
 
 def messages(sent: list[Outgoing]) -> list[Window]:

@@ -20,7 +20,7 @@ from mosquitto import free_port
 
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import edge_toml, load
-from servotwin.edge_process.status import read_status
+from servotwin.edge_process.monitoring import read_status
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.runtime.retry import Retry
 from servotwin.up.enrolment import Enrolment, enroll

@@ -10,7 +10,7 @@ from mosquitto import Mosquitto
 from servotwin.link.broker import Broker, Connection, Events, Wanted
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
-from servotwin.link.transport import Parcel, Unreachable, squeezed
+from servotwin.link.transport import Parcel, Unreachable, deflated
 from servotwin.messages import Window, checksum, encode, pack_channel
 from servotwin.store.group_commit import GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
@@ -35,7 +35,7 @@ def window(sequence: int, servo: str = "axis-1") -> Window:
 
 
 def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
-    return Parcel(servo, *squeezed(encode(window(sequence, servo))), "b0", sequence)
+    return Parcel(servo, *deflated(encode(window(sequence, servo))), "b0", sequence)
 
 
 class Twin:

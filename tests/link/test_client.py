@@ -1,4 +1,4 @@
-"""What the edge sends and hears, over a transport that does as it is told; time and chance come from the test."""
+"""Sender and receiver over a scripted transport; time and chance come from the test."""
 
 from collections.abc import Callable, Iterator
 from math import inf
@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.link.courier import Courier
-from servotwin.link.listener import Listener
+from servotwin.link.client import Receiver, Sender
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
+from servotwin.link.session import Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Update, Window, checksum, encode, pack_channel
@@ -65,74 +65,70 @@ def outbox(tmp_path: Path) -> Iterator[SqliteOutbox]:
 
 
 @pytest.fixture
-def courier(outbox: SqliteOutbox, script: Script) -> Courier:
-    return Courier(outbox, script, RETRY, lambda: 1.0)
+def sender(outbox: SqliteOutbox, script: Script) -> Sender:
+    return Sender(Session(outbox, RETRY), script)
 
 
-def test_letters_go_first_then_windows_in_order(courier: Courier, outbox: SqliteOutbox, script: Script) -> None:
+def test_letters_go_first_then_windows_in_order(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
     for k in range(2):
         outbox.put(window(k))
-    outbox.post(b"letter")
-    assert [courier.step(0.0).window for _ in range(3)] == [None, ("b0", 0), ("b0", 1)]
+    outbox.put_letter(b"letter")
+    assert [sender.step(0.0).window for _ in range(3)] == [None, ("b0", 0), ("b0", 1)]
     assert [parcel.is_window for parcel in script.delivered] == [False, True, True]
-    assert courier.step(0.0).wait_s == inf
+    assert sender.step(0.0).wait_s == inf
     assert (outbox.pending(), outbox.letters()) == ([], [])
-    assert courier.counts == {"letters": 1, "windows": 2}
+    assert sender.session.counts == {"letters": 1, "windows": 2}
 
 
-def test_out_of_reach_everything_waits_longer_and_longer(
-    courier: Courier, outbox: SqliteOutbox, script: Script
-) -> None:
+def test_out_of_reach_everything_waits_longer_and_longer(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
     outbox.put(window(0))
     script.faults = [Unreachable("gone")] * 6
     now, waits = 0.0, []
     while script.faults:
-        waits.append(courier.step(now).wait_s)
-        assert courier.trouble == "gone"
-        assert courier.step(now + 0.25 * waits[-1]).wait_s == pytest.approx(0.75 * waits[-1])
+        waits.append(sender.step(now).wait_s)
+        assert sender.session.trouble == "gone"
+        assert sender.step(now + 0.25 * waits[-1]).wait_s == pytest.approx(0.75 * waits[-1])
         now += waits[-1]
     assert waits == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0]
-    sent = courier.step(now)
-    assert (sent.window, sent.back, courier.trouble) == (("b0", 0), True, "")
+    sent = sender.step(now)
+    assert (sent.window, sent.reconnected, sender.session.trouble) == (("b0", 0), True, "")
     outbox.put(window(1))
-    assert not courier.step(now).back
+    assert not sender.step(now).reconnected
 
 
 @pytest.mark.parametrize("reason", [reason for reason in Refusal if not reason.passing])
 def test_what_will_never_be_taken_is_dropped_and_counted(
-    courier: Courier, outbox: SqliteOutbox, script: Script, reason: Refusal
+    sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
 ) -> None:
     outbox.put(window(0))
     outbox.put(window(1))
     script.faults = [Refused(reason, "no")]
-    assert courier.step(0.0).wait_s == 0.0
-    assert courier.step(0.0).window == ("b0", 1)
+    assert sender.step(0.0).wait_s == 0.0
+    assert sender.step(0.0).window == ("b0", 1)
     assert outbox.dropped == {reason.value: 1}
-    outbox.post(b"letter")
+    outbox.put_letter(b"letter")
     script.faults = [Refused(reason, "no")]
-    courier.step(0.0)
+    sender.step(0.0)
     assert outbox.letters() == []
-    assert courier.counts[f"refused: {reason.value}"] == 2
+    assert sender.session.counts[f"refused: {reason.value}"] == 2
 
 
 @pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.passing and reason is not Refusal.FUTURE])
-def test_what_may_be_taken_later_is_kept(
-    courier: Courier, outbox: SqliteOutbox, script: Script, reason: Refusal
-) -> None:
+def test_what_may_be_taken_later_is_kept(sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal) -> None:
     outbox.put(window(0))
     script.faults = [Refused(reason, "not now", 5.0)]
-    assert courier.step(0.0).wait_s == 5.0
-    assert courier.step(5.0).window == ("b0", 0)
+    assert sender.step(0.0).wait_s == 5.0
+    assert sender.step(5.0).window == ("b0", 0)
 
 
-def test_a_window_from_the_future_holds_up_no_other(courier: Courier, outbox: SqliteOutbox, script: Script) -> None:
+def test_a_window_from_the_future_holds_up_no_other(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
     outbox.put(window(0))
     outbox.put(window(1))
     script.faults = [Refused(Refusal.FUTURE, "too early")]
-    courier.step(0.0)
-    assert courier.step(0.0).window == ("b0", 1)
-    assert courier.step(0.0).wait_s == 1.0
-    assert courier.step(1.0).window == ("b0", 0)
+    sender.step(0.0)
+    assert sender.step(0.0).window == ("b0", 1)
+    assert sender.step(0.0).wait_s == 1.0
+    assert sender.step(1.0).window == ("b0", 0)
 
 
 FAULTS = st.lists(
@@ -141,7 +137,7 @@ FAULTS = st.lists(
 
 
 def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_without_a_pause(
-    courier: Courier, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+    sender: Sender, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     outbox.put(window(0))
     outbox.put(window(1))
@@ -155,10 +151,10 @@ def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_withou
         return parcel(key)
 
     monkeypatch.setattr(outbox, "parcel", read)
-    assert courier.step(0.0).window is None
-    assert courier.step(0.0).window == ("b0", 1)
-    assert [courier.step(0.0).wait_s, courier.step(1.0).wait_s, courier.step(1.0).wait_s] == [1.0, 0.0, 2.0]
-    assert courier.step(3.0).window == ("b0", 0)
+    assert sender.step(0.0).window is None
+    assert sender.step(0.0).window == ("b0", 1)
+    assert [sender.step(0.0).wait_s, sender.step(1.0).wait_s, sender.step(1.0).wait_s] == [1.0, 0.0, 2.0]
+    assert sender.step(3.0).window == ("b0", 0)
 
 
 @settings(max_examples=40, deadline=None)
@@ -167,11 +163,11 @@ def test_every_window_is_delivered_once_or_counted(
     tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None]
 ) -> None:
     outbox, script = SqliteOutbox(tmp_path_factory.mktemp("box") / "o", "axis-1"), Script()
-    courier, now = Courier(outbox, script, RETRY, lambda: 0.5), 0.0
+    sender, now = Sender(Session(outbox, RETRY, lambda: 0.5), script), 0.0
     script.faults = list(faults)
     for k in range(5):
         outbox.put(window(k))
-    while (wait := courier.step(now).wait_s) < inf:
+    while (wait := sender.step(now).wait_s) < inf:
         now += wait
     delivered = [parcel.sequence for parcel in script.delivered]
     assert len(delivered) == len(set(delivered))
@@ -182,59 +178,59 @@ def test_every_window_is_delivered_once_or_counted(
 
 
 @pytest.fixture
-def listener(script: Script) -> Listener:
-    return Listener(script, "axis-1", "secret", 0, RETRY, lambda: 1.0)
+def receiver(script: Script) -> Receiver:
+    return Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0)
 
 
 def sealed(serial: int, body: bytes | None = None, key: bytes = KEY, direction: str = TO_EDGE) -> bytes:
     return seal(key, direction, "axis-1", serial, encode(Acknowledge("axis-1", "b0", serial)) if body is None else body)
 
 
-def test_what_the_twin_says_is_heard_once_and_in_order(listener: Listener, script: Script) -> None:
+def test_what_the_twin_says_is_heard_once_and_in_order(receiver: Receiver, script: Script) -> None:
     script.news = [sealed(2), sealed(3), sealed(2), sealed(1)]
-    assert [serial for serial, _ in listener.step().messages] == [2, 3]
+    assert [serial for serial, _ in receiver.step().messages] == [2, 3]
     script.news = [sealed(3), sealed(7)]
-    assert [serial for serial, _ in listener.step().messages] == [7]
+    assert [serial for serial, _ in receiver.step().messages] == [7]
     assert script.asked == [0, 3]
-    assert listener.counts == {"heard": 3, "repeated": 3}
+    assert receiver.counts == {"received": 3, "repeated": 3}
 
 
-def test_nothing_comes_through_with_a_broken_seal(listener: Listener, script: Script) -> None:
+def test_nothing_comes_through_with_a_broken_seal(receiver: Receiver, script: Script) -> None:
     other, good = key_of(verifier_of("other")), sealed(1)
     script.news = [sealed(9, key=other), sealed(9, direction=TO_TWIN), good[:-1] + bytes([good[-1] ^ 1]), b"rubbish"]
-    told = listener.step()
-    assert (told.messages, told.wait_s) == ([], 1.0)
-    assert listener.counts["broken seal"] == 4
+    received = receiver.step()
+    assert (received.messages, received.wait_s) == ([], 1.0)
+    assert receiver.counts["broken seal"] == 4
     script.news += [sealed(1)]
-    assert [serial for serial, _ in listener.step().messages] == [1]
+    assert [serial for serial, _ in receiver.step().messages] == [1]
 
 
-def test_a_message_that_is_none_or_not_for_an_edge_is_passed_over(listener: Listener, script: Script) -> None:
+def test_a_message_that_is_none_or_not_for_an_edge_is_passed_over(receiver: Receiver, script: Script) -> None:
     hello = encode(Hello("axis-1", "b0", 0.0, 1.0, 0, Setting(0.0), ""))
     script.news = [sealed(1, b"rubbish"), sealed(2, hello), sealed(3)]
-    assert [serial for serial, _ in listener.step().messages] == [3]
-    assert listener.counts["not understood"] == 2
+    assert [serial for serial, _ in receiver.step().messages] == [3]
+    assert receiver.counts["not understood"] == 2
 
 
-def test_polls_that_fail_come_less_and_less_often(listener: Listener, script: Script) -> None:
+def test_polls_that_fail_come_less_and_less_often(receiver: Receiver, script: Script) -> None:
     script.faults = [Unreachable("gone"), Refused(Refusal.BAD_TOKEN, "no"), Refused(Refusal.TOO_MANY, "slowly", 30.0)]
-    assert [listener.step().wait_s for _ in range(4)] == [1.0, 2.0, 30.0, 0.0]
-    assert listener.trouble == ""
+    assert [receiver.step().wait_s for _ in range(4)] == [1.0, 2.0, 30.0, 0.0]
+    assert receiver.trouble == ""
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_survived(data: bytes) -> None:
     script = Script()
     script.news = [data]
-    assert Listener(script, "axis-1", "secret", 0, RETRY, lambda: 1.0).step().messages == []
+    assert Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0).step().messages == []
 
 
-def test_an_update_is_handed_on_as_it_was(listener: Listener, script: Script) -> None:
+def test_an_update_is_handed_on_as_it_was(receiver: Receiver, script: Script) -> None:
     update = Update("axis-1", 1, 0, ("b0", 0), 0.0, None, None, (None, None), "OK", Setting(1e-4), 60.0)
     script.news = [sealed(5, encode(update))]
-    assert listener.step().messages == [(5, encode(update))]
+    assert receiver.step().messages == [(5, encode(update))]
 
 
-def test_the_token_is_not_shown(listener: Listener, script: Script) -> None:
+def test_the_token_is_not_shown(receiver: Receiver, script: Script) -> None:
     shown: Callable[[object], str] = repr
-    assert "secret" not in shown(listener)
+    assert "secret" not in shown(receiver)

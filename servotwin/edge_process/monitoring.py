@@ -1,0 +1,115 @@
+"""Monitoring of an edge: its log on the standard error, its status file, and a histogram of tick times."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import time
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+import msgspec
+
+from servotwin.runtime.files import replace_file
+
+STATUS_SCHEMA = "servotwin-edge-status/1"
+BINS = 4096
+"""Bins of one microsecond; a longer time counts in the last one."""
+
+_TYPECODE = "Q"  # 64 bits on every machine: at 5 kHz 32 bits are full in ten days
+
+
+class TroubleLog:
+    """Logs what goes wrong with a part, once until it is another thing, and when it is over."""
+
+    def __init__(self) -> None:
+        self._logged: dict[str, str] = {}
+
+    def update(self, where: str, why: str) -> None:
+        """Log a change; `why` says what is wrong with a part now, empty: nothing."""
+        if why != self._logged.get(where, ""):
+            self._logged[where] = why
+            if why:
+                log("trouble", where=where, why=why)
+            else:
+                log("trouble over", where=where)
+
+
+def log(event: str, **values: Any) -> None:
+    """Write one JSON line to the standard error; where that is gone, or nobody reads it, the line is lost."""
+    line = {"time": round(time.time(), 3), "event": event, **values}
+    stream: TextIO | None = sys.stderr
+    try:
+        if stream is not None and _is_writable(stream):
+            stream.write(msgspec.json.encode(line).decode() + "\n")
+            stream.flush()
+    except (OSError, ValueError):
+        return
+
+
+def _is_writable(stream: TextIO) -> bool:
+    """True where writing would not wait: a pipe whose reader stands still is full one day."""
+    try:
+        descriptor = stream.fileno()
+    except (OSError, ValueError):
+        return True  # nothing of the system's is behind it
+    return bool(select.select([], [descriptor], [], 0.0)[1])
+
+
+def write_status(path: Path, status: Mapping[str, Any]) -> None:
+    """Replace the status file; raises OSError. A status is old in a second: it is not flushed to the disk."""
+    replace_file(path, msgspec.json.format(msgspec.json.encode({"schema": STATUS_SCHEMA, **status})) + b"\n")
+
+
+def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Read the last status; None: there is none, or the file is no status."""
+    try:
+        status = msgspec.json.decode(Path(path).read_bytes())
+    except (OSError, msgspec.MsgspecError):
+        return None
+    return status if isinstance(status, dict) and status.get("schema") == STATUS_SCHEMA else None
+
+
+class TickHistogram:
+    """Histogram of durations by microseconds: cheap to add to, of fixed size."""
+
+    def __init__(self) -> None:
+        self.bins = array(_TYPECODE, bytes(array(_TYPECODE).itemsize * BINS))
+        self.longest = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration."""
+        self.bins[min(max(int(seconds * 1e6), 0), BINS - 1)] += 1
+        if seconds > self.longest:
+            self.longest = seconds
+
+    def dumps(self) -> bytes:
+        """Encode the bins."""
+        return self.bins.tobytes()
+
+
+def summarise(data: bytes, longest: float) -> dict[str, float]:
+    """Number, and median, p99, p99.9 and maximum in microseconds, of `TickHistogram.dumps`.
+
+    A quantile beyond the bins is given as the longest duration.
+    """
+    bins = array(_TYPECODE)
+    bins.frombytes(data)
+    total = sum(bins)
+    shares = {"median_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
+    quantiles = {name: float(_quantile(bins, total, share)) for name, share in shares.items()}
+    quantiles = {name: value if value < BINS else round(longest * 1e6, 1) for name, value in quantiles.items()}
+    return {"number": total, **quantiles, "max_us": round(longest * 1e6, 1)}
+
+
+def _quantile(bins: array[int], total: int, share: float) -> int:
+    """End of the bin, us, below which that share of the durations lies."""
+    need, count = share * total, 0
+    for microsecond, number in enumerate(bins):
+        count += number
+        if count >= need and count > 0:
+            return microsecond + 1
+    return 0

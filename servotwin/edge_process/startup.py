@@ -1,0 +1,126 @@
+"""Start of an edge: checks of its files, locks, the name of the boot, and the parameters of the last one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge.store import FileParameterStore
+from servotwin.edge.switch import Rules
+from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
+from servotwin.edge_process.monitoring import log
+from servotwin.errors import InvalidInput
+from servotwin.link.url import is_encrypted
+from servotwin.runtime.extras import check_extra
+from servotwin.runtime.files import replace_file
+from servotwin.runtime.locks import locked
+
+
+def check(config: EdgeConfig) -> None:
+    """Refuse what could never work; what may come back, such as a twin or a full disk, is not looked at.
+
+    Raises
+    ------
+    InvalidInput
+        The token, the broker's password, the certificates or a library of the link are not there, or a folder is not.
+    """
+    for key in ("outbox", "parameters", "status", "boots"):
+        name = getattr(config.keeping, key)
+        folder = config.path(name).parent
+        if not folder.is_dir():
+            raise InvalidInput(f"{config.source}: [keep]: {key} = {name!r}: there is no folder {folder}")
+    if config.twin is not None:
+        token_of(config.twin, config.folder)
+        password_of(config.twin, config.folder)
+        _check_link(config, config.twin)
+
+
+def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
+    if twin.over_mqtt:
+        check_extra("paho", f"{config.source}: [twin]: url = {twin.url!r}")
+    if twin.ca_file is None or not is_encrypted(twin.url):
+        return
+    import ssl
+
+    path = config.path(twin.ca_file)
+    try:
+        ssl.create_default_context(cafile=str(path))
+    except OSError as error:
+        raise InvalidInput(f"{path}: holds no certificates that can be read ({error.strerror or error})") from None
+
+
+@contextmanager
+def exclusive(config: EdgeConfig) -> Iterator[None]:
+    """Lock an edge's files for this process: two edges would give one machine two voltages.
+
+    Where the disk takes no lock the machine runs anyway.
+
+    Raises
+    ------
+    InvalidInput
+        Another process holds them.
+    """
+    with ExitStack() as locks:
+        for name in dict.fromkeys((config.keeping.parameters, config.keeping.outbox)):
+            try:
+                locks.enter_context(locked(config.path(f"{name}-lock")))
+            except BlockingIOError:
+                raise InvalidInput(f"{config.source}: another edge runs on its files; end that one first") from None
+            except OSError as error:
+                log("not locked", error=str(error))
+        yield
+
+
+def next_boot(path: Path, random: bytes) -> str:
+    """Name this start: its number, and something random that makes it unique where the count is lost.
+
+    Parameters
+    ----------
+    path : path
+        Holds the number of starts; it need not be readable or writable.
+    random : bytes
+        8 bytes.
+    """
+    count = _count(path) + 1
+    with suppress(OSError):
+        replace_file(path, f"{count}\n".encode("ascii"), durable=True)
+    return f"b{count}-{random.hex()}"
+
+
+def _count(path: Path) -> int:
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return 0
+    return int(text) if text.isdigit() and len(text) < 16 else 0
+
+
+def stored_parameters(path: Path) -> Parameters | None:
+    """Load the parameters of an earlier start; a file that holds none is renamed, since the machine must run."""
+    try:
+        return FileParameterStore(path).load()
+    except InvalidInput as error:
+        log("last parameters not readable", error=str(error))
+    except OSError as error:
+        log("last parameters not readable", error=str(error))
+        return None
+    try:
+        path.replace(path.with_name(f"{path.name}.broken"))
+    except OSError as error:
+        log("last parameters not put aside", error=str(error))
+    return None
+
+
+def permitted(stored: Parameters | None, agent: AgentSettings) -> Parameters | None:
+    """Return the parameters of an earlier start where today's limits would allow an update to them; else None."""
+    if stored is None or stored.fallback:
+        return stored
+    centre, gains = Rules(agent.limits, agent.controller, agent.own).centre, stored.setting.gains
+    good = gains is None or (centre is not None and agent.limits.allows_gains(gains, centre))
+    if good and agent.limits.allows_tolerance(stored.setting.tolerance):
+        return stored
+    log("last parameters not allowed any more", version=stored.version, tolerance_m=stored.setting.tolerance)
+    return None
