@@ -10,7 +10,7 @@ from servotwin.messages import Probe
 
 @dataclass(frozen=True, slots=True)
 class ProbeLimits:
-    """Which probing moves an edge makes.
+    """Limits of the probing moves that an edge makes.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ class ProbeLimits:
     interval_s : float
         Shortest time from the beginning of one to the next.
     rest_s : float
-        How long the reference must have rested before one.
+        Time for which the reference must have rested before one.
     """
 
     size: float
@@ -36,7 +36,7 @@ class ProbeLimits:
 
 @dataclass(frozen=True, slots=True)
 class ProbingMove:
-    """What is added to the reference, sample by sample: away for `hold` samples, back for as many, `strokes` times.
+    """Offset added to the reference: `size` for `hold` samples, 0 for as many, `strokes` times.
 
     Parameters
     ----------

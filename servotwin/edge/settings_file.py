@@ -7,9 +7,9 @@ from math import inf
 
 from servotwin.config.table import Reader, Table, given
 from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.messages import Band, Gains, Setting
 

@@ -8,9 +8,8 @@ from typing import Any
 
 from servotwin.config.toml import dumps, values_of
 from servotwin.control.gains import written_gains
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge_process.config import MB, EdgeConfig
 from servotwin.messages import Band, Gains
 from servotwin.novelty import settings_file as noveltyfile

@@ -6,7 +6,7 @@ from functools import partial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
@@ -70,7 +70,7 @@ class StubTwin:
 
 @dataclass
 class CarelessTwin:
-    """Takes windows as they come, guesses bases, uses versions twice, repeats what it said, listens to no receipt.
+    """Takes windows as they come, guesses bases, uses versions twice, is_repeat what it said, listens to no receipt.
 
     So the guard alone has to keep order.
     """
@@ -86,11 +86,11 @@ class CarelessTwin:
         self.seen.add(message.sequence)
         self.version += message.sequence % 3 != 0
         base = max(0, self.version - 1 - message.sequence % 2)
-        self.said.append(make_update(self.version, base, message, self.lifetime_s))
-        return [Acknowledge(message.servo, message.boot, message.sequence), self.said[-1]]
+        self.messages.append(make_update(self.version, base, message, self.lifetime_s))
+        return [Acknowledge(message.servo, message.boot, message.sequence), self.messages[-1]]
 
     def repeat(self) -> list[Message]:
-        return self.said[-6:]
+        return self.messages[-6:]
 
 
 class Loop:
@@ -130,7 +130,7 @@ class Loop:
             self.history.append(self.agent.parameters)
             self.swaps.append((message.base_version, before.version))
 
-    def _up(self, sent: list[Outgoing]) -> None:
+    def _up(self, sent: list[OutgoingMessage]) -> None:
         for out in sent:
             if isinstance(out.message, Receipt):
                 self.receipts.append(out.message)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.config.table import parse_toml
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
 from servotwin.novelty import settings_file as noveltyfile
 from servotwin.novelty.detector import (
