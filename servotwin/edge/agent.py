@@ -178,7 +178,7 @@ class Agent:
         self._deadline = self._next_deadline()
 
     def restore(self, former: Parameters) -> list[OutgoingMessage]:
-        """Put former parameters in force again: the drive has refused the present ones. Return what is to be sent now."""
+        """Put former parameters in force again, as the drive has refused the present ones; return messages."""
         messages = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
         return [OutgoingMessage(self.samples, each) for each in messages]

@@ -4,9 +4,8 @@ The error is watched at all times: while the loop may still follow its reference
 moved and a little more, otherwise it stays within the band. Limit cycles and energies are evidence only while the
 reference rests and the loop had time to settle, since the last step of the reference and since the last change of
 parameters; in that time new parameters are compared with the certified band, then with the predicted one. Samples are
-taken together in
-slots of 10 ms: the mean error of a slot keeps what the loop does and little of the sensor's noise, the sums of squares
-keep everything.
+taken together in slots of 10 ms: the mean error of a slot keeps the loop's motion and little of the sensor's noise, the
+sums of squares keep everything.
 """
 
 from collections import deque

@@ -70,14 +70,14 @@ class StubTwin:
 
 @dataclass
 class CarelessTwin:
-    """Takes windows as they come, guesses bases, uses versions twice, is_repeat what it said, listens to no receipt.
+    """Takes windows as they come, guesses bases, uses versions twice, repeats what it said, listens to no receipt.
 
     So the guard alone has to keep order.
     """
 
     lifetime_s: float
     version: int = 1
-    said: list[Message] = field(default_factory=list)
+    updates: list[Message] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
@@ -86,11 +86,11 @@ class CarelessTwin:
         self.seen.add(message.sequence)
         self.version += message.sequence % 3 != 0
         base = max(0, self.version - 1 - message.sequence % 2)
-        self.messages.append(make_update(self.version, base, message, self.lifetime_s))
-        return [Acknowledge(message.servo, message.boot, message.sequence), self.messages[-1]]
+        self.updates.append(make_update(self.version, base, message, self.lifetime_s))
+        return [Acknowledge(message.servo, message.boot, message.sequence), self.updates[-1]]
 
     def repeat(self) -> list[Message]:
-        return self.messages[-6:]
+        return self.updates[-6:]
 
 
 class Loop:

@@ -113,7 +113,7 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
     feed(agent, [0.0] * 30)
     assert answer(agent, request()).taken
     fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
-    monkeypatch.setattr(Supervisor, "look", lambda self: (fallback,) if self._recorder.samples == 34 else ())
+    monkeypatch.setattr(Supervisor, "check", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
     assert fallback in sent
     assert windows(sent) == []
@@ -155,9 +155,9 @@ def test_without_permission_no_move() -> None:
 def test_what_is_refused_and_why(message: Request, outcome: Outcome) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
-    before = agent._granted
+    before = agent._requests
     assert answer(agent, message).outcome is outcome
-    assert (replace(agent._granted, answer=None) == before) == (outcome is not Outcome.TAKEN)
+    assert (replace(agent._requests, answer=None) == before) == (outcome is not Outcome.TAKEN)
 
 
 def test_a_request_counts_once_and_is_answered_again() -> None:

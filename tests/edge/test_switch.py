@@ -12,8 +12,9 @@ from servotwin.control import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import FallbackSet, Parameters, Violation
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.switch import PendingUpdate, Rules, Switch, apply_pending, fall_back, is_safe, offer
+from servotwin.edge.watch import Violation
 from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
