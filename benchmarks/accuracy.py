@@ -64,7 +64,7 @@ def shown(figures: list[Figure]) -> Table:
 
 
 def limited(figure: Figure) -> bool:
-    """Whether there is a target at all."""
+    """Decide: the figure has a target."""
     return any(math.isfinite(end) for end in figure.target)
 
 

@@ -23,8 +23,7 @@ MILLIMETRE = "/ 1 mm"
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure: small workloads (`quick`), contestants of many seconds (`slow`), positions of W1 to compare
-    with."""
+    """Small workloads (`quick`), contestants of many seconds (`slow`), and reference positions of W1."""
 
     quick: bool = False
     slow: bool = False
@@ -154,11 +153,11 @@ def sampled(options: Options) -> Workload:
 
 
 def decision(options: Options) -> Workload:
-    """What the certified policy takes to decide."""
+    """Time of a decision of the certified policy."""
     size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
     return Workload(
         "decision",
-        f"settings proved on {size} each",
+        f"settings verified on {size} each",
         decisions.decisions(options.quick),
         (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
         lambda _: "",

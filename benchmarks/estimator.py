@@ -27,8 +27,8 @@ from benchmarks.estimator_figures import (
 from benchmarks.estimator_windows import RATE, Case, paper_loop_cases, random_cases
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.paper.estimator import Settings as PaperSettings
-from servotwin.estimation.whitened.plain import plain_fit
+from servotwin.estimation.paper.estimator import PaperSettings
+from servotwin.estimation.whitened.fit import plain_fit
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Array
 

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.whitened.estimator import Settings
+from servotwin.estimation.whitened.estimator import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 Flags: TypeAlias = NDArray[np.bool_]
 FLOOR = 1e-6  # m
 ANY = (-math.inf, math.inf)
-OPEN_MINDED = Settings(largest_std=10.0, largest_shift=10.0)  # refuses next to nothing
+OPEN_MINDED = WhitenedSettings(largest_std=10.0, largest_shift=10.0)  # refuses next to nothing
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Answers:
         return float(np.mean(ratio <= NORMAL_95)) if ratio.size else math.nan
 
 
-def answers(cases: Iterable[Case], servo: Servo | None = None, settings: Settings | None = None) -> Answers:
+def answers(cases: Iterable[Case], servo: Servo | None = None, settings: WhitenedSettings | None = None) -> Answers:
     """The default estimator's, with another model where one is given."""
     known = list(cases)
     return Answers(known, [estimate_gap(c.window, servo or c.servo, settings=settings) for c in known])

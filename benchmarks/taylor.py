@@ -116,7 +116,7 @@ def _dot(row: Array, terms: Any) -> Any:
 
 
 def _callbacks() -> tuple[Callable[..., bool], ...]:
-    """What the events change; the lane is given only by an integrator of several runs."""
+    """Make the callbacks of the events; only an integrator of several runs passes a lane."""
 
     def beyond(side: int) -> Callable[..., bool]:
         def switch(ta: Any, sign: int, *lane: int) -> bool:

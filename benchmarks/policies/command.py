@@ -14,7 +14,7 @@ from rich.table import Table
 
 from benchmarks import report
 from benchmarks.policies.machines import BLOCKS
-from benchmarks.policies.table import Row, compare
+from benchmarks.policies.table import PolicyScores, compare
 from benchmarks.policies.trial import Scores
 from servotwin.analysis.maps.pool import workplace
 from servotwin.plant.servo import Servo
@@ -44,7 +44,7 @@ def policies(
     count: int = MACHINES,
     blocks: Sequence[str] = BLOCKS,
     console: Console | None = None,
-) -> tuple[Row, ...]:
+) -> tuple[PolicyScores, ...]:
     """Compare, show as it comes, and write JSON when asked to.
 
     Parameters
@@ -76,7 +76,7 @@ def policies(
     return tuple(rows)
 
 
-def shown(rows: Sequence[Row]) -> Table:
+def shown(rows: Sequence[PolicyScores]) -> Table:
     """A line for each contender in each block."""
     result = Table(title="policies: random machines, 60 s after a step", title_justify="left", box=None, pad_edge=False)
     result.add_column("block")
@@ -89,8 +89,8 @@ def shown(rows: Sequence[Row]) -> Table:
     return result
 
 
-def chosen(rows: Sequence[Row]) -> Table:
-    """What the certified policy had in force at the end, by gap."""
+def chosen(rows: Sequence[PolicyScores]) -> Table:
+    """Settings that the certified policy had in force at the end, by gap."""
     result = Table(title="certified: in force at the end", title_justify="left", box=None, pad_edge=False)
     for heading in ("block", "gap, deg", "machines", "Kp, Kd x", "with Ki, %", "with dead zone, %"):
         result.add_column(heading, justify="left" if heading == "block" else "right")
@@ -113,7 +113,7 @@ def _choice(scores: Scores, which: NDArray[np.bool_]) -> tuple[str, str, str]:
     )
 
 
-def dumps(rows: Sequence[Row], date: str) -> str:
+def dumps(rows: Sequence[PolicyScores], date: str) -> str:
     """The document: schema, date, machine, and every measure of every run."""
     found = [
         {

@@ -1,11 +1,11 @@
-"""Who competes: the policies, and constant controllers among which the best is chosen with hindsight."""
+"""The competitors: the policies, and constant controllers among which the best is chosen with hindsight."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
 
-from benchmarks.policies.trial import Told
+from benchmarks.policies.trial import Contender
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -19,19 +19,19 @@ _NOT_BOUND = 100.0
 
 
 @cache
-def contender(name: str, model: Servo, known: Uncertainty) -> Told:
+def contender(name: str, model: Servo, known: Uncertainty) -> Contender:
     """A policy by name, with the model and what is stated of it."""
     own = Design(model.controller)
     if name == "no dead zone":
-        return Told(None, own)
+        return Contender(None, own)
     if name == "paper":
-        return Told(PaperPolicy(model), own)
+        return Contender(PaperPolicy(model), own)
     if name == "margin":
-        return Told(MarginPolicy(model, known.step), own)
+        return Contender(MarginPolicy(model, known.step), own)
     if name == "hysteresis":
-        return Told(HysteresisPolicy(model), own)
+        return Contender(HysteresisPolicy(model), own)
     certified = CertifiedPolicy(model, known)
-    return Told(certified, certified.fallback().setting)
+    return Contender(certified, certified.fallback().setting)
 
 
 def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:

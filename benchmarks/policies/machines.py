@@ -18,7 +18,7 @@ _RELATIVE = ("k", "c", "k_B", "m")
 
 
 @dataclass(frozen=True)
-class Machine:
+class TrialMachine:
     """One plant with its gap and what happens to it.
 
     Attributes
@@ -44,18 +44,18 @@ class Machine:
     seed: int
 
 
-def machines(model: Servo, known: Uncertainty, block: str, count: int, seed: int) -> list[Machine]:
+def machines(model: Servo, known: Uncertainty, block: str, count: int, seed: int) -> list[TrialMachine]:
     """`count` machines of a block: parameters, gap and bias uniform within what is `known`, steps logarithmic."""
     rng = np.random.default_rng([seed, BLOCKS.index(block)])
     return [_machine(model, known, block, rng, seed * 100_000 + k) for k in range(count)]
 
 
-def _machine(model: Servo, known: Uncertainty, block: str, rng: np.random.Generator, seed: int) -> Machine:
+def _machine(model: Servo, known: Uncertainty, block: str, rng: np.random.Generator, seed: int) -> TrialMachine:
     widths = {name: getattr(known, name) for name in _RELATIVE}
     servo = model.replace(**{n: getattr(model, n) * (1.0 + w * rng.uniform(-1.0, 1.0)) for n, w in widths.items()})
     gap = rng.uniform(*known.gap)
     bias = rng.uniform(-BIAS, BIAS)
-    return Machine(
+    return TrialMachine(
         servo,
         gap,
         rng.uniform(-0.5, 0.5) * gap,

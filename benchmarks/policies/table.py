@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.policies.contenders import POLICIES, constants, contender
-from benchmarks.policies.machines import BLOCKS, Machine, machines
-from benchmarks.policies.trial import Scores, Told, run_machine
+from benchmarks.policies.machines import BLOCKS, TrialMachine, machines
+from benchmarks.policies.trial import Contender, Scores, run_machine
 from servotwin.analysis.maps.pool import shared
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import STILL
@@ -21,7 +21,7 @@ _SCREENED, _FEWEST, _FINALISTS = 0.2, 20, 4
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class PolicyScores:
     """One contender in one block.
 
     Attributes
@@ -29,13 +29,13 @@ class Row:
     block, name : str
     scores : Scores
         Of (N,) arrays, a value per machine.
-    machines : tuple of N Machine
+    machines : tuple of N TrialMachine
     """
 
     block: str
     name: str
     scores: Scores
-    machines: tuple[Machine, ...]
+    machines: tuple[TrialMachine, ...]
 
     @property
     def settled(self) -> float:
@@ -49,15 +49,15 @@ class Row:
 
 class _Task(NamedTuple):
     place: int
-    machine: Machine
+    machine: TrialMachine
     block: str
     model: Servo
-    told: Told
+    competitor: Contender
 
 
 def compare(
     model: Servo, known: Uncertainty, count: int, seed: int = 2026, blocks: Sequence[str] = BLOCKS
-) -> Iterator[Row]:
+) -> Iterator[PolicyScores]:
     """All rows, in the order of blocks and contenders; the last of each block is the best constant controller.
 
     Parameters
@@ -65,7 +65,7 @@ def compare(
     model : Servo
         What policies know.
     known : Uncertainty
-        Of which the machines are drawn, and which the certified policy is told.
+        Of which the machines are drawn, and which the certified policy is competitor.
     count, seed : int
         Machines of each block.
     blocks : sequence of str
@@ -77,25 +77,25 @@ def compare(
         yield _best_constant(block, those, model, known)
 
 
-def _row(block: str, name: str, those: Sequence[Machine], model: Servo, told: Told) -> Row:
-    tasks = [_Task(place, machine, block, model, told) for place, machine in enumerate(those)]
+def _row(block: str, name: str, those: Sequence[TrialMachine], model: Servo, competitor: Contender) -> PolicyScores:
+    tasks = [_Task(place, machine, block, model, competitor) for place, machine in enumerate(those)]
     found = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
-    return Row(block, name, Scores(*np.array([scores for _, scores in found]).T), tuple(those))
+    return PolicyScores(block, name, Scores(*np.array([scores for _, scores in found]).T), tuple(those))
 
 
 def _tried(task: _Task) -> Scores:
-    return run_machine(task.machine, task.block, task.model, task.told)
+    return run_machine(task.machine, task.block, task.model, task.competitor)
 
 
-def _best_constant(block: str, those: Sequence[Machine], model: Servo, known: Uncertainty) -> Row:
+def _best_constant(block: str, those: Sequence[TrialMachine], model: Servo, known: Uncertainty) -> PolicyScores:
     """The best on all machines of those that are best on a fifth of them: with hindsight."""
     few = those[: max(_FEWEST, round(_SCREENED * len(those)))]
     settings = {f"constant: {name}": setting for name, setting in constants(model, known).items()}
-    tried = [_row(block, name, few, model, Told(None, setting)) for name, setting in settings.items()]
+    tried = [_row(block, name, few, model, Contender(None, setting)) for name, setting in settings.items()]
     finalists = [row.name for row in sorted(tried, key=_rank)[:_FINALISTS]]
-    return min((_row(block, name, those, model, Told(None, settings[name])) for name in finalists), key=_rank)
+    return min((_row(block, name, those, model, Contender(None, settings[name])) for name in finalists), key=_rank)
 
 
-def _rank(row: Row) -> tuple[bool, float]:
+def _rank(row: PolicyScores) -> tuple[bool, float]:
     """The cheapest of those that settle; in noise nothing does."""
     return row.block != "noise" and row.settled < LEAST_SETTLED, row.at("cost", 95.0)

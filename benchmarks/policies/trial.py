@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.policies.machines import NOISE, Machine
+from benchmarks.policies.machines import NOISE, TrialMachine
 from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
 from servotwin.estimation.disturbance import disturbance
@@ -69,13 +69,13 @@ class Scores(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Told:
-    """A policy with the setting that runs before it is asked.
+class Contender:
+    """A policy with the setting that runs before its first decision.
 
     Attributes
     ----------
     policy : Policy or None
-        None: the start stays.
+        None: the start setting stays.
     start : Design
     """
 
@@ -83,19 +83,19 @@ class Told:
     start: Design
 
 
-def run_machine(machine: Machine, block: str, model: Servo, told: Told) -> Scores:
+def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Contender) -> Scores:
     """The gap's estimate is right to 0.05 deg (standard deviation) and says so; of the rest a policy knows what its
     windows show: 2 s that end 2 s before the step, 20 and 40 s after it, its setting in force a second later."""
     rng = np.random.default_rng(machine.seed)
     believed = max(0.0, machine.gap + SPREAD * rng.standard_normal())
-    setting = _redesigned(told, Evidence(_estimate(believed)), told.start)
+    setting = _redesigned(competitor, Evidence(_estimate(believed)), competitor.start)
     simulation, told_for = _simulation(machine, block, setting, rng), None
-    for end in UPDATES if told.policy is not None else ():
+    for end in UPDATES if competitor.policy is not None else ():
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
         seen = disturbance(window, model)
         evidence = Evidence(_estimate(believed), seen, None, setting.setting(), told_for)
-        now = _redesigned(told, evidence, setting)
+        now = _redesigned(competitor, evidence, setting)
         told_for = believed
         if now != setting:
             simulation.advance(_sample(end + DELAY, block))
@@ -126,11 +126,11 @@ def scores(run: Run, step: float, setting: Design, model: Servo) -> Scores:
     )
 
 
-def _redesigned(told: Told, evidence: Evidence, before: Design) -> Design:
+def _redesigned(competitor: Contender, evidence: Evidence, before: Design) -> Design:
     """The setting after a policy was asked."""
-    if told.policy is None:
+    if competitor.policy is None:
         return before
-    made = told.policy.redesign(evidence)
+    made = competitor.policy.redesign(evidence)
     if made.setting is None:
         return before
     return Design(with_gains(before.controller, made.setting.gains), made.setting.tolerance)
@@ -141,7 +141,7 @@ def _estimate(gap: float) -> GapEstimate:
     return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, 0.0)
 
 
-def _simulation(machine: Machine, block: str, setting: Design, rng: np.random.Generator) -> Simulation:
+def _simulation(machine: TrialMachine, block: str, setting: Design, rng: np.random.Generator) -> Simulation:
     return Simulation(
         machine.servo,
         REST + DURATION,

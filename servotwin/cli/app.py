@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from servotwin.cli import deployed, design, study
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import EXTRAS, missing_extra
 
 INVALID, INTERRUPTED = 2, 130
 
@@ -33,6 +34,10 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except InvalidInput as error:
             _end(f"error: {error}", INVALID)
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] not in EXTRAS:
+                raise
+            _end(f"error: {missing_extra(str(error.name), f'servotwin {ctx.invoked_subcommand}')}", INVALID)
         except KeyboardInterrupt as interrupt:
             _end(str(interrupt) or "interrupted; nothing half written was left behind", INTERRUPTED)
 

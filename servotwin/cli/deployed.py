@@ -23,7 +23,11 @@ def up(
     seconds: Annotated[float | None, typer.Option("--for", help="End by itself after so many s.")] = None,
 ) -> None:
     """Everything at once on this machine: a twin, and three simulated servos that wear; Ctrl-C ends it."""
+    from servotwin.runtime.extras import check_extra
     from servotwin.up.command import up as run
+
+    for module in ("uvicorn", "httptools", "sqlalchemy", "alembic"):  # the twin is a process of its own
+        check_extra(module, "servotwin up")
 
     run(folder, speed, seconds)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class LawParameters(NamedTuple):
-    """What the tick needs, discretised; made by `Controller.law`.
+    """Parameters of the tick, discretised; made by `Controller.law`.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class LawParameters(NamedTuple):
     feedforward : float
         Always added to the voltage, V.
     release_step : float
-        1 - exp(-Ts / release time) of `LawState.offset`.
+        1 - exp(-Ts / release time), the share of `LawState.offset` that fades per tick.
     """
 
     Kp: float
@@ -53,7 +53,7 @@ class LawParameters(NamedTuple):
 
 
 class LawState(NamedTuple):
-    """What the tick remembers.
+    """State of the law between two ticks.
 
     Attributes
     ----------
@@ -64,11 +64,11 @@ class LawState(NamedTuple):
     filtered : float
         The measurement behind the loop filter, m.
     voltage : float
-        What was applied at the last tick, V.
+        Voltage applied at the last tick, V.
     active : float
         1.0: the loop is closed; 0.0: the error is inside the dead zone.
     offset : float
-        What a change of parameters left over, V: added to the voltage, inside the dead zone too, and let go
+        Voltage offset after a change of parameters, V: added to the voltage, inside the dead zone too; it fades
         exponentially.
     """
 
@@ -93,7 +93,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     parameters, state : LawParameters, LawState
         The law in force and its state after the previous tick.
     reference, measurement : float
-        Wanted and measured position of the last mass, m.
+        Reference and measured position of the last mass, m.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
 
 
 def transfer(old: LawParameters, new: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
-    """The state with which the next tick of `new` gives the voltage that `old` would have given.
+    """Change the law without a bump: the state with which the next tick of `new` gives the voltage of `old`.
 
     Parameters
     ----------
@@ -150,8 +150,8 @@ def transfer(old: LawParameters, new: LawParameters, state: LawState, reference:
     Returns
     -------
     LawState
-        For the first tick of `new`. The difference between the two laws is in the offset and fades with it; what the
-        old one wanted beyond its limits is forgotten.
+        For the first tick of `new`. The difference between the two laws is in the offset and fades with it; the part of
+        the old voltage beyond its limits is dropped.
 
     Notes
     -----

@@ -12,11 +12,11 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from math import inf, isfinite, sqrt
+from math import isfinite, sqrt
 from operator import mul, sub
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from servotwin.errors import InvalidInput
+from servotwin.config.keys import check, key, settings
 from servotwin.messages import Band, Cause
 
 
@@ -28,54 +28,47 @@ class Violation(NamedTuple):
     allowed: float
 
 
+@settings("watch")
 @dataclass(frozen=True, slots=True)
 class WatchSettings:
-    """Thresholds of the watch.
+    """Thresholds of the evidence against the parameters in force."""
 
-    Parameters
-    ----------
-    slot_s : float
-        Length of a slot, in which samples are averaged.
-    window_s : float
-        Length of the sliding window for energies.
-    settling_s : float
-        Until the loop is settled, where no band says so.
-    margin : float
-        The loop may leave the band by this factor.
-    overshoot : float
-        While the loop settles the error may be larger by this times the reference's travel.
-    persist_s : float
-        How long the error itself must be outside.
-    error_floor, effort_floor : float
-        m and V: what is smaller is no evidence, whatever the band says; above the sensor's noise in a slot.
-    swings : int
-        Turns of the error, one up, one down, that make a limit cycle.
-    similarity : float
-        Factor by which a swing may be smaller than one before it, and half a period longer or shorter than another.
-    """
-
-    slot_s: float = 0.01
-    window_s: float = 2.0
-    settling_s: float = 3.0
-    margin: float = 1.25
-    overshoot: float = 1.3
-    persist_s: float = 0.05
-    error_floor: float = 1e-5
-    effort_floor: float = 0.02
-    swings: int = 6
-    similarity: float = 1.3
+    slot_s: Annotated[float, key(above=0.0, help="Length of a slot, in which samples are taken together.")] = 0.01
+    window_s: Annotated[float, key(above=0.0, help="Length of the sliding window for energies.")] = 2.0
+    settling_s: Annotated[float, key(minimum=0.0, help="Time until the loop is settled, where no band says so.")] = 3.0
+    margin: Annotated[float, key(minimum=1.0, help="Factor by which the loop may leave the band.")] = 1.25
+    overshoot: Annotated[
+        float,
+        key(
+            minimum=1.0,
+            help="While the loop settles the error may be larger by this multiple of the reference's travel.",
+        ),
+    ] = 1.3
+    persist_s: Annotated[float, key(above=0.0, help="Time for which the error itself must be outside.")] = 0.05
+    error_floor: Annotated[
+        float,
+        key(
+            "error_floor_m",
+            "error_floor_mm",
+            above=0.0,
+            help="A smaller error is no evidence, whatever the band says; above the sensor's noise in a slot.",
+        ),
+    ] = 1e-5
+    effort_floor: Annotated[
+        float, key("effort_floor_v", above=0.0, help="A smaller voltage is no evidence, whatever the band says.")
+    ] = 0.02
+    swings: Annotated[int, key(minimum=2, help="Turns of the error, one up, one down, that make a limit cycle.")] = 6
+    similarity: Annotated[
+        float,
+        key(
+            minimum=1.0,
+            help="Factor by which a swing may be smaller than one before it, and half a period longer or shorter than "
+            "another.",
+        ),
+    ] = 1.3
 
     def __post_init__(self) -> None:
-        for name in ("slot_s", "window_s", "persist_s", "error_floor", "effort_floor"):
-            if not 0.0 < getattr(self, name) < inf:
-                raise InvalidInput(f"watch {name} = {getattr(self, name)!r}: must be finite and greater than 0")
-        if not 0.0 <= self.settling_s < inf:
-            raise InvalidInput(f"watch settling_s = {self.settling_s!r} s: must be finite and at least 0")
-        for name in ("margin", "overshoot", "similarity"):
-            if not 1.0 <= getattr(self, name) < inf:
-                raise InvalidInput(f"watch {name} = {getattr(self, name)!r}: must be finite and at least 1")
-        if self.swings < 2:
-            raise InvalidInput(f"watch swings = {self.swings!r}: must be at least 2")
+        check(self)
 
 
 class Watch:

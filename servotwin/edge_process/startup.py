@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from importlib.util import find_spec
 from pathlib import Path
 
 from servotwin.edge.parameters import Parameters
@@ -15,6 +14,7 @@ from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, tok
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput
 from servotwin.link.url import is_encrypted
+from servotwin.runtime.extras import check_extra
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import locked
 
@@ -39,10 +39,8 @@ def check(config: EdgeConfig) -> None:
 
 
 def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
-    if twin.over_mqtt and find_spec("paho") is None:
-        raise InvalidInput(
-            f"{config.source}: [twin]: url = {twin.url!r} needs paho-mqtt: pip install 'servotwin[mqtt]'"
-        )
+    if twin.over_mqtt:
+        check_extra("paho", f"{config.source}: [twin]: url = {twin.url!r}")
     if twin.ca_file is None or not is_encrypted(twin.url):
         return
     import ssl

@@ -21,8 +21,8 @@ class Method(NamedTuple):
 
 
 METHODS: Mapping[str, Method] = {
-    whitened.METHOD: Method(whitened.estimate, whitened.Settings),
-    paper.METHOD: Method(paper.estimate, paper.Settings),
+    whitened.METHOD: Method(whitened.estimate, whitened.WhitenedSettings),
+    paper.METHOD: Method(paper.estimate, paper.PaperSettings),
 }
 
 
@@ -82,7 +82,7 @@ def settings_of(method: str, settings: Any = None) -> Any:
 def shortest_window(method: str, sample_rate: float, settings: Any = None) -> tuple[float, str]:
     """The shortest window (s) that a method accepts at a sample rate (Hz), and why, in words."""
     chosen = settings_of(method, settings)
-    if isinstance(chosen, paper.Settings):
+    if isinstance(chosen, paper.PaperSettings):
         settle = chosen.settle_s
         return settle + MINIMUM_SAMPLES / sample_rate, f"the observer, which takes {settle!r} s to settle"
     return whitened.SHORTEST / sample_rate, f"method {method!r}, which needs {whitened.SHORTEST} samples"

@@ -15,9 +15,8 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
-from servotwin.estimation.core.between import polygon
-from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap
-from servotwin.estimation.core.normal import least_squares
+from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, polygon
+from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
@@ -35,7 +34,7 @@ def estimate_carrying(
     window: Window,
     servo: Servo,
     prior: float | GapEstimate | None,
-    settings: whitened.Settings,
+    settings: whitened.WhitenedSettings,
     carried: tuple[float, float] | None,
 ) -> GapEstimate:
     """The gap from the window alone, or, where that shows too little of it, with the offset that earlier ones showed.
@@ -49,7 +48,7 @@ def estimate_carrying(
     servo : Servo
     prior : float or GapEstimate, optional
         As for `estimate_gap`.
-    settings : whitened.Settings
+    settings : whitened.WhitenedSettings
         With an `offset` of its own, nothing is carried and nothing read.
     carried : (float, float), optional
         Mean and standard deviation of the offset, rad.
@@ -80,7 +79,7 @@ def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
 
 
 def read_offset(
-    window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings | None = None
+    window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.WhitenedSettings | None = None
 ) -> OffsetReading:
     """The offset (rad) with its standard deviation and its covariance with the gap.
 
@@ -95,7 +94,7 @@ def read_offset(
     if window.theta_m is None or not estimate.ok:
         missing = "theta_m" if window.theta_m is None else "an OK estimate"
         raise InvalidInput(f"{window.where}the encoder's offset needs {missing}")
-    table = _columns(window, servo, estimate, settings or whitened.Settings())
+    table = _columns(window, servo, estimate, settings or whitened.WhitenedSettings())
     residual, columns = table[0], table[1:]
     gain = response(servo, window.sample_rate).static_gain
     solved = least_squares(np.delete(columns, _GAP, axis=0), residual)
@@ -104,7 +103,7 @@ def read_offset(
     return OffsetReading(offset, math.sqrt(covariance[1, 1]), float(covariance[0, 1]))
 
 
-def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.Settings) -> Array:
+def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.WhitenedSettings) -> Array:
     """(k, n) residual, its derivatives by gap and constant (per rad of offset), nuisances."""
     model = response(servo, window.sample_rate)
     angle = motor_angle(window, servo.encoder_resolution, settings)

@@ -11,26 +11,90 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, Interval, OffsetReading
 from servotwin.estimation.passage import Passage, passage
-from servotwin.estimation.trend_model import (
-    GAP,
-    OFFSET,
-    RATE,
-    Reading,
-    bound_std,
-    process_noise,
-    reading,
-    transition,
-    truncation,
-)
 from servotwin.estimation.trend_settings import TrendSettings
 from servotwin.plant.signals import Array
 from servotwin.runtime.notebook import html_table
 
 __all__ = ["OffsetReading", "Prior", "Trend", "TrendSettings"]
+
+GAP, RATE, OFFSET = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class TrendMeasurement:
+    """values (m,) = select (m, 3) state + noise of covariance (m, m)."""
+
+    values: Array
+    select: Array
+    noise: Array
+
+    @property
+    def of_gap(self) -> TrendMeasurement:
+        """Its first value alone."""
+        return TrendMeasurement(self.values[:1], self.select[:1], self.noise[:1, :1])
+
+
+def reading(estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None) -> TrendMeasurement:
+    """What an OK estimate says of gap and offset.
+
+    A gap that rests on the carried offset is none of its own: the window shows gap - slope offset. Taken as a gap, the
+    offset's error would count anew with every such window, as if it were another each time.
+
+    Raises
+    ------
+    InvalidInput
+        The spreads make no covariance matrix.
+    """
+    variance = estimate.std_total**2
+    if not 0.0 <= variance < math.inf:
+        raise InvalidInput(f"trend: the estimate's std_total = {estimate.std_total!r} rad: must be finite")
+    if offset is None:
+        return TrendMeasurement(np.array([estimate.gap]), np.eye(3)[:1], np.array([[variance]]))
+    if isinstance(offset, CarriedOffset):
+        own = max(0.0, variance - (offset.slope * offset.std) ** 2)
+        select = np.array([[1.0, 0.0, -offset.slope]])
+        return TrendMeasurement(np.array([estimate.gap - offset.slope * offset.offset]), select, np.array([[own]]))
+    noise = np.array([[variance, offset.covariance], [offset.covariance, offset.std**2]])
+    if not np.all(np.isfinite(noise)) or np.any(np.linalg.eigvalsh(noise) < 0.0):
+        raise InvalidInput(f"trend: {offset} and std_total = {estimate.std_total!r} rad make no covariance matrix")
+    return TrendMeasurement(np.array([estimate.gap, offset.offset]), np.eye(3)[[GAP, OFFSET]], noise)
+
+
+def transition(step: float) -> Array:
+    """(3, 3) matrix that carries the state on by `step` seconds."""
+    flow = np.eye(3)
+    flow[GAP, RATE] = step
+    return flow
+
+
+def process_noise(step: float, settings: TrendSettings) -> Array:
+    """(3, 3) covariance that `step` seconds of the random walks add: exact, so that steps can be split at will."""
+    gap, rate = settings.gap_walk_rad_per_sqrt_s**2, settings.rate_walk_rad_per_s_per_sqrt_s**2
+    noise = np.zeros((3, 3))
+    noise[GAP, GAP] = gap * step + rate * step**3 / 3.0
+    noise[GAP, RATE] = noise[RATE, GAP] = rate * step**2 / 2.0
+    noise[RATE, RATE] = rate * step
+    noise[OFFSET, OFFSET] = settings.offset_walk_rad_per_sqrt_s**2 * step
+    return noise
+
+
+def bound_std(estimate: GapEstimate) -> float:
+    """Spread (rad) of a lower bound, from the lower end of its 95 % interval."""
+    return max(0.0, estimate.gap - estimate.interval[0]) / NORMAL_95
+
+
+def truncation(margin: float) -> tuple[float, float]:
+    """(shift, shrinkage) of a standard normal that is known to exceed -margin: its mean, one less its variance."""
+    if math.isinf(margin):
+        return 0.0, 0.0
+    pull = math.exp(-0.5 * margin * margin - 0.5 * math.log(2.0 * math.pi) - float(log_ndtr(margin)))
+    return pull, min(1.0, max(0.0, pull * (pull + margin)))
+
 
 _OUTLIER = "the window did not count, being an outlier"
 _MOVED = "the encoder's offset is not what it was: it is read anew from this window"
@@ -152,7 +216,7 @@ class Trend:
         """The same state on a clock that now reads `time`, s."""
         return replace(self, time=_time(time), rival=self.rival and self.rival.on_clock(time))
 
-    def _corrected(self, seen: Reading) -> Trend:
+    def _corrected(self, seen: TrendMeasurement) -> Trend:
         """Corrected by what was seen, unless the gap is an outlier; an offset that is one is read anew."""
         distance = self._distance(seen.of_gap)
         if distance > self.settings.outlier_std:
@@ -161,13 +225,13 @@ class Trend:
             return replace(self.without_offset()._joseph(seen), reasons=(_MOVED,))
         return self._joseph(seen)
 
-    def _distance(self, seen: Reading) -> float:
+    def _distance(self, seen: TrendMeasurement) -> float:
         """How far from the prediction, in standard deviations of both."""
         surprise = seen.values - seen.select @ self.mean
         spread = seen.select @ self.covariance @ seen.select.T + seen.noise
         return math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
 
-    def _joseph(self, seen: Reading) -> Trend:
+    def _joseph(self, seen: TrendMeasurement) -> Trend:
         """Kalman update; Joseph's form keeps the covariance definite."""
         select, noise = seen.select, seen.noise
         spread = select @ self.covariance @ select.T + noise
@@ -178,7 +242,7 @@ class Trend:
         counted = self.updates + 1
         return replace(self, mean=mean, covariance=_symmetric(covariance), updates=counted, refused=0, rival=None)
 
-    def _refused(self, distance: float, seen: Reading) -> Trend:
+    def _refused(self, distance: float, seen: TrendMeasurement) -> Trend:
         """The prediction with one more refusal; or what the outliers say, once enough of them agree."""
         expected = f"{math.degrees(self.mean[GAP]):.4g} deg were expected"
         limit = f"{distance:.3g} standard deviations away, and {self.settings.outlier_std:.3g} are allowed"
@@ -191,7 +255,7 @@ class Trend:
         reason = f"outliers in a row that agree: {rival.updates}; the gap starts afresh, as after a crash or a repair"
         return replace(rival, updates=self.updates + rival.updates, reasons=(reason,))
 
-    def _rival(self, seen: Reading) -> Trend:
+    def _rival(self, seen: TrendMeasurement) -> Trend:
         """The state that the outliers so far would make, were they right: of those that agree with this one."""
         if self.rival is not None and self.rival._distance(seen.of_gap) <= self.settings.agreement_std:
             return self.rival._corrected(seen)
@@ -268,7 +332,7 @@ class Trend:
         return passage(self.mean[:OFFSET], covariance, gap, *walks)
 
 
-def _leans_on_offset(seen: Reading) -> bool:
+def _leans_on_offset(seen: TrendMeasurement) -> bool:
     """Whether a gap was read by means of the carried offset."""
     return bool(seen.select[0, OFFSET] != 0.0)
 

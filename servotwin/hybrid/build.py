@@ -23,7 +23,7 @@ from servotwin.hybrid.tables import (
 
 
 class Numbers(NamedTuple):
-    """What distinguishes automata of one structure, flat: everything that is not a table of theirs yet."""
+    """Numbers in which automata of one structure differ, flat; their tables are built of these."""
 
     flows: Array  # M * n * n
     rows: Array  # M * G * n: guards

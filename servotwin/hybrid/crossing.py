@@ -1,4 +1,4 @@
-"""Where one guard becomes positive within one search step: its Taylor polynomial and the first root of it."""
+"""First time within one search step at which a guard becomes positive: the first root of its Taylor polynomial."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
 
 @inlined
 def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
-    """Whether the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
+    """True when the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
     base = (mode * t.guards + guard) * t.states
     value = dot(t.rows, base, x)
     if abs(value) > rounding(t, mode, guard, 0, x):

@@ -15,9 +15,9 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton, shared_flows, speeds
 from servotwin.hybrid.build import new_workspace, numbers_of
 from servotwin.hybrid.flow import new_scratch
-from servotwin.hybrid.kernel import DONE, ZENO, Record, grown, new_record
-from servotwin.hybrid.members import Family, Figures, Found, Hand, Starts, run_members
-from servotwin.hybrid.output import empty_outputs, new_block
+from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
+from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
+from servotwin.hybrid.output import empty_outputs, new_output_workspace
 from servotwin.hybrid.tables import divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
 
@@ -25,7 +25,7 @@ _PARTS_PER_WORKER = 8
 
 
 class Members(NamedTuple):
-    """Where runs begin, and what of them.
+    """Starts of the runs, and the automaton of each.
 
     Attributes
     ----------
@@ -43,9 +43,9 @@ class Members(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Judging:
-    """What figures need: ``limits`` (K, O) that an output is outside of, and the number of samples at the end that have
-    figures of their own."""
+class FigureOptions:
+    """Options of figures: ``limits`` (K, O) beyond which an output counts as outside, and the number of samples in the
+    last part, which has figures of its own."""
 
     limits: Array
     last: int
@@ -60,13 +60,13 @@ def run_ensemble(
     rows: ArrayLike,
     threads: int | None = None,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Outputs of every member at every sample.
+    """Run every member and return its outputs at every sample.
 
     Parameters
     ----------
     automaton : Automaton
     states : (K, n) array
-        Starts at time 0.
+        MemberStarts at time 0.
     modes : (K,) array
         Modes at time 0.
     sample_step : float
@@ -104,7 +104,7 @@ def run_family(
     samples: int,
     threads: int | None = None,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Outputs of every member at every sample, each of an automaton of its own.
+    """Run every member, each with an automaton of its own, and return its outputs at every sample.
 
     Parameters
     ----------
@@ -129,9 +129,9 @@ def run_family(
         Naming the member.
     """
     traces = np.empty((len(members.mode), rows.shape[1], samples))
-    found = Found(traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64))
-    _run(_family(automata, rows, sample_step), automata[0], members, found, None, threads)
-    return traces, found.events
+    results = MemberResults(traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64))
+    _run(_family(automata, rows, sample_step), automata[0], members, results, None, threads)
+    return traces, results.events
 
 
 def figures_of_family(
@@ -140,19 +140,19 @@ def figures_of_family(
     members: Members,
     sample_step: float,
     samples: int,
-    judging: Judging,
+    options: FigureOptions,
     threads: int | None = None,
 ) -> Figures:
-    """The same runs; the samples are not kept, but what they come to: arrays (K, O)."""
-    if not 1 <= judging.last <= samples:
-        raise InvalidInput(f"the last {judging.last} of {samples} samples: must be 1 to {samples}")
+    """Run the members as `run_family` does and reduce their samples to figures, arrays (K, O)."""
+    if not 1 <= options.last <= samples:
+        raise InvalidInput(f"the last {options.last} of {samples} samples: must be 1 to {samples}")
     figures = np.empty((len(members.mode), rows.shape[1], len(Figures._fields)))
-    found = Found(np.empty((1, rows.shape[1], samples)), figures, np.zeros(len(figures), dtype=np.int64))
-    _run(_family(automata, rows, sample_step), automata[0], members, found, judging, threads)
+    results = MemberResults(np.empty((1, rows.shape[1], samples)), figures, np.zeros(len(figures), dtype=np.int64))
+    _run(_family(automata, rows, sample_step), automata[0], members, results, options, threads)
     return Figures(*np.moveaxis(figures, 2, 0))
 
 
-def _family(automata: Sequence[Automaton], rows: Array, sample_step: float) -> Family:
+def _family(automata: Sequence[Automaton], rows: Array, sample_step: float) -> AutomatonFamily:
     flows = np.array([automaton.flows for automaton in automata])
     structure = _structure(automata[0])
     if any(_structure(automaton) != structure for automaton in automata[1:]):
@@ -160,7 +160,7 @@ def _family(automata: Sequence[Automaton], rows: Array, sample_step: float) -> F
     guards = max(1, *(len(mode.guards) for mode in automata[0].modes))
     numbers = [numbers_of(automaton, guards) for automaton in automata]
     strides = divisors(*speeds(flows), sample_step)
-    return Family(
+    return AutomatonFamily(
         np.array([each.flows for each in numbers]),
         np.array([each.rows for each in numbers]),
         np.array([each.resets for each in numbers]),
@@ -176,24 +176,24 @@ def _structure(automaton: Automaton) -> tuple[object, ...]:
 
 
 def _run(
-    family: Family,
+    family: AutomatonFamily,
     structure: Automaton,
     members: Members,
-    found: Found,
-    judging: Judging | None,
+    results: MemberResults,
+    options: FigureOptions | None,
     threads: int | None,
 ) -> None:
-    """Fill `found`; every worker takes the next part when it is done with one."""
-    starts = _checked_starts(structure, len(family.step), members, found, judging)
+    """Fill `results`; every worker takes the next part when it is done with one."""
+    starts = _checked_starts(structure, len(family.step), members, results, options)
     count = len(starts.order)
     workers = max(1, min(threads or os.cpu_count() or 1, count))
     # Members cost unequally: many small parts keep every worker busy to the end.
     size = max(1, count // (_PARTS_PER_WORKER * workers))
     parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
-    tail = 1 if judging is None else judging.last
+    tail = 1 if options is None else options.last
 
     def work(_: int) -> list[int]:
-        return _worked(family, structure, starts, found, parts, tail)
+        return _run_parts(family, structure, starts, results, parts, tail)
 
     with ThreadPoolExecutor(workers) as pool:
         lost = [member for some in pool.map(work, range(workers)) for member in some]
@@ -201,27 +201,39 @@ def _run(
         raise ZenoError(f"member {min(lost)} changes mode without end: the automaton is Zeno or slides")
 
 
-def _worked(
-    family: Family, structure: Automaton, starts: Starts, found: Found, parts: Iterator[tuple[int, int]], tail: int
+def _run_parts(
+    family: AutomatonFamily,
+    structure: Automaton,
+    starts: MemberStarts,
+    results: MemberResults,
+    parts: Iterator[tuple[int, int]],
+    tail: int,
 ) -> list[int]:
     """One worker: run parts while there are any; return the members that cannot go on."""
-    hand, record = _new_hand(family, structure), new_record(starts.state.shape[1])
-    if len(found.figures):
-        found = found._replace(traces=np.empty_like(found.traces))
+    memory, record = _new_memory(family, structure), new_record(starts.state.shape[1])
+    if len(results.figures):
+        results = results._replace(traces=np.empty_like(results.traces))
     lost = []
     for first, last in parts:
-        status, record = _run_part(family, starts, found, first, last, tail, hand, record)
+        status, record = _run_part(family, starts, results, first, last, tail, memory, record)
         if status >= 0:
             lost.append(int(starts.order[status]))
     return lost
 
 
 def _run_part(
-    family: Family, starts: Starts, found: Found, first: int, last: int, tail: int, hand: Hand, record: Record
-) -> tuple[int, Record]:
+    family: AutomatonFamily,
+    starts: MemberStarts,
+    results: MemberResults,
+    first: int,
+    last: int,
+    tail: int,
+    memory: WorkerMemory,
+    record: RunRecord,
+) -> tuple[int, RunRecord]:
     """Run the members of a part; return the place of the one that cannot go on, -1 when all are done."""
     while first < last:
-        status, first = run_members(family, starts, found, first, last, tail, hand, record)
+        status, first = run_members(family, starts, results, first, last, tail, memory, record)
         if status == ZENO:
             return int(first), record
         if status != DONE:
@@ -229,14 +241,14 @@ def _run_part(
     return -1, record
 
 
-def _new_hand(family: Family, structure: Automaton) -> Hand:
+def _new_memory(family: AutomatonFamily, structure: Automaton) -> WorkerMemory:
     flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
     tables = empty_tables(structure, shared_flows(flows))
-    return Hand(
+    return WorkerMemory(
         tables,
         empty_outputs(tables, family.outputs.shape[1]),
         new_workspace(tables),
-        new_block(tables.states),
+        new_output_workspace(tables.states),
         new_scratch(tables),
         np.zeros(tables.states),
         np.full(1, -1),
@@ -244,8 +256,8 @@ def _new_hand(family: Family, structure: Automaton) -> Hand:
 
 
 def _checked_starts(
-    structure: Automaton, automata: int, members: Members, found: Found, judging: Judging | None
-) -> Starts:
+    structure: Automaton, automata: int, members: Members, results: MemberResults, options: FigureOptions | None
+) -> MemberStarts:
     which, modes, states = members
     n, count = len(structure.names), len(structure.modes)
     if states.shape != (len(modes), n):
@@ -254,5 +266,5 @@ def _checked_starts(
         raise InvalidInput(f"states must be finite and modes one of 0 to {count - 1}")
     if which.shape != modes.shape or not np.isin(which, np.arange(automata)).all():
         raise InvalidInput(f"every member needs an automaton of 0 to {automata - 1}")
-    limits = np.zeros((len(modes), found.traces.shape[1])) if judging is None else judging.limits
-    return Starts(np.argsort(which, kind="stable"), which, modes, states, limits)
+    limits = np.zeros((len(modes), results.traces.shape[1])) if options is None else options.limits
+    return MemberStarts(np.argsort(which, kind="stable"), which, modes, states, limits)

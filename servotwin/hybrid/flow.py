@@ -112,7 +112,7 @@ def dot_sizes(table: Array, base: int, x: Array) -> float:
 
 @inlined
 def rounding(t: Tables, mode: int, guard: int, order: int, x: Array) -> float:
-    """What of a guard's Taylor coefficient (in steps) may be rounding."""
+    """Part of a guard's Taylor coefficient (in steps) that may be rounding."""
     return SIGNIFICANT * dot_sizes(t.sizes, ((mode * t.guards + guard) * TERMS + order) * t.states, x)
 
 

@@ -25,9 +25,8 @@ EVENTS_PER_STEP = 1000
 CHANGES_AT_ONCE = 64
 
 
-class Record(NamedTuple):
-    """Growing output: segments (start of a stretch of one flow) and events; ``size[0]`` segments and ``size[1]`` events
-    are filled."""
+class RunRecord(NamedTuple):
+    """Growing output of a run: segments (starts of one flow) and events; ``size[0]`` and ``size[1]`` are filled."""
 
     size: NDArray[np.int64]
     step: NDArray[np.int64]
@@ -41,9 +40,9 @@ class Record(NamedTuple):
     event_forced: NDArray[np.bool_]
 
 
-def new_record(states: int, segments: int = 4 * EVENTS_PER_STEP, events: int = 4 * EVENTS_PER_STEP) -> Record:
+def new_record(states: int, segments: int = 4 * EVENTS_PER_STEP, events: int = 4 * EVENTS_PER_STEP) -> RunRecord:
     """An empty record with room for so many segments and events."""
-    return Record(
+    return RunRecord(
         np.zeros(2, dtype=np.int64),
         np.empty(segments, dtype=np.int64),
         np.empty(segments),
@@ -57,7 +56,7 @@ def new_record(states: int, segments: int = 4 * EVENTS_PER_STEP, events: int = 4
     )
 
 
-def grown(record: Record) -> Record:
+def grown(record: RunRecord) -> RunRecord:
     """A copy with twice the room."""
     larger = new_record(record.state.shape[1], 2 * len(record.step), 2 * len(record.event_step))
     for old, new in zip(record, larger, strict=True):
@@ -66,7 +65,7 @@ def grown(record: Record) -> Record:
 
 
 @inlined
-def note_segment(record: Record, step: int, fraction: float, mode: int, x: Array) -> None:
+def note_segment(record: RunRecord, step: int, fraction: float, mode: int, x: Array) -> None:
     """Start a segment at a place."""
     at = record.size[0]
     record.step[at], record.fraction[at], record.mode[at] = step, fraction, mode
@@ -84,7 +83,7 @@ def fire(
     step: int,
     fraction: float,
     forced: bool,
-    record: Record,
+    record: RunRecord,
     scratch: Scratch,
 ) -> int:
     """Record the event, apply the guard's reset and return the mode entered."""
@@ -98,10 +97,13 @@ def fire(
 
 
 @inlined
-def settle(
-    t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: Record, scratch: Scratch
+def follow_guards(
+    t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: RunRecord, scratch: Scratch
 ) -> int:
-    """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none."""
+    """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none.
+
+    A jump or a reset may make several guards positive at once; each change is an event of its own.
+    """
     for _ in range(CHANGES_AT_ONCE):
         leaving = -1
         for g in range(t.guard_count[mode]):
@@ -116,7 +118,7 @@ def settle(
 
 @inlined
 def cross(
-    t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: Record, scratch: Scratch
+    t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: RunRecord, scratch: Scratch
 ) -> tuple[int, int]:
     """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number
     of events."""
@@ -133,7 +135,7 @@ def cross(
         advance_fraction(t, mode, x, first, scratch)
         place = min(place + first, end)
         mode = fire(t, mode, which, x, step, place, False, record, scratch)
-        mode = settle(t, mode, x, step, place, False, record, scratch)
+        mode = follow_guards(t, mode, x, step, place, False, record, scratch)
         if mode < 0:
             break
         note_segment(record, step, place, mode, x)
@@ -141,7 +143,7 @@ def cross(
 
 
 @inlined
-def step_once(t: Tables, mode: int, x: Array, step: int, record: Record, scratch: Scratch) -> int:
+def step_once(t: Tables, mode: int, x: Array, step: int, record: RunRecord, scratch: Scratch) -> int:
     """Advance `x` in place by one search step; return the mode, -1 when Zeno. One product when nothing happens."""
     n = np.uint64(t.states)
     stride = t.states + 4 * t.guards
@@ -168,14 +170,14 @@ def flow_until(
     fraction: float,
     end_step: int,
     end_fraction: float,
-    record: Record,
+    record: RunRecord,
     scratch: Scratch,
 ) -> tuple[int, int, float, int]:
     """Advance `x` in place from one place to another.
 
     Returns status, place reached (of the failure when Zeno) and mode.
     """
-    calm = 0
+    calm = 0  # search steps since the last event
     room = len(record.step) - EVENTS_PER_STEP - 4
     room_events = len(record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE - 4
     if record.size[0] > room or record.size[1] > room_events:
@@ -185,7 +187,7 @@ def flow_until(
         if record.size[0] > room or record.size[1] > room_events:
             return FULL, step, fraction, mode
         if fraction == 0.0 and calm >= NODES_FINE and end_step - step >= NODES_FINE:
-            # Only after a while without events: what they excite may be fast.
+            # Only after a while without events: they may excite motions that are fast, and gone within a coarse step.
             wanted = min(NODES_COARSE, (end_step - step) // NODES_FINE)
             clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, wanted, mode, x, scratch)
             if clean > 0:
@@ -222,17 +224,17 @@ def follow_schedule(
     jump_fraction: Array,
     jump_value: Array,
     jump_mode: NDArray[np.int64],
-    record: Record,
+    record: RunRecord,
     scratch: Scratch,
 ) -> int:
-    """Flow from jump to jump, apply each (NaN keeps a state), settle; the last row only marks the end.
+    """Flow from jump to jump, apply each (NaN keeps a state), follow guards; the last row only marks the end.
 
     ``place = [fraction]`` and ``at = [step, mode, next jump, fresh]`` are updated in place, so that a run resumes when
     `record` has grown.
     """
     while True:
         if at[3] == 1:
-            mode = settle(t, at[1], x, at[0], place[0], True, record, scratch)
+            mode = follow_guards(t, at[1], x, at[0], place[0], True, record, scratch)
             if mode < 0:
                 return ZENO
             at[1], at[3] = mode, 0

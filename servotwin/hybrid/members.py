@@ -1,5 +1,5 @@
-"""The compiled side of an ensemble: tables filled for one automaton after the other, its members run, their outputs
-sampled, and what is asked of those summed up."""
+"""The compiled side of an ensemble: for one automaton after the other fill its tables, run its members, sample their
+outputs and reduce these to figures."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.build import Numbers, Workspace, fill_tables
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import Scratch
-from servotwin.hybrid.kernel import DONE, ZENO, Record, flow_until, settle
-from servotwin.hybrid.output import Block, Outputs, fill_output, sample_segments
+from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, flow_until, follow_guards
+from servotwin.hybrid.output import Outputs, OutputWorkspace, fill_output, sample_segments
 from servotwin.hybrid.tables import Tables
 
 
 class Figures(NamedTuple):
-    """What is left of outputs when their samples are not kept; arrays of one shape, ``[..., output]``.
+    """Figures of outputs whose samples are not kept; arrays of one shape, ``[..., output]``.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Figures(NamedTuple):
     last_mean_square: Array
 
 
-class Family(NamedTuple):
+class AutomatonFamily(NamedTuple):
     """Automata of one structure: the numbers of each."""
 
     flows: Array  # (A, M * n * n)
@@ -58,8 +58,8 @@ class Family(NamedTuple):
     stride: NDArray[np.int64]  # (A,) search steps a sample
 
 
-class Starts(NamedTuple):
-    """Where members begin."""
+class MemberStarts(NamedTuple):
+    """Starts of the members."""
 
     order: NDArray[np.int64]  # (K,) in which to run them: those of one automaton together
     automaton: NDArray[np.int64]  # (K,)
@@ -68,45 +68,45 @@ class Starts(NamedTuple):
     limits: Array  # (K, O) outputs beyond them count as outside
 
 
-class Found(NamedTuple):
-    """What is kept of members."""
+class MemberResults(NamedTuple):
+    """Results of the members."""
 
     traces: Array  # (K, O, samples), or (1, O, samples) when only figures are asked for
     figures: Array  # (K, O, number of figures), or (0, O, number of figures)
     events: NDArray[np.int64]  # (K,)
 
 
-class Hand(NamedTuple):
-    """What one worker holds: everything that it fills again for each automaton and each member."""
+class WorkerMemory(NamedTuple):
+    """Memory of one worker, filled again for each automaton and each member."""
 
     tables: Tables
     outputs: Outputs
     workspace: Workspace
-    block: Block
+    block: OutputWorkspace
     scratch: Scratch
     state: Array
     loaded: NDArray[np.int64]  # (1,) automaton that the tables are those of; -1: none
 
 
 @inlined
-def output(hand: Hand, o: int) -> Outputs:
+def output(memory: WorkerMemory, o: int) -> Outputs:
     """One of the outputs."""
-    every = hand.outputs
+    every = memory.outputs
     return Outputs(every.table[o], every.place[o], every.order[o], every.used[o])
 
 
 @bare
-def load(family: Family, a: int, hand: Hand) -> None:
+def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
     """Fill the tables for automaton `a`."""
     numbers = Numbers(family.flows[a], family.guards[a], family.resets[a])
-    fill_tables(hand.tables, numbers, family.step[a], hand.workspace)
+    fill_tables(memory.tables, numbers, family.step[a], memory.workspace)
     for o in range(family.outputs.shape[1]):
-        fill_output(hand.tables, family.outputs[a, o], family.stride[a], output(hand, o), hand.block)
-    hand.loaded[0] = a
+        fill_output(memory.tables, family.outputs[a, o], family.stride[a], output(memory, o), memory.block)
+    memory.loaded[0] = a
 
 
 @bare
-def sample_all(record: Record, hand: Hand, stride: int, traces: Array) -> None:
+def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Array) -> None:
     """Every output of the run just recorded."""
     for o in range(len(traces)):
         sample_segments(
@@ -116,10 +116,10 @@ def sample_all(record: Record, hand: Hand, stride: int, traces: Array) -> None:
             record.fraction,
             record.mode,
             record.state,
-            output(hand, o),
+            output(memory, o),
             stride,
             0,
-            hand.scratch.change,
+            memory.scratch.change,
             traces[o],
         )
 
@@ -151,30 +151,37 @@ def figures_of(y: Array, limit: float, tail: int, out: Array) -> None:
 
 @bare
 def run_members(
-    family: Family, starts: Starts, found: Found, first: int, last: int, tail: int, hand: Hand, record: Record
+    family: AutomatonFamily,
+    starts: MemberStarts,
+    results: MemberResults,
+    first: int,
+    last: int,
+    tail: int,
+    memory: WorkerMemory,
+    record: RunRecord,
 ) -> tuple[int, int]:
     """Run members at places first .. last - 1 of the order; return the status and the place it concerns. `tail` is the
     number of samples at the end that have figures of their own."""
-    t = hand.tables
+    t = memory.tables
     for place in range(first, last):
         k = starts.order[place]
         a = starts.automaton[k]
-        if hand.loaded[0] != a:
-            load(family, a, hand)
+        if memory.loaded[0] != a:
+            load(family, a, memory)
         for i in range(t.states):
-            hand.state[i] = starts.state[k, i]
-        traces = found.traces[k if len(found.traces) > 1 else 0]
+            memory.state[i] = starts.state[k, i]
+        traces = results.traces[k if len(results.traces) > 1 else 0]
         steps = (traces.shape[1] - 1) * family.stride[a]
         record.size[0] = record.size[1] = 0
-        mode = settle(t, starts.mode[k], hand.state, 0, 0.0, True, record, hand.scratch)
+        mode = follow_guards(t, starts.mode[k], memory.state, 0, 0.0, True, record, memory.scratch)
         if mode < 0:
             return ZENO, place
-        status, _, _, mode = flow_until(t, hand.state, mode, 0, 0.0, steps, 0.0, record, hand.scratch)
+        status, _, _, mode = flow_until(t, memory.state, mode, 0, 0.0, steps, 0.0, record, memory.scratch)
         if status != DONE:
             return status, place
-        found.events[k] = record.size[1]
-        sample_all(record, hand, family.stride[a], traces)
-        if len(found.figures) > 0:
+        results.events[k] = record.size[1]
+        sample_all(record, memory, family.stride[a], traces)
+        if len(results.figures) > 0:
             for o in range(len(traces)):
-                figures_of(traces[o], starts.limits[k, o], tail, found.figures[k, o])
+                figures_of(traces[o], starts.limits[k, o], tail, results.figures[k, o])
     return DONE, last

@@ -17,7 +17,7 @@ _BLOCK = NODES_COARSE * NODES_FINE
 
 
 class Outputs(NamedTuple):
-    """How one output follows from the state at the start of a segment, up to 127 steps later."""
+    """Table of one output: from the state at the start of a segment to the output up to 127 steps later."""
 
     table: Array  # M * 128 * n, or M * n * 128 for the states in `order`
     place: NDArray[np.int64]  # (M,) mode whose rows these are: modes of equal flow and row share them
@@ -25,7 +25,7 @@ class Outputs(NamedTuple):
     used: NDArray[np.int64]  # (M,) number of those that count
 
 
-class Block(NamedTuple):
+class OutputWorkspace(NamedTuple):
     """Working memory of `fill_output`."""
 
     starts: Array
@@ -33,9 +33,9 @@ class Block(NamedTuple):
     rows: Array
 
 
-def new_block(states: int) -> Block:
+def new_output_workspace(states: int) -> OutputWorkspace:
     """Working memory for outputs of so many states."""
-    return Block(
+    return OutputWorkspace(
         aligned(np.zeros(NODES_COARSE * states)), aligned(np.zeros(states * states)), aligned(np.zeros(_BLOCK * states))
     )
 
@@ -57,7 +57,7 @@ def _equal(rows: Array, one: int, other: int, n: int) -> bool:
 
 
 @bare
-def _fill_rows(t: Tables, flow: int, row: Array, w: Block) -> None:
+def _fill_rows(t: Tables, flow: int, row: Array, w: OutputWorkspace) -> None:
     """``row @ exp(A j h)`` for all j: to every eighth step, and on from each of those."""
     n = t.states
     for k in range(n):
@@ -78,7 +78,7 @@ def _fill_rows(t: Tables, flow: int, row: Array, w: Block) -> None:
 
 
 @bare
-def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: Block) -> None:
+def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
     """Rows as sampling needs them: whole ones, or for every step the columns that are not zero."""
     base = m * _BLOCK * n
     if stride > 1:
@@ -102,7 +102,7 @@ def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: Block) -> None:
 
 
 @bare
-def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: Block) -> None:
+def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
     """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)`` for a
     few."""
     n = t.states
@@ -120,7 +120,9 @@ def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: Block)
 def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
     """The output ``rows[m] @ x``, `rows` being (M, n), at every `stride`-th step."""
     outputs = empty_outputs(tables)
-    fill_output(tables, np.ascontiguousarray(rows, dtype=float).ravel(), stride, outputs, new_block(tables.states))
+    fill_output(
+        tables, np.ascontiguousarray(rows, dtype=float).ravel(), stride, outputs, new_output_workspace(tables.states)
+    )
     return outputs
 
 

@@ -3,7 +3,7 @@
 Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every
 step, and a single step as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; its
 Bernstein coefficients are the values and the values plus or minus a third of the slopes, so "no coefficient above zero"
-means "the cubic does not leave the mode", and one product settles a whole block.
+means "the cubic does not leave the mode", and one product decides a whole block.
 """
 
 from __future__ import annotations

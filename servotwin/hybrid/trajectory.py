@@ -1,4 +1,4 @@
-"""Running an automaton, and what comes out: exact dense output and a table of events."""
+"""Running an automaton: exact dense output and a table of events."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.build import build_tables
 from servotwin.hybrid.flow import new_scratch
-from servotwin.hybrid.kernel import FULL, ZENO, Record, follow_schedule, grown, new_record
+from servotwin.hybrid.kernel import FULL, ZENO, RunRecord, follow_schedule, grown, new_record
 from servotwin.hybrid.output import Outputs, evaluate, output_table, sample_segments
 from servotwin.hybrid.tables import Tables, search_step
 
@@ -76,7 +76,7 @@ class Trajectory:
     step: float = field(init=False)
     divisor: int = field(init=False)
     tables: Tables = field(init=False, repr=False)
-    record: Record = field(init=False, repr=False)
+    record: RunRecord = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.sample_step) and self.sample_step > 0.0):

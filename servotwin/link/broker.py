@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import missing_extra
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
@@ -210,8 +211,8 @@ def _client(broker: Broker, wanted: Wanted) -> Client:
     try:
         from paho.mqtt.client import Client, MQTTv5
         from paho.mqtt.enums import CallbackAPIVersion
-    except ImportError:
-        raise InvalidInput("the link over MQTT needs paho-mqtt: pip install 'servotwin[mqtt]'") from None
+    except ModuleNotFoundError:
+        raise missing_extra("paho", "the link over MQTT") from None
     client = Client(CallbackAPIVersion.VERSION2, wanted.client_id, protocol=MQTTv5, manual_ack=True)
     client.max_queued_messages_set(QUEUED)
     client.max_inflight_messages_set(wanted.receive)

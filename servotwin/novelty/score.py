@@ -23,7 +23,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
 from servotwin.estimation.core.decimation import Decimation, decimation
-from servotwin.estimation.core.normal import LeastSquares, independent_least_squares
+from servotwin.estimation.core.least_squares import LeastSquares, independent_least_squares
 from servotwin.estimation.core.response import Readout, Response, response
 from servotwin.estimation.core.whitening import Autoregression, burg
 from servotwin.novelty.settings import NoveltyModel, ResponseMode

@@ -1,1 +1,1 @@
-"""What is controlled: motor, lead screw with its gap, chain of masses, sensors, and the signals that drive them."""
+"""The controlled machine: motor, lead screw with its gap, chain of masses, sensors, and the signals that drive them."""

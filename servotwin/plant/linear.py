@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
+from servotwin.runtime.extras import require
 
 Complex = NDArray[np.complex128]
 # Rounding error of a fraction of polynomials, relative, beyond which the response is computed from the matrices: the
@@ -144,10 +145,7 @@ class LinearSystem:
         InvalidInput
             python-control is not installed.
         """
-        try:
-            import control
-        except ImportError:
-            raise InvalidInput("python-control is not installed; give: pip install 'servotwin[interop]'") from None
+        control = require("control", "a python-control system")
         return control.ss(self.A, self.B[:, None], self.C[None, :], [[self.D]])
 
 

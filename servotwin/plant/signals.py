@@ -27,7 +27,7 @@ _TIME_ROUNDING = 4 * float(np.finfo(float).eps)
 
 @runtime_checkable
 class Signal(Protocol):
-    """Anything that can say what it is on [0, duration]."""
+    """Any function of time that can be written as cubics on [0, duration]."""
 
     def pieces(self, duration: float, /) -> PiecewiseCubic: ...
 
@@ -77,7 +77,7 @@ class PiecewiseCubic:
         return cls(times, coeffs)
 
     def pieces(self, _duration: float, /) -> PiecewiseCubic:
-        """Itself: a piecewise cubic holds for ever."""
+        """Return itself: a piecewise cubic holds for ever."""
         return self
 
     def value(self, t: ArrayLike) -> Array:
@@ -142,7 +142,7 @@ class PiecewiseCubic:
         return PiecewiseCubic(self.times, self.coeffs * factor)
 
     def later(self, time: float) -> PiecewiseCubic:
-        """What it is from a time (s, at least 0) on, as a signal that begins there."""
+        """Rest of the signal from a time (s, at least 0) on, as a signal that begins there."""
         first = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
         return PiecewiseCubic(self.times[first:] - time, self.coeffs[first:])
 

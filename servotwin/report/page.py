@@ -12,25 +12,25 @@ SIGNS = {"reproduced": ("✓", "yes"), "not as stated": ("✗", "no"), "cannot b
 
 
 def page(title: str, body: Iterable[str]) -> str:
-    """The whole document around a body made of HTML fragments."""
+    """Compose the document around a body of HTML fragments."""
     text = resources.files("servotwin.report").joinpath("page.html").read_text(encoding="utf-8")
     return Template(text).substitute(title=escape(title), body="\n".join(body))
 
 
 def image(vector: bytes, text: str) -> str:
-    """An SVG as an image element; `text` is what is read out instead of it."""
+    """Make an image element of an SVG; `text` is its alternative text."""
     data = base64.b64encode(vector).decode("ascii")
     return f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(text)}">'
 
 
 def figure(vector: bytes, title: str, caption: str) -> str:
-    """An image with its title and caption."""
+    """Make a figure of an image with title and caption."""
     text = f"<strong>{escape(title)}</strong> {escape(caption)}"
     return f"<figure><div class='scroll'>{image(vector, title)}</div><figcaption>{text}</figcaption></figure>"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = False) -> str:
-    """A table of plain texts; `stack` turns each row into a card on a narrow screen, otherwise the table scrolls."""
+    """Make a table of plain texts; `stack` turns rows into cards on a narrow screen, otherwise the table scrolls."""
     cells = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
     lines = "".join(_row(head, row) for row in rows)
     kind = ' class="stack"' if stack else ""
@@ -38,7 +38,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = F
 
 
 def badge(verdict: str) -> str:
-    """A verdict as a sign, a word and a colour."""
+    """Make a badge of a verdict: sign, word and colour."""
     sign, kind = SIGNS[verdict]
     return f'<span class="badge {kind}">{sign} {escape(verdict)}</span>'
 

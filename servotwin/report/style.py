@@ -1,4 +1,4 @@
-"""How every figure looks: colour-blind safe palette (Okabe & Ito), sizes, panels, decimated traces, files."""
+"""Style of every figure: colour-blind safe palette (Okabe & Ito), sizes, panels, decimated traces, files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _LOOK: Any = {
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw inside this block."""
+    """Apply the style inside this block."""
     with matplotlib.rc_context(_LOOK):
         yield
 
@@ -55,20 +55,20 @@ def look() -> Iterator[None]:
 def panels(
     rows: int, columns: int = 1, height: float = 2.3, heights: Sequence[float] | None = None, share: bool = True
 ) -> tuple[Figure, NDArray[Any]]:
-    """A figure 7.2 inches wide and its axes (rows, columns); `height` in inches per row, `heights` relative."""
+    """Make a figure 7.2 inches wide and its axes (rows, columns); `height` in inches per row, `heights` relative."""
     figure = sheet(7.2, height * rows)
     axes = figure.subplots(rows, columns, squeeze=False, sharex="col" if share else False, height_ratios=heights)
     return figure, axes
 
 
 def letter(axes: Sequence[Axes]) -> None:
-    """(a), (b), ... at the panels' upper left, beside the titles."""
+    """Write (a), (b), ... at the panels' upper left, beside the titles."""
     for one, name in zip(axes, "abcdefghij", strict=False):
         one.set_title(f"({name})", loc="left", fontweight="bold")
 
 
 def envelope(time: ArrayLike, values: ArrayLike, columns: int = 1200) -> tuple[NDArray[Any], NDArray[Any]]:
-    """At most two samples per column, the least and the greatest in their order: what a screen would show of all."""
+    """Reduce a signal to the least and greatest sample per column, in their order: a screen shows no more."""
     time, values = np.asarray(time), np.asarray(values)
     if values.size <= 4 * columns:
         return time, values
@@ -82,17 +82,17 @@ def envelope(time: ArrayLike, values: ArrayLike, columns: int = 1200) -> tuple[N
 
 
 def trace(axes: Axes, time: ArrayLike, values: ArrayLike, color: str, label: str | None = None, **how: Any) -> None:
-    """Plot a long signal without drawing what no eye can see."""
+    """Plot a long signal, reduced to its envelope."""
     axes.plot(*envelope(time, values), color=color, label=label, **how)
 
 
 def sheet(width: float, height: float) -> Figure:
-    """An empty figure, size in inches."""
+    """Make an empty figure; size in inches."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def bode(upper: Axes, lower: Axes, omega: Array, response: Complex, color: str, label: str) -> None:
-    """Magnitude in dB above, unwrapped phase below, over frequency in rad/s."""
+    """Draw magnitude in dB above and unwrapped phase below, over frequency in rad/s."""
     upper.semilogx(omega, 20.0 * np.log10(np.abs(response)), color=color)
     upper.set_ylabel(label)
     lower.semilogx(omega, np.degrees(np.unwrap(np.angle(response))), color=color)
@@ -102,13 +102,13 @@ def bode(upper: Axes, lower: Axes, omega: Array, response: Complex, color: str, 
 
 
 def legend(axes: Axes, columns: int = 4, **how: Any) -> None:
-    """A legend in one line above the axes, where it covers no data."""
+    """Draw the legend in one line above the axes, where it covers no data."""
     spacing = {"borderaxespad": 0.2, "handlelength": 1.5, "columnspacing": 1.0, "handletextpad": 0.5}
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, **spacing, **how)
 
 
 def svg(figure: Figure, name: str) -> bytes:
-    """The figure as a vector image, the same bytes for the same figure."""
+    """Encode the figure as a vector image; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     with matplotlib.rc_context({**_LOOK, "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})

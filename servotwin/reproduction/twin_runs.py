@@ -277,7 +277,7 @@ def _window_errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float
     )
     starts = np.arange(WINDOW_STEPS) * PERIOD / 2.0
     windows = [st.Window.from_run(run, float(start), 1.0) for start in starts]
-    settings = paper.Settings(settle_s=settle)
+    settings = paper.PaperSettings(settle_s=settle)
     estimates = [
         st.estimate_gap(window, servo, method="paper", prior=gap * 2.0 / 3.0, settings=settings) for window in windows
     ]

@@ -1,22 +1,39 @@
-"""Optional dependencies: the one place that says how to install one that is missing."""
+"""Optional dependencies: which extra installs each, and the one sentence where one is missing."""
 
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from typing import Any
 
 from servotwin.errors import InvalidInput
 
+EXTRAS = {
+    "alembic": ("alembic", "twin"),
+    "asyncua": ("asyncua", "opcua"),
+    "control": ("control", "interop"),
+    "distributed": ("dask[distributed]", "dask"),
+    "httptools": ("httptools", "twin"),
+    "joblib": ("joblib", "maps"),
+    "matplotlib": ("matplotlib", "plot"),
+    "paho": ("paho-mqtt", "mqtt"),
+    "pandas": ("pandas", "pandas"),
+    "psycopg": ("psycopg", "postgres"),
+    "pyarrow": ("pyarrow", "parquet"),
+    "sqlalchemy": ("sqlalchemy", "twin"),
+    "uvicorn": ("uvicorn", "twin"),
+    "zstandard": ("zstandard", "twin"),
+}
+"""Distribution and extra by the name that is imported."""
 
-def require(module: str, extra: str, purpose: str) -> Any:
+
+def require(module: str, purpose: str) -> Any:
     """Import an optional dependency.
 
     Parameters
     ----------
     module : str
-        Dotted name of the module.
-    extra : str
-        Extra of servotwin that installs it.
+        Dotted name of the module; its package is in `EXTRAS`.
     purpose : str
         Feature that needs it; the message begins with it.
 
@@ -27,17 +44,42 @@ def require(module: str, extra: str, purpose: str) -> Any:
     Raises
     ------
     InvalidInput
-        The module is not installed; the sentence names the pip command.
+        The package is not installed.
     """
     try:
         return importlib.import_module(module)
-    except ImportError as error:
-        raise missing(error.name or module, extra, purpose) from None
+    except ModuleNotFoundError as error:
+        raise missing_extra(error.name or module, purpose) from None
 
 
-def missing(package: str, extra: str, purpose: str) -> InvalidInput:
-    """Error for a package that is not installed."""
-    package = {"paho": "paho-mqtt", "sqlalchemy": "SQLAlchemy"}.get(
-        package.partition(".")[0], package.partition(".")[0]
-    )
+def check_extra(module: str, purpose: str) -> None:
+    """Refuse at once what would need an absent package later; nothing is imported.
+
+    Raises
+    ------
+    InvalidInput
+        The package is not installed.
+    """
+    if not _is_installed(module):
+        raise missing_extra(module, purpose)
+
+
+def missing_extra(module: str, purpose: str) -> InvalidInput:
+    """Error for a package of `EXTRAS` that is not installed; names the pip command.
+
+    Parameters
+    ----------
+    module : str
+        Dotted name of what could not be imported.
+    purpose : str
+        Feature that needs it.
+    """
+    package, extra = EXTRAS[module.partition(".")[0]]
     return InvalidInput(f"{purpose} needs {package}, which is not installed; give: pip install 'servotwin[{extra}]'")
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except (ModuleNotFoundError, ValueError):  # ValueError: sys.modules holds None for it
+        return False

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.ensemble import Judging, figures_of_family, run_family
+from servotwin.hybrid.ensemble import FigureOptions, figures_of_family, run_family
 from servotwin.hybrid.members import Figures
 from servotwin.plant.servo import Servo
 from servotwin.simulation.cases import Cases, Crowd, crowd
@@ -146,14 +146,14 @@ def summarise_members(
         bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
     found = np.empty((len(bounds), len(outputs), len(Figures._fields)))
     for group in members.groups(outputs):
-        judging = Judging(bounds[group.which], judged)
+        options = FigureOptions(bounds[group.which], judged)
         figures = figures_of_family(
             group.automata,
             group.rows,
             group.members,
             1.0 / sample_rate,
             _samples(duration, sample_rate),
-            judging,
+            options,
             threads,
         )
         found[group.which] = np.stack(figures, axis=2)

@@ -12,7 +12,7 @@ from servotwin.control.law import LawParameters, LawState
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import Scratch
-from servotwin.hybrid.kernel import DONE, FULL, ZENO, Record, step_once
+from servotwin.hybrid.kernel import DONE, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.tables import Tables
 
 tick = verbatim(law.tick)
@@ -112,7 +112,7 @@ def run_ticks(
     port: Port,
     drive: Drive,
     output: Output,
-    record: Record,
+    record: RunRecord,
     scratch: Scratch,
 ) -> tuple[int, int, int, LawState]:
     """Run base steps `base` .. `end` - 1; return status, the next base step, mode and law state. Stops early when

@@ -28,7 +28,7 @@ def stacked_figure(title: str, time: Any, panels: Sequence[Panel]) -> Figure:
     InvalidInput
         matplotlib is not installed.
     """
-    pyplot = require("matplotlib.pyplot", "plot", "a figure")
+    pyplot = require("matplotlib.pyplot", "a figure")
     height = 1.0 + 1.8 * len(panels)
     figure, axes = pyplot.subplots(
         len(panels), 1, sharex=True, squeeze=False, figsize=(8.0, height), layout="constrained"
@@ -53,7 +53,7 @@ def pandas_table(columns: Mapping[str, Any]) -> Any:
     InvalidInput
         pandas is not installed.
     """
-    return require("pandas", "pandas", "a pandas table").DataFrame(dict(columns))
+    return require("pandas", "a pandas table").DataFrame(dict(columns))
 
 
 def arrow_table(columns: Mapping[str, Any]) -> Any:
@@ -64,5 +64,5 @@ def arrow_table(columns: Mapping[str, Any]) -> Any:
     InvalidInput
         pyarrow is not installed.
     """
-    pyarrow = require("pyarrow", "parquet", "an Arrow table")
+    pyarrow = require("pyarrow", "an Arrow table")
     return pyarrow.table({name: np.ascontiguousarray(values) for name, values in columns.items()})

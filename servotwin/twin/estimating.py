@@ -39,7 +39,7 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     given = settings_of(settings.method, settings.estimator)
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        if not isinstance(given, whitened.Settings):
+        if not isinstance(given, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, given)
         drift = given.gap_rate or expected.gap_rate(settings.trend)
         return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)

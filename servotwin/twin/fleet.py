@@ -26,7 +26,7 @@ from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
-from servotwin.config.table import Table, did_you_mean, named, parse_toml, part
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_inner
 from servotwin.config.toml import changes
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
@@ -165,7 +165,7 @@ def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[Model, 
     """[models] of a twin's file; unless they are `checked`, what their policies need may still be missing."""
     inner = table.table("models", required=True)
     make = partial(_model, folder=folder, checked=checked)
-    return tuple(part(inner, name, partial(make, name=name)) for name in inner.values)
+    return tuple(read_inner(inner, name, partial(make, name=name)) for name in inner.values)
 
 
 def _check_pattern(servo: str) -> None:
@@ -178,8 +178,8 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo = _servo(table, folder)
-    law = part(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
-    settings = part(table, "twin", partial(read_twin_settings, folder=folder))
+    law = read_inner(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
+    settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)
     if checked:

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.estimation.disturbance import quick_bias
-from servotwin.estimation.whitened.quick import Quick, quick_fit
+from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
@@ -155,7 +155,7 @@ def _blind(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
-def _unclear(seen: Quick, settings: TriageSettings) -> str:
+def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
     """Why a glance cannot say whether the gap moved."""
     if not seen.settled:
         return "the plain fit did not settle"

@@ -13,7 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.quick import Quick, quick_fit
+from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.messages import Window as WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.twin.decode import decode_window
@@ -95,7 +95,7 @@ class Triage:
             seen.misfit if math.isnan(before) else max(_FADES * before, seen.misfit),
         )
 
-    def _misled(self, seen: Quick, estimate: GapEstimate) -> str:
+    def _misled(self, seen: QuickFit, estimate: GapEstimate) -> str:
         """By how much a glance was wrong, in words; empty where it was not."""
         off = abs(seen.gap - estimate.gap)
         if off <= allowed(math.hypot(seen.std, estimate.std), self.settings):

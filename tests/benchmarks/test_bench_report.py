@@ -1,4 +1,4 @@
-"""What benches write down: JSON that every reader takes, and nothing where nothing was asked for."""
+"""Documents of the benchmarks: JSON that every reader accepts, and none without an output."""
 
 import json
 import math

@@ -13,8 +13,8 @@ from rich.console import Console
 from benchmarks.policies.command import chosen, dumps, policies, shown
 from benchmarks.policies.contenders import constants, contender
 from benchmarks.policies.machines import BIAS, BLOCKS, machines
-from benchmarks.policies.table import Row, compare
-from benchmarks.policies.trial import REST, Told, run_machine, scores
+from benchmarks.policies.table import PolicyScores, compare
+from benchmarks.policies.trial import REST, Contender, run_machine, scores
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
@@ -55,7 +55,7 @@ def test_scores_are_those_of_the_closed_form() -> None:
 def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
     machine = max(machines(MODEL, KNOWN, "bias", 10, 1), key=lambda m: abs(m.input_bias))
     learnt = run_machine(machine, "bias", MODEL, contender("certified", MODEL, KNOWN))
-    constant = run_machine(machine, "bias", MODEL, Told(None, CALM))
+    constant = run_machine(machine, "bias", MODEL, Contender(None, CALM))
     assert constant.tail == pytest.approx(abs(machine.input_bias / CALM.controller.Kp), rel=1e-2)
     assert learnt.tail < 0.05 * constant.tail
     assert learnt.cost < constant.cost
@@ -84,8 +84,10 @@ def test_the_table_and_its_document() -> None:
 
 def test_settled_is_a_share() -> None:
     those = tuple(machines(MODEL, KNOWN, "clean", 2, 1))
-    still, hunting = (run_machine(those[0], "clean", MODEL, Told(None, s)) for s in (CALM, Design(MODEL.controller)))
-    row = Row("clean", "two", type(still)(*np.array([still, hunting]).T), those)
+    still, hunting = (
+        run_machine(those[0], "clean", MODEL, Contender(None, s)) for s in (CALM, Design(MODEL.controller))
+    )
+    row = PolicyScores("clean", "two", type(still)(*np.array([still, hunting]).T), those)
     assert row.settled == 0.5
 
 

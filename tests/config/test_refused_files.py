@@ -162,6 +162,6 @@ def test_a_broker_without_its_library_is_refused(tmp_path: Path, monkeypatch: py
     (tmp_path / "token").chmod(0o600)
     (tmp_path / "edge.toml").write_text(f'{EDGE}[twin]\nurl = "mqtt://h"\n{TOKEN}')
     check(load(tmp_path / "edge.toml"))
-    monkeypatch.setattr("servotwin.edge_process.startup.find_spec", lambda _name: None)
-    with pytest.raises(InvalidInput, match=r"needs paho-mqtt: pip install 'servotwin\[mqtt\]'"):
+    monkeypatch.setattr("servotwin.runtime.extras.find_spec", lambda _name: None)
+    with pytest.raises(InvalidInput, match=r"needs paho-mqtt, .*pip install 'servotwin\[mqtt\]'"):
         check(load(tmp_path / "edge.toml"))

@@ -62,7 +62,7 @@ LINKS = st.builds(
 
 def run(uplink, downlink, seed, twin, interval_s=0.0):
     recording = Recording(RATE, 0.6, 0.2, Retry(1.5, 2.0, 4.0), Limits(interval_s=interval_s))
-    twin = twin.replace(policy="paper", method="paper", estimator=paper.Settings(settle_s=0.0))
+    twin = twin.replace(policy="paper", method="paper", estimator=paper.PaperSettings(settle_s=0.0))
     scenario = Scenario(PAPER, DURATION, seed, uplink=uplink, downlink=downlink, recording=recording, twin=twin)
     loop = Cosimulation(scenario, Stub(), fake)
     while not loop.done:

@@ -34,7 +34,7 @@ def test_fig16_adds_noise_and_filters_to_the_sampled_loop():
     assert plain.law.sample_rate == 5000.0
     assert noisy.noise == Noise(0.22e-3, (10.0, 50.0))
     assert noisy.twin.method == "paper"
-    assert noisy.twin.estimator == paper.Settings(lowpass_hz=20.0)
+    assert noisy.twin.estimator == paper.PaperSettings(lowpass_hz=20.0)
 
 
 def test_an_unknown_preset_is_named():
@@ -115,7 +115,7 @@ def test_every_key_in_its_unit(tmp_path):
     assert agent.parameters.setting.tolerance == scenario.servo.tolerance_for(math.radians(4.0), 1.5)
     assert scenario.uplink == LinkSettings(0.5, 0.0, 0.1, outages=((1.0, 2.0),))
     assert scenario.downlink == LinkSettings(0.5, 0.3, 0.2, outages=((1.0, 2.0),))
-    assert scenario.twin.estimator == paper.Settings(alpha=80.0, contact_travel=math.radians(2.0))
+    assert scenario.twin.estimator == paper.PaperSettings(alpha=80.0, contact_travel=math.radians(2.0))
     assert scenario.twin.gap_limit == pytest.approx(math.radians(12.0))
     assert scenario.twin.trend == TrendSettings.for_wear(math.radians(10.0), 1000.0)
 
@@ -169,7 +169,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ('kind = "step"', 'kind = "stp"', "did you mean 'step'"),
         ("size_mm = 1.0", "size_m = 1.0", "'reference.size_mm' is missing (found 'reference.size_m' instead)"),
         ("size_mm = 1.0", "size_mm = nan", "reference.size_mm = nan is not allowed"),
-        ("[gap]", "[gab]", "'gap.total_deg' is missing"),
+        ("[gap]", "[gab]", "table [gap] is missing (found 'gab' instead)"),
         ("total_deg = 10.0", "total_deg = -1", "gap.total_deg = -1 is not allowed; give a number, at least 0"),
         ("total_deg = 10.0", "from_deg = 1\nto_deg = -1\nover_s = 3", "gap.to_deg = -1 is not allowed"),
         ("total_deg = 10.0", "total_deg = 1\nto_deg = 3", "unknown key 'gap.to_deg'"),

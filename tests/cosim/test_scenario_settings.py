@@ -34,7 +34,7 @@ def test_every_key_of_the_papers_estimator_is_read(tmp_path):
     lines += ["reversals = 2", "rest_speed_rad_per_s = 0.2", "contact_travel_deg = 1", "method_error_deg = 2"]
     lines += ["largest_std_deg = 3", "unexplained = 0.3", "alpha_rad_per_s = 80", "settle_s = 0.1", "lowpass_hz = 30"]
     one, two, three = (math.radians(x) for x in (1.0, 2.0, 3.0))
-    assert estimator(tmp_path, "paper", lines) == paper.Settings(
+    assert estimator(tmp_path, "paper", lines) == paper.PaperSettings(
         80.0, 0.1, 30.0, 4, "even", 9, 7, "first", 2, 0.2, one, two, three, 0.3
     )
 
@@ -44,7 +44,7 @@ def test_every_key_of_the_default_estimator_is_read(tmp_path):
     lines += ["gap_rate_deg_per_s = 1", "offset_deg = [-2, 3]", "prefilter_hz = 80", "contact_travel_deg = 1"]
     lines += ["largest_std_deg = 3", "largest_shift_deg = 2", "model_error_deg = 3", "calibration = 1.3"]
     one, two, three = (math.radians(x) for x in (1.0, 2.0, 3.0))
-    assert estimator(tmp_path, "whitened", lines) == whitened.Settings(
+    assert estimator(tmp_path, "whitened", lines) == whitened.WhitenedSettings(
         passes=3,
         order=40,
         starts=9,

@@ -1,4 +1,4 @@
-"""What the documentation names exists, what it links to is there, and the code it shows runs."""
+"""Names in the documentation exist, its links lead somewhere, and its samples run."""
 
 import ast
 import dataclasses

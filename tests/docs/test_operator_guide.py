@@ -56,7 +56,7 @@ def rows(title: str) -> Iterator[list[str]]:
 
 
 def named(title: str) -> list[str]:
-    """What the first cells name."""
+    """Names in the first cells."""
     return [name for cells in rows(title) for name in NAME.findall(cells[0])]
 
 

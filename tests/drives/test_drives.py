@@ -118,7 +118,7 @@ def test_what_is_no_controller_is_refused_and_nothing_changes(tmp_path: Path) ->
         drive.connect()
         for bad in (-1.0, np.inf):
             refused = Parameters(3, Setting(0.0, gains))
-            object.__setattr__(refused, "tolerance", bad)
+            object.__setattr__(refused, "setting", Setting(bad, gains))
             with pytest.raises(DriveRefused, match="tolerance"):
                 drive.write(refused)
         assert drive.read(10).version == 0

@@ -229,7 +229,7 @@ def test_blocks_have_the_effect_of_single_samples(
         ({"sample_rate": math.nan}, "sample_rate"),
         ({"window_s": 0.25}, "window_s"),
         ({"window_s": math.inf}, "window_s"),
-        ({"window_s": 0.0}, "at least one sample"),
+        ({"window_s": 0.0}, "window_s = 0.0 s: must be a positive number"),
         ({"pre_trigger_s": 0.05}, "pre_trigger_s"),
         ({"pre_trigger_s": 1.0}, "pre_trigger_s"),
         ({"pre_trigger_s": -0.1}, "pre_trigger_s"),

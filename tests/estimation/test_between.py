@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import random_cases
-from servotwin.estimation.core.between import polygon, pushed
-from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
-from servotwin.estimation.core.projection import orthonormal, project_out
+from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, polygon, pushed
+from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.core.response import response
 from servotwin.plant.backlash import play
 

@@ -24,6 +24,7 @@ from servotwin.twin.store import MemoryStore
 from servotwin.twin.twin import Twin
 
 DEG = math.radians(1.0)
+SETTINGS = whitened.WhitenedSettings()
 SERVO = Servo.preset("paper").replace(Ki=0.0)
 GAP = 12.0 * DEG
 REFUSED = {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND}
@@ -96,7 +97,7 @@ def carried(trend: Trend) -> tuple[float, float]:
 
 def test_spreads_and_the_trend_hold_what_they_say():
     """An encoder that is 40 deg off, 1 um of noise: the trend's gap and offset after one window of each kind."""
-    settings = whitened.Settings(model_error=0.0, largest_std=DEG)
+    settings = whitened.WhitenedSettings(model_error=0.0, largest_std=DEG)
     scores = []
     for seed in range(20):
         both = noisy(stretch(5.0, 2.0), seed, 40.0 * DEG)
@@ -115,7 +116,7 @@ def test_spreads_and_the_trend_hold_what_they_say():
 def test_a_window_with_two_contacts_is_never_told_of_the_offset():
     window = noisy(stretch(5.0, 2.0), 1)
     alone = estimate_gap(window, SERVO)
-    told = estimate_carrying(window, SERVO, None, whitened.Settings(), (3.0, 1e-6))
+    told = estimate_carrying(window, SERVO, None, SETTINGS, (3.0, 1e-6))
     assert replace(told, offset=None) == alone
     assert told.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
 
@@ -129,9 +130,9 @@ def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
         return found if settings.offset is None else replace(found, gap=found.gap + DEG, rms=100.0 * found.rms)
 
     known = (0.0, 0.01 * DEG)
-    assert estimate_carrying(window, SERVO, None, whitened.Settings(), known).ok
+    assert estimate_carrying(window, SERVO, None, SETTINGS, known).ok
     monkeypatch.setattr(whitened, "estimate", lost)
-    refused = estimate_carrying(window, SERVO, None, whitened.Settings(), known)
+    refused = estimate_carrying(window, SERVO, None, SETTINGS, known)
     assert refused.status in REFUSED
     assert "times as much is left over" in refused.reasons[-1]
 
@@ -139,7 +140,7 @@ def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
 def test_what_is_known_too_badly_is_not_carried():
     window = noisy(stretch(5.0, 1.2), 1)
     for known in (None, (0.0, 0.1 * DEG)):
-        assert estimate_carrying(window, SERVO, None, whitened.Settings(), known).status in REFUSED
+        assert estimate_carrying(window, SERVO, None, SETTINGS, known).status in REFUSED
 
 
 def test_an_encoder_that_slipped_is_read_anew_or_doubted():
@@ -148,15 +149,15 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     trend = Trend.start(0.0, TrendSettings.for_wear(GAP, 1e5))
     for k in range(3):
         window = noisy(stretch(5.0, 2.0), k)
-        trend = trend.update(replace(estimate_carrying(window, SERVO, None, whitened.Settings(), None), time=20.0 * k))
+        trend = trend.update(replace(estimate_carrying(window, SERVO, None, SETTINGS, None), time=20.0 * k))
     slip = -3.0 * DEG
-    both = estimate_carrying(noisy(stretch(5.0, 2.0), 5, slip), SERVO, None, whitened.Settings(), carried(trend))
+    both = estimate_carrying(noisy(stretch(5.0, 2.0), 5, slip), SERVO, None, SETTINGS, carried(trend))
     moved = trend.update(replace(both, time=60.0))
     assert (moved.refused, moved.updates) == (0, 4)
     assert "read anew" in moved.reasons[0]
     assert moved.prior.offset == pytest.approx(-slip, abs=0.02 * DEG)
     window = noisy(stretch(5.0, 1.2), 6, slip)
-    told = estimate_carrying(window, SERVO, None, whitened.Settings(), carried(trend))
+    told = estimate_carrying(window, SERVO, None, SETTINGS, carried(trend))
     assert told.ok
     assert abs(told.gap - GAP) > 5.0 * DEG
     doubted = trend.update(replace(told, time=60.0))

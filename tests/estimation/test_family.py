@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.signal import lsim
 
-from servotwin.estimation.core.family import MOTOR, STRUCTURE, Family, Hold, motor_family, structure_family
+from servotwin.estimation.core.family import MOTOR, STRUCTURE, Family, InputHold, motor_family, structure_family
 from servotwin.estimation.core.response import response
 from servotwin.plant.servo import Servo
 
@@ -20,7 +20,7 @@ def scaled(servo: Servo, name: str, factor: float) -> Servo:
     return servo.replace(**{field: tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value})
 
 
-@pytest.mark.parametrize("hold", list(Hold))
+@pytest.mark.parametrize("hold", list(InputHold))
 @pytest.mark.parametrize(("make", "names"), [(motor_family, MOTOR), (structure_family, STRUCTURE)])
 def test_derivatives_are_those_of_the_responses(make, names, hold):
     servo = Servo.preset("paper").replace(m=(5.2, 4.0, 6.1), k=(1e4, 9e3, 1.2e4), c=(36.9, 30.0, 45.0))
@@ -40,7 +40,7 @@ def test_derivatives_are_those_of_the_responses(make, names, hold):
 def test_the_discrete_systems_derivative_by_complex_step():
     servo, h = Servo.preset("paper"), 1e-30
     family = motor_family(servo)
-    sampled = family.sampled(RATE, Hold.CONSTANT)
+    sampled = family.sampled(RATE, InputHold.CONSTANT)
     for index, one in enumerate(family.by):
         flow = np.zeros((4, 4), complex)
         flow[:3, :3] = family.system.A + 1j * h * one.A
@@ -50,10 +50,12 @@ def test_the_discrete_systems_derivative_by_complex_step():
         np.testing.assert_allclose(sampled.now[index + 1], exact[:3, 3], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("hold", list(Hold))
+@pytest.mark.parametrize("hold", list(InputHold))
 def test_responses_as_scipy_gives_them(hold):
     system = motor_family(Servo.preset("paper")).system
-    expected = lsim((system.A, system.B[:, None], system.C[None], [[0.0]]), SIGNAL, TIME, interp=hold is Hold.LINEAR)[1]
+    expected = lsim(
+        (system.A, system.B[:, None], system.C[None], [[0.0]]), SIGNAL, TIME, interp=hold is InputHold.LINEAR
+    )[1]
     found = motor_family(Servo.preset("paper")).sampled(RATE, hold).respond(SIGNAL)[0]
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from servotwin.estimation.paper.information import standard_deviation
+from servotwin.estimation.paper.residual import standard_deviation
 
 N = 2000
 T = np.linspace(0.0, 1.0, N)

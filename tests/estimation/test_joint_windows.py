@@ -12,11 +12,9 @@ from benchmarks.estimator_windows import RATE
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.whitening import Autoregression, burg
 from servotwin.estimation.estimate import GapStatus
-from servotwin.estimation.joint.alone import searched
-from servotwin.estimation.joint.estimator import JointSettings, estimate_jointly
+from servotwin.estimation.joint.estimator import JointSettings, SharedFit, estimate_jointly
+from servotwin.estimation.joint.fit import likeliest, searched
 from servotwin.estimation.joint.model import JointModel
-from servotwin.estimation.joint.noise import likeliest
-from servotwin.estimation.joint.together import Together
 from servotwin.estimation.window import Window
 from servotwin.plant.backlash import play
 from servotwin.plant.servo import Servo
@@ -96,7 +94,7 @@ def test_what_cannot_be_fitted_together_is_said(windows, word):
 def test_derivatives_of_the_whole_are_those_of_its_cost():
     names = ("gap", "place", "delay", "k/m", "pitch")
     models = [JointModel(window_of(gap), SERVO, names, None, 12) for gap in (6.0, 10.0)]
-    whole = Together.of([searched(model, None, JointSettings()) for model in models])
+    whole = SharedFit.of([searched(model, None, JointSettings()) for model in models])
     assert [list(place) for place in whole.places] == [[2, 3, 4, 0, 1], [5, 6, 7, 0, 1]]
     point = whole._start([fit.best for fit in whole.fits])
     point[[0, 2, 5]] += 1e-4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from measured_windows import measured
 
-from servotwin.estimation.core.family import Hold
+from servotwin.estimation.core.family import InputHold
 from servotwin.estimation.joint.model import JointModel, cubic, cubic_slopes, margin_for
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
@@ -30,7 +30,7 @@ def voltage_window() -> Window:
 @pytest.mark.parametrize(("names", "window"), [(ANGLE, measured(GAP)), (VOLTAGE, voltage_window())])
 def test_derivatives_are_those_of_the_projected_residual(names, window):
     """The cost's gradient, which the projection's own derivatives do not enter, to the rounding of differences."""
-    model = JointModel(window, Servo.preset("paper"), names, Hold.LINEAR, 12)
+    model = JointModel(window, Servo.preset("paper"), names, InputHold.LINEAR, 12)
     values = dict.fromkeys(names, 0.01) | {"gap": 0.15, "place": 0.2, "delay": 3.3e-4, "speed0": 20.0}
     values = {name: values[name] for name in names}
     slopes = model.slopes(values, unchanged)
@@ -44,7 +44,7 @@ def test_derivatives_are_those_of_the_projected_residual(names, window):
 
 
 def test_the_truth_leaves_nothing():
-    model = JointModel(measured(GAP), Servo.preset("paper"), ANGLE, Hold.LINEAR, 12)
+    model = JointModel(measured(GAP), Servo.preset("paper"), ANGLE, InputHold.LINEAR, 12)
     truth = dict.fromkeys(ANGLE, 0.0) | {"gap": GAP, "place": 1.0}
     ends = [model.cost(truth | {"place": place}, unchanged) for place in (-1.0, 1.0)]
     rms = math.sqrt(min(ends) / model.measured.size)
@@ -56,7 +56,7 @@ def test_the_truth_leaves_nothing():
 @pytest.mark.parametrize("samples", [-7.0, -2.5, 0.0, 0.3, 5.0, 9.75])
 def test_a_delay_moves_the_answer(samples):
     """A smooth signal delayed by a fraction of a sample, and its slope."""
-    model = JointModel(measured(GAP), Servo.preset("paper"), ANGLE, Hold.LINEAR, margin_for(2e-3, 5000.0))
+    model = JointModel(measured(GAP), Servo.preset("paper"), ANGLE, InputHold.LINEAR, margin_for(2e-3, 5000.0))
     t = np.arange(2000.0)
     kept = t[model.margin : -model.margin]
     shifted = model.delayed(np.sin(0.02 * t)[None], samples)[0]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import polynomial as poly
 from scipy.signal import lsim, tf2ss
 
-from servotwin.estimation.paper.lags import LagFilter, lag_polynomial
+from servotwin.estimation.paper.observer import LagFilter, lag_polynomial
 from servotwin.plant.backlash import play
 
 numbers = st.floats(-3.0, 3.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from servotwin.estimation.paper.motion import motion
+from servotwin.estimation.paper.estimator import motion
 
 RATE = 5000.0
 T = np.arange(5000) / RATE

@@ -8,10 +8,16 @@ import pytest
 from scipy.linalg import null_space, subspace_angles
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.core.contacts import Gap
+from servotwin.estimation.core.contacts import Gap, last_contacts
 from servotwin.estimation.core.family import MOTOR, motor_family
-from servotwin.estimation.joint.identifiability import identifiability
-from servotwin.estimation.joint.motor_information import PRODUCTS, Case, SensorNoise, last_contacts, motor_cases, table
+from servotwin.estimation.joint.identifiability import (
+    PRODUCTS,
+    MotorCase,
+    SensorNoise,
+    identifiability,
+    motor_cases,
+    table,
+)
 from servotwin.estimation.window import Window
 from servotwin.plant.backlash import play
 from servotwin.plant.motor import Motor
@@ -28,7 +34,7 @@ EXPECTED = [np.zeros((0, 5)), LOOP_OPEN, VOLTAGE_AND_ANGLE, VOLTAGE_AND_ANGLE, V
 
 
 @lru_cache
-def cases(preset: str = "paper") -> tuple[Case, ...]:
+def cases(preset: str = "paper") -> tuple[MotorCase, ...]:
     servo = Servo.preset(preset)
     run = simulate(servo, 6.1, reference=SquareWave(1e-3, 10.0), gap=GAP)
     window = Window.from_run(run, 5.0, 1.0)

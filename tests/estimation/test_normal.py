@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.estimation.core.normal import LeastSquares, independent_least_squares, least_squares
+from servotwin.estimation.core.least_squares import LeastSquares, independent_least_squares, least_squares
 
 Fit = Callable[[np.ndarray, np.ndarray], LeastSquares]
 

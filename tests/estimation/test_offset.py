@@ -11,7 +11,7 @@ from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.offset import read_offset
 from servotwin.estimation.trend import Trend, TrendSettings
-from servotwin.estimation.whitened.estimator import Settings
+from servotwin.estimation.whitened.estimator import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
@@ -59,7 +59,7 @@ def test_the_trend_carries_gap_and_offset(wearing):
     for index, start in enumerate(np.arange(10.0, 61.0, 10.0)):
         window = seen(wearing, start, shift, index)
         ahead = trend.predict(window.mid_time)
-        settings = Settings(
+        settings = WhitenedSettings(
             gap_rate=math.radians(0.2), offset=(ahead.prior.offset, ahead.prior.offset_std) if index else None
         )
         estimate = estimate_gap(window, SERVO, prior=ahead.as_estimate() if index else None, settings=settings)

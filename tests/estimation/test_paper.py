@@ -12,14 +12,14 @@ from measured_windows import RATE, measured
 from servotwin.errors import InvalidInput
 from servotwin.estimation import gap as entry
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.paper.estimator import Settings
+from servotwin.estimation.paper.estimator import PaperSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 
 estimate_gap = partial(entry.estimate_gap, method="paper")
 
 SERVO = Servo.preset("paper")
-PATIENT = Settings(settle_s=0.5)
+PATIENT = PaperSettings(settle_s=0.5)
 T = np.arange(10000) / RATE
 
 
@@ -51,7 +51,7 @@ def test_finds_the_gap_once_the_observer_has_settled(gap_deg, prior_deg):
     ],
 )
 def test_finds_the_gap_of_other_servos(servo):
-    settings = Settings(settle_s=0.5, alpha=60.0)
+    settings = PaperSettings(settle_s=0.5, alpha=60.0)
     estimate = estimate_gap(measured(math.radians(10.0), servo), servo, settings=settings)
     assert math.degrees(estimate.gap) == pytest.approx(10.0, abs=0.02)
 
@@ -74,7 +74,7 @@ def test_an_estimate_says_what_it_rests_on():
 def test_scaling_every_signal_scales_the_estimate_bit_for_bit(scale):
     window = measured(math.radians(10.0))
     larger = Window(scale * window.position, scale * window.theta_m, sample_rate=RATE, start=window.start)
-    open_minded = Settings(largest_std=1e3)
+    open_minded = PaperSettings(largest_std=1e3)
     one = estimate_gap(window, SERVO, prior=0.1, settings=open_minded)
     other = estimate_gap(larger, SERVO, prior=scale * 0.1, settings=open_minded)
     assert (other.gap, other.theta_d0, other.std, other.rms) == tuple(
@@ -159,13 +159,13 @@ def test_a_window_of_another_machine_gets_no_number(spoil):
 
 def test_an_estimate_too_uncertain_is_refused():
     window = measured(math.radians(10.0))
-    estimate = estimate_gap(window, SERVO, settings=Settings(largest_std=1e-6))
+    estimate = estimate_gap(window, SERVO, settings=PaperSettings(largest_std=1e-6))
     assert estimate.status is GapStatus.UNIDENTIFIABLE
     assert "deg are allowed" in estimate.reasons[0]
 
 
 def test_a_minimisation_cut_short_is_refused():
-    estimate = estimate_gap(measured(math.radians(10.0)), SERVO, settings=Settings(iterations=1))
+    estimate = estimate_gap(measured(math.radians(10.0)), SERVO, settings=PaperSettings(iterations=1))
     assert estimate.status is GapStatus.UNIDENTIFIABLE
     assert "did not converge" in estimate.reasons[0]
 
@@ -187,11 +187,11 @@ def test_a_number_is_never_confident_without_evidence(seed):
         ({"prior": math.nan}, "prior = nan rad"),
         ({"settings": {"alpha": 40.0}}, "do not belong to method 'paper'"),
         (
-            {"settings": Settings(lowpass_hz=2500.0)},
+            {"settings": PaperSettings(lowpass_hz=2500.0)},
             "lowpass_hz = 2500.0 Hz: must be below half the sample rate of 5000 Hz",
         ),
         (
-            {"settings": Settings(settle_s=0.999)},
+            {"settings": PaperSettings(settle_s=0.999)},
             r"lasts 1 s: must be at least 1\.0022 s, so that the observer can settle",
         ),
     ],
@@ -221,4 +221,4 @@ def test_the_motor_angle_is_needed():
 )
 def test_settings_are_checked(arguments, message):
     with pytest.raises(InvalidInput, match=message):
-        Settings(**arguments)
+        PaperSettings(**arguments)

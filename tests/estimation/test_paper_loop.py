@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from servotwin.estimation import gap as entry
-from servotwin.estimation.paper.estimator import Settings
+from servotwin.estimation.paper.estimator import PaperSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
@@ -41,7 +41,7 @@ def run_of(preset: str, gap_deg: float, noise: Noise | None = None, steps: int =
     )
 
 
-def errors(run: Run, gap_deg: float, settings: Settings, steps: int = 8) -> np.ndarray:
+def errors(run: Run, gap_deg: float, settings: PaperSettings, steps: int = 8) -> np.ndarray:
     """(steps,) estimated less true gap, deg; every window after the first step must be accepted."""
     prior = math.radians(max(0.0, gap_deg - 2.0))
     windows = [Window.from_run(run, 5.0 * step, 1.0) for step in range(1, steps + 1)]
@@ -63,7 +63,7 @@ def errors(run: Run, gap_deg: float, settings: Settings, steps: int = 8) -> np.n
 )
 def test_the_published_estimator_is_biased_without_any_noise(preset, settle_s, bias, margin, gap_deg):
     """Erratum E8: "unbiased" with alpha = 40 and k_s T_s = 0.25 s it is not; the observer has not yet forgotten."""
-    found = errors(run_of(preset, gap_deg), gap_deg, Settings(settle_s=settle_s))
+    found = errors(run_of(preset, gap_deg), gap_deg, PaperSettings(settle_s=settle_s))
     assert np.mean(found) == pytest.approx(bias, abs=margin)
     assert np.std(found) < 0.03
 
@@ -71,7 +71,7 @@ def test_the_published_estimator_is_biased_without_any_noise(preset, settle_s, b
 @pytest.mark.parametrize("gap_deg", GAPS)
 def test_the_bias_comes_from_where_positions_are_counted_from(gap_deg):
     """Counted from the window's first position, the observer begins with nearly no error, and the bias is gone."""
-    found = errors(run_of("paper", gap_deg), gap_deg, Settings(origin="first"))
+    found = errors(run_of("paper", gap_deg), gap_deg, PaperSettings(origin="first"))
     assert np.abs(found).max() < 0.015
 
 
@@ -81,7 +81,7 @@ def test_the_bias_grows_with_the_distance_from_zero(offset_mm, low, high):
     window = Window.from_run(run_of("table1", 10.0), 10.0, 1.0)
     servo, offset = Servo.preset("table1"), 1e-3 * offset_mm
     farther = window.replace(position=window.position + offset, theta_m=window.theta_m + offset / servo.p)
-    moved = [estimate_gap(farther, servo, settings=Settings(origin=origin)) for origin in ("absolute", "first")]
+    moved = [estimate_gap(farther, servo, settings=PaperSettings(origin=origin)) for origin in ("absolute", "first")]
     error = [math.degrees(estimate.gap) - 10.0 for estimate in moved]
     assert low < error[0] < high
     assert error[1] == pytest.approx(0.0, abs=0.02)
@@ -94,7 +94,7 @@ def test_far_from_zero_the_published_reading_is_refused():
     refused = estimate_gap(farther, servo)
     assert not refused.ok
     assert "deg are allowed" in refused.reasons[0]
-    first = estimate_gap(farther, servo, settings=Settings(origin="first"))
+    first = estimate_gap(farther, servo, settings=PaperSettings(origin="first"))
     assert math.degrees(first.gap) == pytest.approx(10.0, abs=0.015)
     assert abs(first.theta_d0 - farther.theta_m[0]) <= 0.5 * first.gap * (1.0 + 1e-9)
 
@@ -103,10 +103,10 @@ def test_far_from_zero_the_published_reading_is_refused():
 @pytest.mark.parametrize(
     ("settings", "bias", "scatter"),
     [
-        (Settings(lowpass_hz=20.0), (-0.75, -0.25), (0.05, 0.30)),
-        (Settings(lowpass_hz=20.0, padding="even", padding_samples=250), (-0.42, -0.28), (0.005, 0.08)),
-        (Settings(), (-0.42, -0.26), (0.03, 0.14)),
-        (Settings(settle_s=0.4), (-0.06, 0.06), (0.03, 0.14)),
+        (PaperSettings(lowpass_hz=20.0), (-0.75, -0.25), (0.05, 0.30)),
+        (PaperSettings(lowpass_hz=20.0, padding="even", padding_samples=250), (-0.42, -0.28), (0.005, 0.08)),
+        (PaperSettings(), (-0.42, -0.26), (0.03, 0.14)),
+        (PaperSettings(settle_s=0.4), (-0.06, 0.06), (0.03, 0.14)),
     ],
     ids=["as published", "mirrored padding", "no filter", "no filter, settled"],
 )
@@ -140,5 +140,5 @@ def test_the_stated_spread_covers_the_error(gap_deg):
     run = run_of("paper", gap_deg, NOISE)
     windows = [Window.from_run(run, 5.0 * step, 1.0) for step in range(1, 9)]
     for window in windows:
-        estimate = estimate_gap(window, run.servo, settings=Settings(lowpass_hz=20.0))
+        estimate = estimate_gap(window, run.servo, settings=PaperSettings(lowpass_hz=20.0))
         assert estimate.interval[0] < math.radians(gap_deg) < estimate.interval[1]

@@ -10,7 +10,7 @@ from measured_windows import RATE, position_of
 from scipy.linalg import expm
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, travel
-from servotwin.estimation.core.projection import orthonormal, project_out
+from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.core.response import response
 from servotwin.plant.backlash import play
 from servotwin.plant.servo import Servo

@@ -15,10 +15,9 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.whitened.estimator import Settings, fit
-from servotwin.estimation.whitened.gate import Evidence, judge
-from servotwin.estimation.whitened.model_check import Shift
-from servotwin.estimation.whitened.plain import plain_fit
+from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
+from servotwin.estimation.whitened.fit import plain_fit
+from servotwin.estimation.whitened.gate import FitEvidence, ModelShift, judge
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
@@ -108,13 +107,13 @@ def test_a_delay_is_no_bias_and_without_the_nuisance_it_is():
     case = clean()[4]
     late = Window(case.window.position[:-1], case.window.theta_m[1:], sample_rate=RATE)
     assert abs(error(estimate_gap(late, SERVO), case)) < 1e-3
-    blind = estimate_gap(late, SERVO, settings=Settings(skew=False, largest_std=1.0, largest_shift=1.0))
+    blind = estimate_gap(late, SERVO, settings=WhitenedSettings(skew=False, largest_std=1.0, largest_shift=1.0))
     assert abs(error(blind, case)) > 0.02
 
 
 def test_an_ideal_clock_narrows_the_spread():
     window = measured(clean()[4])
-    free, fixed = (estimate_gap(window, SERVO, settings=Settings(skew=skew)) for skew in (True, False))
+    free, fixed = (estimate_gap(window, SERVO, settings=WhitenedSettings(skew=skew)) for skew in (True, False))
     assert 0.5 < fixed.std / free.std < 0.97
 
 
@@ -133,7 +132,7 @@ def test_a_wrong_model_is_named(change, words):
         refused = estimate_gap(measured(case), model)
         assert refused.status is GapStatus.MODEL_MISMATCH
         assert any(words in reason for reason in refused.reasons), refused.reasons
-        mild = estimate_gap(measured(case), model, settings=Settings(largest_std=10.0, largest_shift=10.0))
+        mild = estimate_gap(measured(case), model, settings=WhitenedSettings(largest_std=10.0, largest_shift=10.0))
         off = abs(mild.gap - case.gap)
         assert off > math.radians(0.03)
         assert off < 1.96 * mild.std_total
@@ -208,7 +207,7 @@ def test_what_the_window_must_bring():
 )
 def test_settings_are_checked(settings, words):
     with pytest.raises(InvalidInput, match=words):
-        Settings(**settings)
+        WhitenedSettings(**settings)
 
 
 def rocking(gap_deg: float, amplitude_deg: float, drift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -247,7 +246,7 @@ def test_one_contact_needs_a_known_offset():
     blind = estimate_gap(window, SERVO)
     assert not blind.ok
     assert "needed both ways" in " ".join(blind.reasons)
-    told = estimate_gap(window, SERVO, settings=Settings(offset=(0.0, 1e-5), largest_std=math.radians(0.2)))
+    told = estimate_gap(window, SERVO, settings=WhitenedSettings(offset=(0.0, 1e-5), largest_std=math.radians(0.2)))
     assert told.ok, told.reasons
     assert abs(told.gap - math.radians(6.0)) < 3.0 * told.std
     assert told.std < math.radians(0.2)
@@ -278,7 +277,7 @@ def test_the_estimate_says_when_and_where():
 def test_a_prior_can_be_merged():
     window = measured(clean()[4])
     alone = estimate_gap(window, SERVO)
-    merged = estimate_gap(window, SERVO, prior=alone, settings=Settings(combine=True))
+    merged = estimate_gap(window, SERVO, prior=alone, settings=WhitenedSettings(combine=True))
     assert merged.gap == pytest.approx(alone.gap, abs=1e-9)
     assert merged.std_total == pytest.approx(alone.std_total / math.sqrt(2.0), rel=0.02)
 
@@ -306,7 +305,7 @@ def test_a_gap_that_grows_within_the_window(integral):
     run = simulate(SERVO, 62.5, controller=controller, reference=reference, gap=gap)
     cases = [cut(run, start, 2.0 if start % 1.0 else 1.0) for start in (20.0, 39.7, 40.0, 59.7)]
     for case in cases:
-        estimate = estimate_gap(case.window, SERVO, settings=Settings(gap_rate=math.radians(0.15)))
+        estimate = estimate_gap(case.window, SERVO, settings=WhitenedSettings(gap_rate=math.radians(0.15)))
         assert abs(error(estimate, case)) < 2e-3
         assert estimate.interval[0] < case.gap < estimate.interval[1]
 
@@ -382,17 +381,17 @@ def test_growth_is_among_the_reasons():
     assert any("grows by +" in reason for estimate in refused for reason in estimate.reasons), refused
 
 
-def evidence(case: Case) -> Evidence:
+def evidence(case: Case) -> FitEvidence:
     """Evidence of a clean fit with a spread of 0.01 deg, against which nothing speaks."""
-    fitted = fit(measured(case), case.servo, None, Settings())
+    fitted = fit(measured(case), case.servo, None, WhitenedSettings())
     assert fitted.aligned is not None
     gap, std = fitted.aligned.found.point.gap, math.radians(0.01)
-    return Evidence(
+    return FitEvidence(
         aligned=fitted.aligned,
         std=std,
         interval=(gap - 2.0 * std, gap + 2.0 * std),
         travel=Travel(1.0, 1.0, gap),
-        shift=Shift(0.0, std, "", 0.0),
+        shift=ModelShift(0.0, std, "", 0.0),
         observer=(0.0, math.inf),
         lost_motion=gap,
         unexplained=0.0,
@@ -403,11 +402,11 @@ def evidence(case: Case) -> Evidence:
 @pytest.mark.parametrize("view", ["free model", "observer form", "lost motion"])
 def test_another_view_counts_from_three_standard_deviations_on(view: str, deviations: float, status: GapStatus):
     """Noise moves every view of a window; only what it cannot explain is held against the model."""
-    seen, given = evidence(clean()[1]), Settings()
+    seen, given = evidence(clean()[1]), WhitenedSettings()
     std = math.radians(0.1)
     most = 1.05 * seen.aligned.found.point.gap + given.contact_travel
     seen = {
-        "free model": replace(seen, shift=Shift(deviations * std, std, "a stiffness off", 0.0)),
+        "free model": replace(seen, shift=ModelShift(deviations * std, std, "a stiffness off", 0.0)),
         "observer form": replace(seen, observer=(-deviations * std, std)),
         "lost motion": replace(seen, std=0.4 * std, lost_motion=most + 0.4 * deviations * std),
     }[view]

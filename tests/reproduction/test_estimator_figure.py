@@ -37,7 +37,7 @@ def test_one_contact_answers_but_the_screws_start_can_imitate_it(drawn):
 
 
 def test_the_misfits_valley_is_a_point_a_line_or_a_plain(drawn):
-    """How far the gap can be moved, the screw's start at its best, before the misfit doubles."""
+    """Width of the gaps, with the screw's start at its best, before the misfit doubles."""
     widths = []
     for panel in drawn:
         least = panel.misfit.min(axis=0)

@@ -148,7 +148,7 @@ def test_a_window_that_no_estimator_took_is_the_same_again():
         (
             Servo.preset("paper").replace(k_d=1e6),
             TwinSettings(
-                estimator=whitened.Settings(offset=(0.1, 0.2)), excitation=ExcitationSettings(), gap_limit=0.3
+                estimator=whitened.WhitenedSettings(offset=(0.1, 0.2)), excitation=ExcitationSettings(), gap_limit=0.3
             ),
         ),
         (Servo.preset("paper"), Scenario.preset("fig16").twin),

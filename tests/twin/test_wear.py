@@ -77,9 +77,9 @@ def test_a_reboot_starts_the_edges_clock_anew_but_not_the_wear():
 
 def test_a_prior_must_not_be_counted_twice():
     with pytest.raises(InvalidInput, match="combine"):
-        TwinSettings(estimator=whitened.Settings(combine=True))
+        TwinSettings(estimator=whitened.WhitenedSettings(combine=True))
     with pytest.raises(InvalidInput, match=r"identify\.paper|identify\.settings"):
-        TwinSettings(method="paper", estimator=whitened.Settings())
+        TwinSettings(method="paper", estimator=whitened.WhitenedSettings())
     with pytest.raises(InvalidInput, match="'best' does not exist"):
         TwinSettings(method="best")
     with pytest.raises(InvalidInput, match="gap_limit"):

@@ -1,10 +1,10 @@
 """Limit cycles of the loop with backlash, exact, with or without a dead zone: shooting on the hybrid automaton.
 
-Three things keep Newton's method on solid ground. Lengths are divided by the gap, since the loop is homogeneous: so
+Three measures keep Newton's method well-conditioned. Lengths are divided by the gap, since the loop is homogeneous: so
 the amplitude is exactly proportional to the gap. Neutral directions are removed: states that no flow changes stay
 fixed, and a constant reference is shifted away where the loop allows it. And a symmetric orbit is closed after half a
-period by its mirror image. What is found is then flown for a period by the event simulation, on half its search step:
-only an orbit that closes there is returned.
+period by its mirror image. The orbit is then verified: the event simulation runs it for a period on half its search
+step, and only an orbit that closes there is returned.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NEAR, _ON_IT = 0.1, 1e-6
 
 
 class CycleStatus(Enum):
-    """How a search ended."""
+    """End of a search."""
 
     CYCLE = "limit cycle"
     SETTLES = "settles"
@@ -49,7 +49,7 @@ class CycleStatus(Enum):
 
 @dataclass(frozen=True)
 class CycleResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class CycleResult:
     orbit : Orbit or None
         Only with `CycleStatus.CYCLE`.
     reason : str
-        Why there is no orbit; empty otherwise.
+        Reason why there is no orbit; empty otherwise.
     """
 
     status: CycleStatus
@@ -72,7 +72,7 @@ def limit_cycle(
     controller: Controller | None = None,
     step: float = 1e-3,
 ) -> CycleResult:
-    """The limit cycle that the loop ends on after a reference step from rest, if it does.
+    """Find the limit cycle on which the loop ends after a reference step from rest.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def limit_cycle(
 
 
 def _linear(servo: Servo, controller: Controller) -> CycleResult:
-    """Without gap, dead zone and limit there is nothing to run: the poles tell."""
+    """Result without gap, dead zone and limit: the poles decide, nothing is simulated."""
     if servo.closed_loop(controller).is_stable():
         return CycleResult(CycleStatus.SETTLES, None, "without gap, dead zone and limit the loop is linear and stable")
     return CycleResult(CycleStatus.DIVERGES, None, "without gap, dead zone and limit the loop is linear and not stable")

@@ -42,7 +42,7 @@ class Prediction:
     amplitude : float
         m, of the first harmonic of the position: A abs(N(A) G2(j omega)).
     stable : bool
-        Whether a larger amplitude would decay and a smaller one grow, as far as the describing function sees.
+        True when a larger amplitude would decay and a smaller one grow, by the describing function.
     """
 
     frequency: float

@@ -51,7 +51,7 @@ class Orbit:
     motor_amplitude : float
         rad, half the peak-to-peak of the motor's angle.
     symmetric : bool
-        Whether the second half period mirrors the first.
+        True when the second half period mirrors the first.
     multipliers : (K,) complex array
         Floquet multipliers of the period, largest first, without the one of the phase (1) and those of the states that
         no flow changes.
@@ -79,7 +79,7 @@ class Orbit:
 
     @property
     def period(self) -> float:
-        """s."""
+        """Period, s."""
         return 1.0 / self.frequency
 
     @property
@@ -94,7 +94,7 @@ class Orbit:
 
     @property
     def stable(self) -> bool:
-        """Whether every multiplier lies inside the unit circle."""
+        """True when every multiplier lies inside the unit circle."""
         return bool(np.max(np.abs(self.multipliers), initial=0.0) < 1.0)
 
     def signal(self, name: str, samples: int) -> tuple[Array, Array]:
@@ -169,14 +169,14 @@ _GRID = 64
 
 
 class ClosedOrbit(NamedTuple):
-    """An orbit and how far from it, in parts of each state's size, the search began."""
+    """An orbit and the distance from it, in parts of each state's size, at which the search began."""
 
     orbit: Orbit
     distance: float
 
 
 def closed_orbit(loop: ScaledLoop, section: Section, start: Array, scale: Array, half: bool) -> ClosedOrbit:
-    """The orbit through the section near a point of it.
+    """Find the orbit through the section near a point of it.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def closed_orbit(loop: ScaledLoop, section: Section, start: Array, scale: Array,
     Raises
     ------
     LostOrbit
-        There is none near, or what was found does not close in the event simulation.
+        There is none near, or it does not close in the event simulation.
     """
     reflection = loop.mirror if half else None
     if reflection is not None:
@@ -206,10 +206,10 @@ def closed_orbit(loop: ScaledLoop, section: Section, start: Array, scale: Array,
     period = sum(segment.duration for segment in full.segments)
     residual = _residual(loop, section, point.state, full, period)
     if residual > CLOSED:
-        raise LostOrbit(f"what was found fails to close by {residual:.2g} of its range")
+        raise LostOrbit(f"the orbit that was found fails to close by {residual:.2g} of its range")
     orbit = _orbit(loop, section, point, full, period, residual, reflection is not None)
     if orbit.amplitude < _SMALLEST * loop.extent * loop.unit:
-        raise LostOrbit("what was found is an equilibrium")
+        raise LostOrbit("the orbit that was found is an equilibrium")
     return ClosedOrbit(orbit, distance)
 
 
@@ -225,13 +225,13 @@ def _half(loop: ScaledLoop, section: Section, reflection: Mirror, start: Array, 
 
 
 def _hits(section: Section, reflection: Mirror, half: Shot) -> int:
-    """How often the section's event fires in a half period after its start, and in the mirrored half after that."""
+    """Number of firings of the section's event in a half period after its start and in the mirrored half after that."""
     guards = [segment.guard_id for segment in half.segments[1:]]
     return guards.count(section.start) + guards.count(reflection.guards[section.start])
 
 
 def _residual(loop: ScaledLoop, section: Section, start: Array, full: Shot, period: float) -> float:
-    """How well the event simulation closes, from one moment far from any event to the same one a period later."""
+    """Closing error of the event simulation, from a moment far from any event to the same one a period later."""
     events = np.cumsum([segment.duration for segment in full.segments])
     grid = np.arange(1, _GRID) * (period / _GRID)
     calm = 1 + int(np.argmax(np.min(np.abs(grid[:, None] - events), axis=1)))

@@ -60,7 +60,7 @@ class LostOrbit(RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """Where a passage begins and ends.
+    """Begin and end of a passage of the map.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Section:
     refine: int = 1
 
     def shoot(self, state: Array) -> Shot:
-        """From just before the start event to just before the end event."""
+        """Run from just before the start event to just before the end event."""
         segments = self._segments(state, self.start.mode, self.hits, skip=1)
         if segments[0].guard_id != self.start:
             raise LostOrbit(f"{self._name(segments[0].guard_id)} comes before {self._name(self.start)}")

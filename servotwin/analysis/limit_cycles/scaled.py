@@ -144,7 +144,7 @@ class ScaledLoop:
 
     @property
     def sample_step(self) -> float:
-        """s."""
+        """Spacing of samples, s."""
         return self.time / LOOKS
 
     def actual(self, state: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Stability maps: ensembles of initial states in every cell, each run exact, reduced to what one wants to know."""
+"""Stability maps: an ensemble of initial states in every cell, each run exact, reduced to measures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SETTLING_BAND = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Measures:
-    """What the members of each cell did, (N,) each.
+    """Measures of the members of each cell, (N,) each.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The pieces of a map shared among processes: a pool on this machine, or a Dask cluster. Written once, for joblib."""
+"""Tasks shared among processes by joblib: a pool on this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import require
 
 CONNECT_TIMEOUT = 5.0
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?([^\s/:\[\]]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
@@ -27,7 +28,7 @@ _R = TypeVar("_R")
 
 @contextmanager
 def workplace(workers: int | None = None, scheduler: str | None = None) -> Iterator[None]:
-    """Where `shared` finds its processes inside this block.
+    """Provide the processes of `shared` inside this block.
 
     Parameters
     ----------
@@ -46,12 +47,12 @@ def workplace(workers: int | None = None, scheduler: str | None = None) -> Itera
 
 
 def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple[_T, _R], None, None]:
-    """Each task with what `function` makes of it, as they come; close it to leave the rest undone.
+    """Apply `function` to every task; yield (task, result) in order of completion, until closed.
 
     Parameters
     ----------
     function : callable
-        Picklable; what it gives depends on the task alone.
+        Picklable; its result depends on the task alone.
     tasks : iterable
         Picklable.
     """
@@ -109,12 +110,7 @@ def _cluster(address: str) -> Iterator[None]:
 
 
 def _connected(address: str) -> Any:
-    try:
-        import distributed
-    except ImportError:
-        raise InvalidInput(
-            f"--scheduler {address}: needs Dask, which is not installed; install it with pip install 'servotwin[dask]'"
-        ) from None
+    distributed = require("distributed", f"--scheduler {address}:")
     for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what they have to say is said once, by us
     connect: Any = distributed.Client

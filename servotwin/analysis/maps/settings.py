@@ -1,4 +1,4 @@
-"""What a stability map is made of: servo, controller, axes, initial states, durations."""
+"""Settings of a stability map: servo, controller, axes, initial states, durations."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def _compare(path: Path, wanted: dict[str, Any]) -> None:
 
 
 def _shown(key: str, there: object, value: object) -> str:
-    """What differs, where it is short enough to be said."""
+    """Name the difference; in full where it is short."""
     words = [json.dumps(each) for each in (there, value)]
     return f"{key} = {words[0]}, not {words[1]}" if max(map(len, words)) <= 40 else f"another {key}"
 
@@ -116,7 +116,7 @@ class Piece:
     cells: range
 
     def measured(self) -> Measures:
-        """What its cells do."""
+        """Run its cells."""
         return measured(self.settings, self.cells)
 
 
@@ -146,7 +146,7 @@ def compute(store: MapStore, workers: int | None, scheduler: str | None, console
 
 
 def collected(store: MapStore) -> Measures:
-    """All pieces as one."""
+    """Join all pieces into one."""
     parts = [store.kept(number) for number in range(len(store.settings.chunks))]
     whole = [part for part in parts if part is not None]
     if len(whole) < len(parts):

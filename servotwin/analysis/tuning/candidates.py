@@ -26,7 +26,7 @@ _ROUNDING = 8.0 * float(np.finfo(float).eps)
 
 
 class ControllerType(NamedTuple):
-    """What a controller type consists of: an integrator, a second zero `be`, a filter `al` to choose."""
+    """Parts of a controller type: an integrator, a zero `phz`, a second zero `be`, a filter `al` to choose."""
 
     integral: bool
     zero: bool

@@ -13,7 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.linear import Complex, LinearSystem
 
-# Poles and zeros of the plant get looks of their own, this many of their widths about them.
+# Frequencies about each pole and zero of the plant, in its half widths.
 _CLUSTER = np.linspace(-8.0, 8.0, 49)
 _PER_DECADE = 60
 _AXIS = 1e-9
@@ -65,7 +65,7 @@ class FrequencyData:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """What is tuned for.
+    """Plant for which a controller is tuned.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Plant:
         return np.asarray(self.system.response(w) * np.exp(-1j * w * self.delay))
 
     def search_frequencies(self, wc: float) -> Array:
-        """(N,) rad/s, ascending: where to look at a loop that crosses over at wc."""
+        """(N,) rad/s, ascending: frequencies that resolve a loop that crosses over at wc."""
         if isinstance(self.system, FrequencyData):
             omega = np.asarray(self.system.omega, dtype=float)
             count = int(_PER_DECADE * math.log10(omega[-1] / omega[0])) + 2
@@ -132,7 +132,7 @@ def _integrators(system: LinearSystem | FrequencyData) -> int:
 
 
 def nyquist_stable(loops: Complex, integrators: int) -> Array:
-    """Which closed loops are stable, by Nyquist's criterion.
+    """Decide which closed loops are stable, by Nyquist's criterion.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ _EQUAL = 1.01
 
 @dataclass(frozen=True)
 class Specification:
-    """What is wanted.
+    """Specification of a controller.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Specification:
             )
 
     def cost(self, candidate: Candidate) -> float:
-        """What the search makes small; a candidate beyond Ms_max is worse than any within."""
+        """Cost that the search minimises; a candidate beyond Ms_max is worse than any within."""
         if self.prefer == "Ki" and candidate.Ms <= self.Ms_max:
             return -candidate.integral
         return candidate.Ms
@@ -81,7 +81,7 @@ class Specification:
 
 @dataclass(frozen=True)
 class Tuning:
-    """A controller and what it achieves.
+    """A controller, its margins and the statistics of the search.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Tuning:
     margins : Margins
         All crossovers and margins, Ms and bandwidth.
     candidates, stable : int
-        Candidates looked at, and how many of them were stable.
+        Numbers of candidates evaluated, and of stable ones among them.
     """
 
     controller: Controller
@@ -108,7 +108,7 @@ def tune(
     delay: float = 0.0,
     like: Controller | None = None,
 ) -> Tuning:
-    """The best controller of a type with a given crossover and phase margin.
+    """Find the best controller of a type with a given crossover and phase margin.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def tune(
     delay : float
         s, in series with it.
     like : Controller, optional
-        Where the dead zone, limits and filter of the result come from.
+        Source of the dead zone, limits and filter of the result.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def tune(
     for candidate in [*eager, best]:
         law = candidate.factors.controller()
         achieved = evaluate(system, law, delay)
-        # The looks of the search may just miss a peak; the exact Ms decides.
+        # The frequencies of the search may just miss a peak; the exact Ms decides.
         if achieved.Ms <= wanted.Ms_max:
             break
     if like is not None:
@@ -148,8 +148,7 @@ def tune(
 
 
 def evaluate(system: LinearSystem | FrequencyData, controller: Controller, delay: float = 0.0) -> Margins:
-    """All crossovers and margins, Ms and bandwidth of a controller on a plant: from roots of polynomials where there
-    are any, from a dense response otherwise."""
+    """All crossovers and margins, Ms and bandwidth of a controller on a plant with a delay."""
     law = pidf(controller)
     if isinstance(system, LinearSystem) and delay == 0.0:
         loop = series(law, system)

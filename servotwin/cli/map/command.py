@@ -12,6 +12,7 @@ from servotwin.cli.map import table
 from servotwin.cli.map.request import Request
 from servotwin.errors import InvalidInput
 from servotwin.runtime import files
+from servotwin.runtime.extras import check_extra
 
 
 def stability_map(
@@ -48,6 +49,7 @@ def stability_map(
         With a sentence on what is finished and how to go on.
     """
     console = console or Console()
+    check_extra("matplotlib", "servotwin map")
     if workers is not None and scheduler is not None:
         raise InvalidInput(f"--workers {workers} and --scheduler {scheduler}: give one; a cluster has its own workers")
     settings = request.settings()

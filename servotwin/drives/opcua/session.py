@@ -13,6 +13,7 @@ from servotwin.drives.opcua import model
 from servotwin.drives.opcua.settings import OpcUaSettings
 from servotwin.edge.drive import DriveLost, DriveRefused
 from servotwin.errors import InvalidInput
+from servotwin.runtime.extras import missing_extra
 
 _Result = TypeVar("_Result")
 _CLOSING = 2.0  # s
@@ -49,7 +50,7 @@ class Session:
             from asyncua.client.client import Client
             from asyncua.ua.uaerrors import UaError
         except ModuleNotFoundError:
-            raise InvalidInput("drive kind opcua needs asyncua; give: pip install 'servotwin[opcua]'") from None
+            raise missing_extra("asyncua", "drive kind opcua") from None
         self._ua, self._settings = ua, settings
         self._failures = (OSError, TimeoutError, NoAnswer, asyncio.CancelledError, UaError, ValueError)
         self._client = Client(settings.url, timeout=settings.silence_s)

@@ -24,7 +24,7 @@ MOTOR = ("J", "L", "R", "k_T", "k_B")
 STRUCTURE = ("k/m", "c/m", "pitch")
 
 
-class Hold(StrEnum):
+class InputHold(StrEnum):
     """What an input does between its samples."""
 
     CONSTANT = "zero-order hold"
@@ -61,7 +61,7 @@ class Family:
         """The same system with the derivatives by some of its parameters only."""
         return Family(tuple(names), self.system, tuple(self.by[self.names.index(name)] for name in names))
 
-    def sampled(self, sample_rate: float, hold: Hold = Hold.LINEAR) -> Sampled:
+    def sampled(self, sample_rate: float, hold: InputHold = InputHold.LINEAR) -> Sampled:
         """At a sample rate in Hz."""
         interval = 1.0 / sample_rate
         parts = [_held(self.system, one, interval, hold) for one in (self.system, *self.by)]
@@ -115,7 +115,7 @@ class Sampled:
         return np.array([bare.respond(silence, state)[0] for state in states])
 
 
-def _held(system: Matrices, by: Matrices, interval: float, hold: Hold) -> tuple[Array, Array]:
+def _held(system: Matrices, by: Matrices, interval: float, hold: InputHold) -> tuple[Array, Array]:
     """exp of the system with its input's value and slope as states, over an interval, and its derivative."""
     flow, change = _flow(system, interval, hold), _flow(by, interval, hold, constant=False)
     _, (scale, _) = matrix_balance(flow, permute=False, separate=True)
@@ -161,12 +161,12 @@ def _exponential(flow: Array, change: Array, step: Array) -> None:
         step[0] = multiplied(step[0], step[0])
 
 
-def _flow(system: Matrices, interval: float, hold: Hold, constant: bool = True) -> Array:
+def _flow(system: Matrices, interval: float, hold: InputHold, constant: bool = True) -> Array:
     """(N + 2, N + 2) generator for (state, input, its increment over the interval), times the interval."""
     size = system.B.size
     flow = np.zeros((size + 2, size + 2))
     flow[:size, :size], flow[:size, size] = system.A * interval, system.B * interval
-    if constant and hold is Hold.LINEAR:
+    if constant and hold is InputHold.LINEAR:
         flow[size, size + 1] = 1.0
     return flow
 

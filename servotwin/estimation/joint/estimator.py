@@ -1,29 +1,40 @@
 """The gap together with the model's own numbers, for a machine that is not quite what its description says.
 
 Of the structure only k/m, c/m and the pitch show in its motion, of the motor, when its angle is not measured, only k_B
-(docs/motor-identifiability.md). A delay between the channels is always estimated too.
+(docs/motor-identifiability.md). A delay between the channels is always estimated too. Several windows of one machine
+share its numbers; gap, delay and initial states are each window's.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import shortest_for
-from servotwin.estimation.core.family import Hold
-from servotwin.estimation.joint.alone import RIVAL, Alone, decimation_factor, searched, unsearched
-from servotwin.estimation.joint.knowledge import AnyPrior
+from servotwin.estimation.core.family import InputHold
+from servotwin.estimation.joint.fit import (
+    APART,
+    RIVAL,
+    AnyPrior,
+    FitPoint,
+    ParameterPrior,
+    WindowMinima,
+    decimation_factor,
+    descend,
+    searched,
+    tolerance_of,
+    unsearched,
+)
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
-from servotwin.estimation.joint.together import Together
 from servotwin.estimation.joint.verdict import (
-    Found,
     JointEstimate,
-    Parameter,
+    JointFit,
     at_bound,
     estimate_of,
     mismatched,
@@ -31,16 +42,104 @@ from servotwin.estimation.joint.verdict import (
 )
 from servotwin.estimation.trend import Prior
 from servotwin.estimation.whitened.channels import faults, motor_angle
-from servotwin.estimation.whitened.settings import Settings as Whitened
+from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+__all__ = ["JointEstimate", "JointSettings", "SharedFit", "estimate_jointly"]
+
+SHARED = ("k/m", "c/m", "pitch", "k_B")
+
+
+@dataclass(frozen=True, eq=False)
+class SharedFit:
+    """The windows as one problem, whose point has the shared parameters first and then each window's own.
+
+    Attributes
+    ----------
+    fits : tuple of WindowMinima
+        All with the same shared parameters.
+    places : tuple of (P,) arrays of int
+        Where each window's parameters are in the whole point.
+    """
+
+    fits: tuple[WindowMinima, ...]
+    places: tuple[NDArray[np.intp], ...]
+
+    @classmethod
+    def of(cls, fits: Sequence[WindowMinima]) -> SharedFit:
+        """The layout."""
+        names = fits[0].model.names
+        shared = {name: i for i, name in enumerate(name for name in names if name in SHARED)}
+        places, end = [], len(shared)
+        for fit in fits:
+            own = [name for name in fit.model.names if name not in shared]
+            where = {**shared, **{name: end + i for i, name in enumerate(own)}}
+            places.append(np.array([where[name] for name in fit.model.names], dtype=np.intp))
+            end += len(own)
+        return cls(tuple(fits), tuple(places))
+
+    @property
+    def size(self) -> int:
+        """Parameters in all."""
+        return 1 + max(int(place.max()) for place in self.places)
+
+    def joined(self, parts: Sequence[Array]) -> Array:
+        """(size,) of one (P,) for each window; where they share, the first's counts."""
+        whole = np.empty(self.size)
+        for place, part in reversed(list(zip(self.places, parts, strict=True))):
+            whole[place] = part
+        return whole
+
+    def known(self) -> ParameterPrior:
+        """Bounds and priors of the whole."""
+        each = [fit.known for fit in self.fits]
+        columns = ([getattr(one, name) for one in each] for name in ("lowest", "highest", "mean", "spread"))
+        return ParameterPrior(*(self.joined(column) for column in columns))
+
+    def evaluate(self, point: Array) -> FitPoint:
+        """Residuals and derivatives of all windows; what is known of the shared parameters counts once."""
+        known, residuals, blocks = self.known(), [], []
+        for fit, place in zip(self.fits, self.places, strict=True):
+            count = len(place)
+            seen = fit.evaluated(fit.known.vague(np.ones(count, dtype=bool)))(point[place])
+            block = np.zeros((self.size, seen.residual.size - count))
+            block[place] = seen.jacobian[:, :-count]
+            residuals.append(seen.residual[:-count])
+            blocks.append(block)
+        prior, slope = (point - known.mean) / known.spread, np.diag(1.0 / known.spread)
+        return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
+
+    def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
+        """The best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
+        tolerance = self.joined([tolerance_of(fit.model) for fit in self.fits])
+        starts = [self._start([fit.best for fit in self.fits])]
+        for index, fit in enumerate(self.fits):
+            others = [one.best for one in self.fits]
+            starts += [self._start([*others[:index], rival, *others[index + 1 :]]) for rival in fit.minima[1:]]
+        found = [descend(self.evaluate, start, self.known(), tolerance) for start in starts]
+        best = min(found, key=lambda one: one.cost)
+        near = [one for one in found if one.cost < best.cost + RIVAL]
+        gaps = [place[0] for place in self.places]
+        rivals = tuple(tuple(float(one.point[i]) for one in near if _apart(one.point[i], best.point[i])) for i in gaps)
+        return replace(best, evaluations=sum(one.evaluations for one in found)), rivals
+
+    def _start(self, stands: Sequence[FitPoint]) -> Array:
+        """Each window's own minimum; the shared parameters of the one that knows its gap best."""
+        leader = min(range(len(stands)), key=lambda i: float(stands[i].deviations()[0]))
+        whole = self.joined([one.point for one in stands])
+        whole[self.places[leader]] = stands[leader].point
+        return whole
+
+
+def _apart(gap: float, other: float) -> bool:
+    return abs(gap - other) > APART
+
 
 WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 SHORTEST = 200  # samples beside the margins, as before the decimation; after it a window has MINIMUM_SAMPLES at least
 _SIGMAS = 4.0  # by how many standard deviations a gap may move when its window is fitted with others
-
-
-__all__ = ["JointEstimate", "JointSettings", "Parameter", "Prior", "estimate_jointly"]
 
 
 def estimate_jointly(
@@ -132,8 +231,8 @@ def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointS
             f"{window.where}the window has {window.position.size} samples: the joint estimator needs at least {fewest} "
             f"at {window.sample_rate:.6g} Hz"
         )
-    hold = settings.hold or (Hold.LINEAR if servo.controller.sample_rate is None else Hold.CONSTANT)
-    unsure = jumps(window.voltage) if motor and hold is Hold.LINEAR and window.voltage is not None else ()
+    hold = settings.hold or (InputHold.LINEAR if servo.controller.sample_rate is None else InputHold.CONSTANT)
+    unsure = jumps(window.voltage) if motor and hold is InputHold.LINEAR and window.voltage is not None else ()
     names = ("gap", "place", *delay, *free, *motor, *(f"{JUMP}{index}" for index in unsure))
     return JointModel(window, servo, names, hold, margin, unsure)
 
@@ -150,12 +249,14 @@ def _still(window: Window) -> bool:
     return window.theta_m is None and window.voltage is not None and float(np.ptp(window.voltage)) == 0.0
 
 
-def _fit(window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, settings: JointSettings) -> Alone:
+def _fit(
+    window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, settings: JointSettings
+) -> WindowMinima:
     """One window by itself; not searched when its channels are useless."""
     model = _model(window, servo, names, settings)
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
-        smooth = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, Whitened()))
+        smooth = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, WhitenedSettings()))
         model = replace(model, window=smooth)
     silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
     if broken or silence:
@@ -163,28 +264,28 @@ def _fit(window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, 
     return searched(model, prior, settings)
 
 
-def _alone(fit: Alone) -> Found:
+def _alone(fit: WindowMinima) -> JointFit:
     """The best minimum of one window, and what speaks against it being the only one."""
     best = fit.best
     rivals = tuple(float(one.point[0]) for one in fit.minima[1:] if one.cost < best.cost + RIVAL)
     objection = fit.blocked or _doubt(best.converged, float(best.point[0]), rivals)
-    return Found(fit.model, best.point, best.covariance(), fit.evaluations, objection)
+    return JointFit(fit.model, best.point, best.covariance(), fit.evaluations, objection)
 
 
-def _joined(fits: Sequence[Alone], alone: Sequence[Found], settings: JointSettings) -> list[Found]:
+def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: JointSettings) -> list[JointFit]:
     """The windows fitted together; one whose gap moves by more than its spread contradicts the others."""
-    whole = Together.of(fits)
+    whole = SharedFit.of(fits)
     best, rivals = whole.solved()
     covariance, found = best.covariance(), []
     for before, place, others in zip(alone, whole.places, rivals, strict=True):
         point = best.point[place]
         objection = _doubt(best.converged, float(point[0]), others)
-        one = Found(before.model, point, covariance[np.ix_(place, place)], best.evaluations, objection)
+        one = JointFit(before.model, point, covariance[np.ix_(place, place)], best.evaluations, objection)
         found.append(replace(one, contradiction=_contradiction(before, one, settings)))
     return found
 
 
-def _contradiction(before: Found, after: Found, settings: JointSettings) -> str:
+def _contradiction(before: JointFit, after: JointFit, settings: JointSettings) -> str:
     """Why a window is not of the same machine as the others; empty when it may be."""
     moved, spread = after.point[0] - before.point[0], math.hypot(before.std(settings), settings.model_error_rad)
     if before.objection or not abs(moved) > _SIGMAS * spread:

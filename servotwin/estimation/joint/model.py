@@ -14,10 +14,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts
-from servotwin.estimation.core.family import STRUCTURE, Hold, Sampled, motor_family, structure_family
-from servotwin.estimation.core.projection import orthonormal, project_out
-from servotwin.estimation.joint.motor_information import through_gap
+from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, through_gap
+from servotwin.estimation.core.family import STRUCTURE, InputHold, Sampled, motor_family, structure_family
+from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -31,7 +30,7 @@ _MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
+class JointSlopes:
     """Residual (m,) at a point and its derivatives (P, m) by the parameters, nuisances projected out."""
 
     residual: Array
@@ -51,7 +50,7 @@ class JointModel:
     window : Window
     servo : Servo
     names : tuple of str
-    hold : Hold
+    hold : InputHold
         Of the voltage; counts only where theta_m is not measured.
     margin : int
         Samples left out at either end, so that any allowed delay finds its samples.
@@ -62,7 +61,7 @@ class JointModel:
     window: Window
     servo: Servo
     names: tuple[str, ...]
-    hold: Hold
+    hold: InputHold
     margin: int
     jumps: tuple[int, ...] = ()
 
@@ -127,14 +126,14 @@ class JointModel:
         left = project_out(orthonormal(rows[1:]), rows[:1])[0]
         return float(left @ left)
 
-    def slopes(self, values: Mapping[str, float], reduce: Reduce) -> Slopes:
+    def slopes(self, values: Mapping[str, float], reduce: Reduce) -> JointSlopes:
         """Residual and derivatives; those of the nuisances by the parameters are included."""
         table = self.table(values, reduce)
         split = table.shape[0] - len(self.names)
         basis, moved = orthonormal(table[1:split]), table[split:]
         left = project_out(basis, np.vstack([table[:1], -moved]))
         left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
-        return Slopes(left[0], left[1:], float(left[0] @ left[0]))
+        return JointSlopes(left[0], left[1:], float(left[0] @ left[0]))
 
     def table(self, values: Mapping[str, float], reduce: Reduce) -> Array:
         """(1 + N + 1 + P, m) measured less forced position, nuisances, derivatives of the position by `names`."""

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from servotwin.config.keys import check, settings, value
 from servotwin.errors import InvalidInput
-from servotwin.estimation.core.family import Hold
+from servotwin.estimation.core.family import InputHold
 
 SPREADS: Mapping[str, float] = MappingProxyType(
     {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_B": 0.1, "gap rate": math.radians(0.5)}
@@ -27,7 +27,7 @@ class JointSettings:
     spreads : mapping
         What is known of each free parameter beforehand: standard deviation, of the logarithm for "k/m", "c/m", "pitch"
         and "k_B" (0.1: about 10 %), in rad/s for "gap rate". A parameter may move by four of them.
-    hold : Hold, optional
+    hold : InputHold, optional
         Course of the voltage between samples, where the angle is computed from it. By default it is held when the
         servo's controller is sampled, and linear when it is continuous.
     """
@@ -41,7 +41,7 @@ class JointSettings:
         ),
     ] = 2e-3
     largest_gap_rad: Annotated[float, value(minimum=0.0, help="End of the search.")] = math.radians(60.0)
-    hold: Hold | None = None
+    hold: InputHold | None = None
     contact_travel_rad: Annotated[
         float, value(minimum=0.0, help="Least travel of the fitted screw in each contact.")
     ] = math.radians(0.5)

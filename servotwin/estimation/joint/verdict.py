@@ -67,7 +67,7 @@ class JointEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class JointFit:
     """Where a fit ended, for one window.
 
     Attributes
@@ -106,7 +106,7 @@ class Found:
         return math.hypot(settings.inflation * math.sqrt(variance), settings.numeric_error_rad)
 
 
-def estimate_of(gaps: tuple[GapEstimate, ...], found: Found, settings: JointSettings) -> JointEstimate:
+def estimate_of(gaps: tuple[GapEstimate, ...], found: JointFit, settings: JointSettings) -> JointEstimate:
     """The gaps of all windows, and the parameters as the last that counted knows them."""
     model, covariance = found.model, settings.inflation**2 * found.covariance
     stds = dict(zip(model.names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
@@ -116,7 +116,7 @@ def estimate_of(gaps: tuple[GapEstimate, ...], found: Found, settings: JointSett
     return JointEstimate(gaps, parameters, model.names, covariance, model.adapted(found.values), remarks)
 
 
-def stated(found: Found, settings: JointSettings) -> GapEstimate:
+def stated(found: JointFit, settings: JointSettings) -> GapEstimate:
     """The estimate of a window's gap that a minimum makes."""
     model, std = found.model, found.std(settings)
     status, reasons = _verdict(found, std, settings)
@@ -138,7 +138,7 @@ def stated(found: Found, settings: JointSettings) -> GapEstimate:
     return replace(known, theta_d0=first + at.theta_d0)
 
 
-def _verdict(found: Found, std: float, settings: JointSettings) -> tuple[GapStatus, tuple[str, ...]]:
+def _verdict(found: JointFit, std: float, settings: JointSettings) -> tuple[GapStatus, tuple[str, ...]]:
     """What the minimum may be used for, and why not for more."""
     if found.objection:
         return GapStatus.UNIDENTIFIABLE, (found.objection,)
@@ -157,7 +157,7 @@ def _verdict(found: Found, std: float, settings: JointSettings) -> tuple[GapStat
     return GapStatus.LOWER_BOUND if status is GapStatus.OK else status, (bound, *reasons)
 
 
-def at_bound(found: Found, settings: JointSettings) -> str:
+def at_bound(found: JointFit, settings: JointSettings) -> str:
     """Reason why a fit says no more than that the gap is large: the search ended at its bound; empty otherwise."""
     largest = settings.largest_gap_rad
     # A search may stop a little before the bound, so that one standard deviation counts as there.
@@ -166,7 +166,7 @@ def at_bound(found: Found, settings: JointSettings) -> str:
     return f"the best fit lies at largest_gap_rad = {math.degrees(largest):.6g} deg: the gap is probably larger"
 
 
-def mismatched(found: Found, settings: JointSettings) -> str:
+def mismatched(found: JointFit, settings: JointSettings) -> str:
     """Why the model does not belong to the window; empty when it does."""
     variation = float(np.std(found.model.measured))
     if variation > 0.0 and found.rms > settings.unexplained * variation:
@@ -179,7 +179,7 @@ def mismatched(found: Found, settings: JointSettings) -> str:
     return ""
 
 
-def _by_contacts(found: Found, needed: float) -> tuple[GapStatus, tuple[str, ...]]:
+def _by_contacts(found: JointFit, needed: float) -> tuple[GapStatus, tuple[str, ...]]:
     """Pushed both ways, the screw shows the gap; pushed one way only, a bound."""
     _, theta_m, at = found.model.screw(found.values)
     seen = pushed(found.model, theta_m, at)

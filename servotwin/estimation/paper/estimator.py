@@ -7,31 +7,126 @@ What is added is only what an answer must say of itself: a spread, and a refusal
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.estimate import (
+    NORMAL_95,
+    NOTHING_KNOWN,
+    GapEstimate,
+    GapStatus,
+    Interval,
+    interval_95,
+    no_estimate,
+)
 from servotwin.estimation.paper.bfgs import Minimum, minimise
-from servotwin.estimation.paper.information import standard_deviation
-from servotwin.estimation.paper.motion import motion
 from servotwin.estimation.paper.observer import observer
-from servotwin.estimation.paper.residual import PlayResidual
-from servotwin.estimation.paper.settings import Settings
-from servotwin.estimation.paper.verdict import judge
+from servotwin.estimation.paper.residual import PlayResidual, standard_deviation
+from servotwin.estimation.paper.settings import PaperSettings
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "Settings", "estimate"]
+__all__ = ["METHOD", "PaperSettings", "estimate"]
+
+_SPAN_S = 0.02  # speeds are taken over this time: one encoder count between two samples is no motion
+
+
+@dataclass(frozen=True)
+class MotorMotion:
+    """Share of the window in which the motor moved (0..1), and how often it changed direction."""
+
+    moving: float
+    reversals: int
+
+
+def motion(theta_m: Array, sample_rate: float, rest_speed: float) -> MotorMotion:
+    """Motion of an angle theta_m (n,) rad; slower than `rest_speed` (rad/s) counts as rest."""
+    span = min(max(1, round(_SPAN_S * sample_rate)), theta_m.size - 1)
+    speed = (theta_m[span:] - theta_m[:-span]) * (sample_rate / span)
+    direction = np.sign(speed[np.abs(speed) > rest_speed])
+    return MotorMotion(direction.size / speed.size, int(np.count_nonzero(np.diff(direction))))
+
+
+class PaperVerdict(NamedTuple):
+    """Status, total gap (rad; NaN when nothing is known) and the reasons for both."""
+
+    status: GapStatus
+    gap: float
+    reasons: tuple[str, ...]
+
+    def interval(self, std: float) -> Interval:
+        """95 % interval of the gap for a standard deviation, rad."""
+        if self.status is GapStatus.OK:
+            return interval_95(self.gap, std)
+        if self.status is GapStatus.LOWER_BOUND:
+            return interval_95(self.gap, std)[0], math.inf
+        return NOTHING_KNOWN
+
+
+def judge(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict:
+    """The verdict on a minimum with the statistical standard deviation `std` (rad)."""
+    objection = _objection(residual, found, std, settings)
+    if objection is not None:
+        return objection
+    fitted, total = float(found.point[0]) * residual.scale, math.hypot(std, settings.method_error)
+    widest = max(0.0, fitted) + NORMAL_95 * total
+    if residual.scale < widest:
+        moved = f"the motor moved by {math.degrees(residual.scale):.3g} deg"
+        return _unknown(f"{moved}, less than the {math.degrees(widest):.3g} deg that the gap may have")
+    verdict = _by_contacts(residual, found, max(0.0, fitted), settings.contact_travel)
+    return _negative(fitted, total) if fitted < 0.0 and verdict.status is GapStatus.OK else verdict
+
+
+def _objection(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict | None:
+    """Why the minimum says nothing of the gap, if so."""
+    if not found.converged:
+        return _unknown(f"the minimisation did not converge: {found.message}")
+    share = residual.unexplained(found.cost)
+    if share > settings.unexplained:
+        reason = f"the model leaves {100.0 * share:.0f} % of the measured motion unexplained"
+        return PaperVerdict(GapStatus.MODEL_MISMATCH, math.nan, (reason,))
+    if math.isinf(std):
+        return _unknown("the measurements do not depend on the gap")
+    if std > settings.largest_std:
+        allowed = math.degrees(settings.largest_std)
+        return _unknown(f"the gap is known to {math.degrees(std):.3g} deg only, and {allowed:.3g} deg are allowed")
+    return None
+
+
+def _negative(fitted: float, std: float) -> PaperVerdict:
+    """A minimum at a negative gap: zero when that lies within its spread, otherwise a sign that the model is wrong."""
+    reason = f"the best fit has a negative gap of {math.degrees(fitted):.3g} deg"
+    if -fitted <= NORMAL_95 * std:
+        return PaperVerdict(GapStatus.OK, 0.0, (f"{reason}, taken as 0",))
+    return PaperVerdict(GapStatus.MODEL_MISMATCH, math.nan, (reason,))
+
+
+def _by_contacts(residual: PlayResidual, found: Minimum, fitted: float, needed: float) -> PaperVerdict:
+    """Pushed both ways, the screw shows the gap; pushed one way only, that it is as wide as the motor's free travel."""
+    forwards, backwards, free = residual.screw_motion(found.point)
+    if min(forwards, backwards) >= needed:
+        return PaperVerdict(GapStatus.OK, fitted, ())
+    pushed = f"{math.degrees(forwards):.3g} deg forwards and {math.degrees(backwards):.3g} deg backwards"
+    reason = f"the screw was pushed {pushed}, and {math.degrees(needed):.3g} deg are needed both ways"
+    if max(forwards, backwards) >= needed:
+        return PaperVerdict(GapStatus.LOWER_BOUND, free, (reason,))
+    return _unknown(reason)
+
+
+def _unknown(reason: str) -> PaperVerdict:
+    return PaperVerdict(GapStatus.UNIDENTIFIABLE, math.nan, (reason,))
+
 
 METHOD = "paper"
 _GRADIENT_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-9  # of the motor's range: 1e-5 deg in the paper's loop
 
 
-def estimate(window: Window, servo: Servo, prior: float | None, settings: Settings | None) -> GapEstimate:
+def estimate(window: Window, servo: Servo, prior: float | None, settings: PaperSettings | None) -> GapEstimate:
     """The total gap (rad) that a window with theta_m and position shows.
 
     Parameters
@@ -41,14 +136,14 @@ def estimate(window: Window, servo: Servo, prior: float | None, settings: Settin
         The model, taken as exact.
     prior : float, optional
         The previous total gap, rad, from which the search starts; None: 0, the paper's first.
-    settings : Settings, optional
+    settings : PaperSettings, optional
 
     Raises
     ------
     InvalidInput
         No theta_m, a window too short for the observer to settle, a low-pass above half the sample rate.
     """
-    settings = settings or Settings()
+    settings = settings or PaperSettings()
     theta_m, position = _channels(window, settings)
     refusal = _unmoved(theta_m, window.sample_rate, settings)
     if refusal:
@@ -64,7 +159,7 @@ def estimate(window: Window, servo: Servo, prior: float | None, settings: Settin
     return _stated(_nothing(window, servo), settings, residual, found, angle_origin)
 
 
-def _channels(window: Window, settings: Settings) -> tuple[Array, Array]:
+def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
     """theta_m and position, low-passed where the settings say so."""
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method 'paper' needs the motor's angle in rad")
@@ -85,7 +180,7 @@ def _channels(window: Window, settings: Settings) -> tuple[Array, Array]:
     return lowpass.respond(window.theta_m), lowpass.respond(window.position)
 
 
-def _unmoved(theta_m: Array, sample_rate: float, settings: Settings) -> str:
+def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings) -> str:
     """Why the motor's motion cannot show a gap; empty when it can."""
     seen = motion(theta_m, sample_rate, settings.rest_speed)
     if seen.moving == 0.0:
@@ -102,7 +197,7 @@ def _start(theta_m: Array, prior: float) -> Array:
 
 
 def _stated(
-    blank: GapEstimate, settings: Settings, residual: PlayResidual, found: Minimum, angle_origin: float
+    blank: GapEstimate, settings: PaperSettings, residual: PlayResidual, found: Minimum, angle_origin: float
 ) -> GapEstimate:
     """The estimate that a minimum makes of a blank one."""
     std = residual.scale * standard_deviation(*residual.sensitivities(found.point), residual.values(found.point))

@@ -14,7 +14,7 @@ ORIGINS = ("absolute", "first")
 
 @settings("estimator")
 @dataclass(frozen=True)
-class Settings:
+class PaperSettings:
     """Settings of the paper's estimator.
 
     With `origin` "absolute", the published reading, the observer starts from zero, so that what lies between zero and

@@ -14,27 +14,34 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
-from servotwin.estimation.whitened.aligned import Aligned, align_and_fit
-from servotwin.estimation.whitened.channels import faults, motor_angle
-from servotwin.estimation.whitened.diagnosis import likely_fault
-from servotwin.estimation.whitened.gate import Evidence, judge, lower_bound, one_sided
-from servotwin.estimation.whitened.lost_motion import static_lost_motion
-from servotwin.estimation.whitened.model_check import Shift, model_shift, observer_shift
-from servotwin.estimation.whitened.passes import Found
-from servotwin.estimation.whitened.profile import profile_interval
-from servotwin.estimation.whitened.settings import Settings
-from servotwin.estimation.whitened.unexplained import noise_left, slow_share
+from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, profile_interval
+from servotwin.estimation.whitened.gate import (
+    FitEvidence,
+    ModelShift,
+    judge,
+    lower_bound,
+    model_shift,
+    noise_left,
+    observer_shift,
+    one_sided,
+    slow_share,
+    static_lost_motion,
+)
+from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "SHORTEST", "Fitted", "Settings", "estimate", "fit"]
+__all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit"]
 
 METHOD = "whitened"
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
 
-def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> GapEstimate:
+def estimate(
+    window: Window, servo: Servo, prior: float | GapEstimate | None, settings: WhitenedSettings | None
+) -> GapEstimate:
     """The total gap (rad) that a window with theta_m and position shows.
 
     Parameters
@@ -44,7 +51,7 @@ def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, se
         The model; that it fits the window is checked.
     prior : float or GapEstimate, optional
         Total gap, rad: one of the starts, and what is given back when the window says nothing.
-    settings : Settings, optional
+    settings : WhitenedSettings, optional
 
     Raises
     ------
@@ -55,7 +62,7 @@ def estimate(window: Window, servo: Servo, prior: float | GapEstimate | None, se
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class WindowFit:
     """A window's fit, before anything is held against it, which takes longer than the fit.
 
     Attributes
@@ -63,22 +70,22 @@ class Fitted:
     window : Window
     servo : Servo
     prior : float or GapEstimate, optional
-    settings : Settings
+    settings : WhitenedSettings
     blank : GapEstimate
         What is known without the window; its status and reasons are final where the channels are broken.
     angle : (n,) array
         rad, of the motor.
-    aligned : Aligned, optional
+    aligned : AlignedFit, optional
         None: the channels are broken.
     """
 
     window: Window
     servo: Servo
     prior: float | GapEstimate | None
-    settings: Settings
+    settings: WhitenedSettings
     blank: GapEstimate
     angle: Array
-    aligned: Aligned | None
+    aligned: AlignedFit | None
 
     def one_sided(self) -> str:
         """Why the window cannot show the gap, whatever else is found: too little contact; empty: it has enough."""
@@ -99,9 +106,11 @@ class Fitted:
         return _stated(self.blank, seen, status, reasons, self.prior, self.settings)
 
 
-def fit(window: Window, servo: Servo, prior: float | GapEstimate | None, settings: Settings | None) -> Fitted:
+def fit(
+    window: Window, servo: Servo, prior: float | GapEstimate | None, settings: WhitenedSettings | None
+) -> WindowFit:
     """The first half of `estimate`, with the same arguments and errors."""
-    settings = settings or Settings()
+    settings = settings or WhitenedSettings()
     _check(window)
     assert window.theta_m is not None
     blank = _nothing(window, servo, prior)
@@ -109,10 +118,10 @@ def fit(window: Window, servo: Servo, prior: float | GapEstimate | None, setting
     if broken:
         dead = any("constant" in sentence for sentence in broken)
         blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
-        return Fitted(window, servo, prior, settings, blank, window.theta_m, None)
+        return WindowFit(window, servo, prior, settings, blank, window.theta_m, None)
     angle = motor_angle(window, servo.encoder_resolution, settings)
     aligned = align_and_fit(angle, window.position, window.sample_rate, servo, _start(prior), settings)
-    return Fitted(window, servo, prior, settings, blank, angle, aligned)
+    return WindowFit(window, servo, prior, settings, blank, angle, aligned)
 
 
 def _check(window: Window) -> None:
@@ -128,29 +137,31 @@ def _start(prior: float | GapEstimate | None) -> float:
     return 0.0 if value is None or not math.isfinite(value) else value
 
 
-def _evidence(aligned: Aligned, window: Window, angle: Array, servo: Servo, settings: Settings) -> Evidence:
+def _evidence(
+    aligned: AlignedFit, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings
+) -> FitEvidence:
     found = aligned.found
     std = settings.calibration * found.std * math.sqrt(max(1.0, found.variance))
     gain = found.reduction.response.static_gain
     identifiable = math.isfinite(found.std)
-    return Evidence(
+    return FitEvidence(
         aligned,
         std,
         profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
         _travel(found),
-        model_shift(found, servo, settings.order) if identifiable else Shift(0.0, math.inf, "", 0.0),
+        model_shift(found, servo, settings.order) if identifiable else ModelShift(0.0, math.inf, "", 0.0),
         observer_shift(found, servo) if identifiable else (0.0, math.inf),
         static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
         slow_share(found),
     )
 
 
-def _left(found: Found) -> float:
+def _left(found: WhitenedFit) -> float:
     """m rms, what the fit leaves."""
     return float(np.sqrt(np.mean(noise_left(found) ** 2)))
 
 
-def _travel(found: Found) -> Travel:
+def _travel(found: WhitenedFit) -> Travel:
     """Of the screw, without the end of the window, to which the last mass cannot have answered."""
     reduction, model = found.reduction, found.reduction.response
     kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
@@ -161,11 +172,11 @@ def _travel(found: Found) -> Travel:
 
 def _stated(
     blank: GapEstimate,
-    seen: Evidence,
+    seen: FitEvidence,
     status: GapStatus,
     reasons: tuple[str, ...],
     prior: float | GapEstimate | None,
-    settings: Settings,
+    settings: WhitenedSettings,
 ) -> GapEstimate:
     """The estimate that the evidence makes of a blank one."""
     found = seen.aligned.found

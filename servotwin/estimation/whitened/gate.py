@@ -1,15 +1,216 @@
-"""What a fit may be used for: the status of an estimate and the reasons for it."""
+"""Evidence for and against a fit, and the verdict: status of an estimate and the reasons for it.
+
+How much of the slow motion the fit leaves (noise is fast or small, a wrong channel is neither); static lost motion at
+rest; whether the gap would move if the model were free. Near the fit, a model that is a little off adds multiples of a
+few known motions to the position: those of a stiffer or more damped structure, of another pitch or scale, of a
+compliant screw. Free within wide tolerances, they take what they can of the residual, and the gap moves with them. So
+does a gap that grows within the window, where it counts as constant.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
-from servotwin.estimation.core.contacts import Travel
+import numpy as np
+
+from servotwin.estimation.core.contacts import BY_RATE, Travel, polygon
+from servotwin.estimation.core.least_squares import LeastSquares, least_squares, orthonormal, project_out, spread
+from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
-from servotwin.estimation.whitened.aligned import Aligned
-from servotwin.estimation.whitened.model_check import Shift
-from servotwin.estimation.whitened.settings import Settings
+from servotwin.estimation.paper.observer import LagFilter, observer
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
+from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
+from servotwin.estimation.whitened.settings import WhitenedSettings
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+_SLOW_S = 0.06  # s: motions faster than this are averaged away, twice
+_CHANCE = 6.0  # times what white noise would leave when averaged; decimated, it leaves twice that
+
+
+def noise_left(found: WhitenedFit) -> Array:
+    """(m,) m, what the fit and its nuisances leave of the reduced position."""
+    table = found.reduction.table(found.point)
+    rows = found.reduction.prepared(found.noise, table, CONSTANT)
+    return np.asarray(table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:])
+
+
+def slow_share(found: WhitenedFit) -> float:
+    """Slow part of what is left over the slow variation of the position, rms both; 0 where it can be noise.
+
+    Where hardly anything moves, noise is most of the position's own variation, and that is no fault.
+    """
+    interval = found.reduction.response.interval * found.reduction.decimation.factor
+    variation = float(np.std(slow(found.reduction.position, interval)))
+    left = noise_left(found)
+    remains = _rms(slow(left, interval))
+    if remains <= _CHANCE * averaged_noise(left, interval) and _rms(left) <= loudest(found):
+        return 0.0
+    return remains / variation if variation > 0.0 else math.inf
+
+
+def averaged_noise(values: Array, interval: float) -> float:
+    """rms of the slow part of white noise that is from sample to sample as large as in a signal (m,)."""
+    weights = np.convolve(averaging(interval), averaging(interval))
+    return _rms(np.diff(values)) * math.sqrt(0.5 * float(weights @ weights))
+
+
+def loudest(found: WhitenedFit) -> float:
+    """m: a sensor whose noise hides what the motor does, or does in a turn, measures something else."""
+    reduction = found.reduction
+    return abs(reduction.response.static_gain) * max(float(np.ptp(reduction.theta_m)), 2.0 * math.pi)
+
+
+def averaging(interval: float) -> Array:
+    """Weights (w,) of one average."""
+    size = max(1, round(_SLOW_S / interval))
+    return np.full(size, 1.0 / size)
+
+
+def slow(values: Array, interval: float) -> Array:
+    """A signal (m,) averaged twice."""
+    window = averaging(interval)
+    return np.convolve(np.convolve(values, window, "valid"), window, "valid")
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float(values @ values) / values.size)
+
+
+_BLOCK_S = 0.1
+_STILL = 0.02  # of the gap: what moves less within a block rests
+
+
+def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain: float, gap: float) -> float:
+    """Range (rad) of theta_m - position / static gain over the blocks in which both rest; it cannot exceed the gap.
+
+    Parameters
+    ----------
+    theta_m, position : (n,) arrays
+        rad, m.
+    rate : float
+        Hz.
+    static_gain : float
+        m/rad.
+    gap : float
+        rad, the fitted one: rest means motion below a fiftieth of it.
+    """
+    size = max(4, round(_BLOCK_S * rate))
+    count = theta_m.size // size
+    angle = theta_m[: count * size].reshape(count, size)
+    load = position[: count * size].reshape(count, size) / static_gain
+    allowed = _STILL * gap
+    still = (np.ptp(angle, axis=1) < allowed) & (np.ptp(load, axis=1) < allowed)
+    lead = (angle - load).mean(axis=1)[still]
+    return float(np.ptp(lead)) if lead.size > 1 else 0.0
+
+
+_STEP = 1e-3  # relative
+_STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
+TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
+GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
+_ALPHA = 40.0  # rad/s, the paper's observer
+
+
+class ModelShift(NamedTuple):
+    """By how much the gap moves (rad), the standard deviation of that, what moves it most, in words, and how much more
+    likely the window becomes: twice the logarithm of the ratio, a few for a right model."""
+
+    gap: float
+    std: float
+    words: str
+    gain: float
+
+
+def model_shift(found: WhitenedFit, servo: Servo, order: int) -> ModelShift:
+    """The gap's move when the model is free within `TOLERANCES`, in the noise that is then left.
+
+    Whitening takes a wrong model for noise; with the model free it is seen for what it is.
+    """
+    model, reduction = found.reduction.response, found.reduction
+    seen = polygon(reduction.theta_m, found.point.screw(0.0, reduction.rate))
+    screw = seen[:1]
+    here = model.respond(screw)
+    motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
+    motions.insert(2, here)
+    sizes = list(TOLERANCES.values())
+    if reduction.growth is None:
+        motions.append(model.respond(seen[BY_RATE:]))
+        sizes.append(GROWTH * model.interval)
+    free = reduction.decimation.rows(np.vstack(motions)) * np.array(sizes)[:, None]
+    table, size = np.vstack([reduction.table(found.point), free]), len(free)
+    shares = _within_tolerance(reduction.prepared(found.noise, table, CONSTANT), size).coefficients
+    noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
+    rows = reduction.prepared(noise, table, CONSTANT)
+    solved = _within_tolerance(rows, size)
+    own = spread(rows[GAP], rows[PLACE:-size])
+    std = math.sqrt(max(0.0, float(solved.deviations[0]) ** 2 - own**2)) if math.isfinite(own) else math.inf
+    words = _words(solved.coefficients[-size:], solved.deviations[-size:])
+    gain = 2.0 * table.shape[1] * math.log(found.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
+    return ModelShift(float(solved.coefficients[0]), std, words, gain)
+
+
+def _within_tolerance(rows: Array, free: int) -> LeastSquares:
+    """All coefficients, the last `free` ones expected to be 0 with standard deviation 1."""
+    known = np.zeros((len(rows), free))
+    known[-free:] = np.eye(free)
+    columns = np.hstack([rows, known])
+    return least_squares(columns[GAP:], columns[RESIDUAL])
+
+
+def _words(shares: Array, deviations: Array) -> str:
+    """Which direction is needed most, and by how much."""
+    index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
+    if index == len(TOLERANCES):
+        return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
+    name = list(TOLERANCES)[index]
+    return f"a {name} off by {100.0 * TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
+
+
+@lru_cache(maxsize=32)
+def _neighbours(servo: Servo, sample_rate: float) -> tuple[tuple[Response, float], ...]:
+    """Responses a step away from a servo's in stiffness, damping and the screw's compliance (of the structure's)."""
+    stiffer = servo.replace(k=tuple((1.0 + _STEP) * servo.stiffnesses))
+    damped = servo.replace(c=tuple((1.0 + _STEP) * servo.dampings))
+    stiffness = float(servo.stiffnesses.max())
+    soft = 1.0 / _STIFF if servo.rigid else stiffness / servo.k_d * (1.0 + _STEP)
+    softer = servo.replace(k_d=stiffness / soft)
+    step = soft - (0.0 if servo.rigid else stiffness / servo.k_d)
+    pairs = ((stiffer, _STEP), (damped, _STEP), (softer, step))
+    return tuple((response(other, sample_rate), size) for other, size in pairs)
+
+
+def observer_shift(found: WhitenedFit, servo: Servo) -> tuple[float, float]:
+    """By how much (rad) the paper's observer form would move the gap, and the standard deviation of that.
+
+    The observer weights the residual by denominator / (s + alpha)^N; one step of Gauss and Newton in that weight.
+    """
+    reduction = found.reduction
+    interval = reduction.response.interval * reduction.decimation.factor
+    model = observer(servo, _ALPHA)
+    weight = LagFilter.sampled(model.denominator, model.order, _ALPHA, interval)
+    table = reduction.table(found.point)
+    rows = np.array([weight.respond(row) for row in table])
+    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, interval, table.shape[1])]))
+    left = project_out(basis, rows[[RESIDUAL, GAP]])
+    information = float(left[1] @ left[1])
+    if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
+        return 0.0, math.inf
+    direction = np.array([weight.respond(left[1][::-1])])[0][::-1] / information
+    noise = found.noise.colour_back(direction)
+    own = found.std
+    return float(left[0] @ left[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
+
+
+def _transients(order: int, interval: float, samples: int) -> Array:
+    """(order, m) what the observer has not yet forgotten: t^i exp(-alpha t)."""
+    time = _ALPHA * interval * np.arange(samples)
+    return np.array([time**i * np.exp(-time) for i in range(order)])
+
 
 _SIGMAS = 3.0
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
@@ -18,19 +219,19 @@ _UNEXPLAINED = 0.05  # of the position's own slow variation
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class FitEvidence:
     """Everything that is held against a fit, or for it.
 
     Attributes
     ----------
-    aligned : Aligned
+    aligned : AlignedFit
     std : float
         rad, calibrated.
     interval : (float, float)
         rad, profile likelihood.
     travel : Travel
         Of the fitted screw.
-    shift : Shift
+    shift : ModelShift
         By a free model.
     observer : (float, float)
         rad: by the observer form, and the standard deviation of that.
@@ -40,17 +241,17 @@ class Evidence:
         Slow part of the residual over that of the position.
     """
 
-    aligned: Aligned
+    aligned: AlignedFit
     std: float
     interval: Interval
     travel: Travel
-    shift: Shift
+    shift: ModelShift
     observer: tuple[float, float]
     lost_motion: float
     unexplained: float
 
 
-def judge(seen: Evidence, settings: Settings) -> tuple[GapStatus, tuple[str, ...]]:
+def judge(seen: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
     """Status and reasons.
 
     Where the screw was not pushed as it must, the fitted gap is nobody's: that other views put it elsewhere is no news.
@@ -67,12 +268,12 @@ def judge(seen: Evidence, settings: Settings) -> tuple[GapStatus, tuple[str, ...
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
 
 
-def lower_bound(seen: Evidence, settings: Settings) -> float:
+def lower_bound(seen: FitEvidence, settings: WhitenedSettings) -> float:
     """rad: what the window contradicts every gap below of, were the model off by its usual error."""
     return max(0.0, seen.interval[0] - NORMAL_95 * settings.model_error)
 
 
-def one_sided(seen: Travel, settings: Settings) -> str:
+def one_sided(seen: Travel, settings: WhitenedSettings) -> str:
     """Pushed both ways the screw shows the gap; pushed one way only when the encoder's offset is known."""
     forwards, backwards = seen.forwards, seen.backwards
     needed = settings.contact_travel
@@ -86,7 +287,7 @@ def one_sided(seen: Travel, settings: Settings) -> str:
     )
 
 
-def _spread(seen: Evidence, settings: Settings) -> str:
+def _spread(seen: FitEvidence, settings: WhitenedSettings) -> str:
     if math.isinf(seen.std):
         return "the measurements do not depend on the gap"
     if math.isinf(seen.interval[1]):
@@ -98,13 +299,13 @@ def _spread(seen: Evidence, settings: Settings) -> str:
     return ""
 
 
-def _unexplained(seen: Evidence) -> str:
+def _unexplained(seen: FitEvidence) -> str:
     if seen.unexplained <= _UNEXPLAINED:
         return ""
     return f"the model leaves {100.0 * seen.unexplained:.0f} % of the position's slow motion unexplained"
 
 
-def _delayed(seen: Evidence, settings: Settings) -> str:
+def _delayed(seen: FitEvidence, settings: WhitenedSettings) -> str:
     delay = seen.aligned.delay
     if abs(delay) <= settings.largest_skew:
         return ""
@@ -112,7 +313,7 @@ def _delayed(seen: Evidence, settings: Settings) -> str:
     return f"position and theta_m would be {1e3 * delay:+.3g} ms apart, and {allowed:.3g} ms are allowed"
 
 
-def _disagreements(seen: Evidence, settings: Settings) -> tuple[str, ...]:
+def _disagreements(seen: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
     """What other views of the same window say against the fit."""
     found = []
     shift, limit = seen.shift, settings.largest_shift

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.estimation.core.decimation import decimation
-from servotwin.estimation.core.projection import remove
+from servotwin.estimation.core.least_squares import remove
 from servotwin.estimation.core.response import response
-from servotwin.estimation.whitened.misfit import Misfit, Point, Slopes
-from servotwin.estimation.whitened.reduction import Prior, Reduction, factor_for
+from servotwin.estimation.whitened.reduction import Misfit, MisfitSlopes, NuisancePrior, Point, Reduction, factor_for
 from servotwin.estimation.whitened.search import GAP_ONLY, descend
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
@@ -31,7 +30,7 @@ _ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 
 
 
 @dataclass(frozen=True)
-class Quick:
+class QuickFit:
     """The minimum next to a gap.
 
     Attributes
@@ -53,7 +52,7 @@ class Quick:
     settled: bool
 
 
-def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, float] | None = None) -> Quick:
+def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, float] | None = None) -> QuickFit:
     """Look at a window with theta_m next to a total gap (rad).
 
     Parameters
@@ -75,14 +74,14 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
     rms, residual = math.sqrt(fit.slopes.cost / count), fit.slopes.residual
     weights = _weights(fit.slopes, rms)
     if weights is None:
-        return Quick(float(fit.point.gap), math.inf, rms, fit.converged)
+        return QuickFit(float(fit.point.gap), math.inf, rms, fit.converged)
     by_place = float(weights @ fit.slopes.jacobian[1])
     variance = _coloured(weights, residual) + _ANYWHERE * by_place**2
     if offset is not None:
         variance += (offset[1] * _by_offset(reduction, misfit, weights)) ** 2
     std = math.sqrt(variance)
     still = abs(float(weights @ residual))
-    return Quick(float(fit.point.gap), std, rms, still <= max(_SETTLED * std, _CLOSE * span))
+    return QuickFit(float(fit.point.gap), std, rms, still <= max(_SETTLED * std, _CLOSE * span))
 
 
 def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> Reduction:
@@ -96,11 +95,11 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> R
         return Reduction.of(rows[0], rows[1], model, skew=False)
     first, home = float(angle[0] + rows[0, 0]), float(position[0] + rows[1, 0])
     gain = model.static_gain
-    known = Prior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
+    known = NuisancePrior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
     return Reduction.of(rows[0], rows[1], model, known, skew=False)
 
 
-def _weights(slopes: Slopes, rms: float) -> Array | None:
+def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
     """(m,) by how much the gap moves per change of each sample; None: nothing shows the gap.
 
     The place lies within the gap: where the noise (m rms) hides it, it is that which is known of it.

@@ -1,26 +1,107 @@
-"""A window made ready for the search: relative angles, few samples, and the nuisances that go with them.
-
-Nuisances enter the position linearly: the encoder's offset (a constant: play of a shifted angle is shifted play), the
-structure's motion from before the window, a delay between the channels (the velocity of the response) and the gap's
-growth within the window. The last two depend on the gap, mildly, and are taken at the point where the search stands.
-"""
+"""The residual of a window at a gap and its exact derivatives: decimated, whitened, nuisances projected out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.between import polygon
-from servotwin.estimation.core.contacts import BY_RATE
+from servotwin.estimation.core.contacts import BY_RATE, Gap, polygon, trace
 from servotwin.estimation.core.decimation import Decimation, decimation
-from servotwin.estimation.core.normal import least_squares
-from servotwin.estimation.core.projection import orthonormal
+from servotwin.estimation.core.least_squares import least_squares, orthonormal, remove
 from servotwin.estimation.core.response import Response
 from servotwin.estimation.core.whitening import Autoregression
-from servotwin.estimation.whitened.misfit import Misfit, Point, mix_places
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
+
+
+class Point(NamedTuple):
+    """Total gap (rad) and where in it the screw began, -1 (behind the motor by half the gap) .. 1 (ahead of it)."""
+
+    gap: float
+    place: float
+
+    def screw(self, first: float, rate: float = 0.0) -> Gap:
+        """The same as seen by the play operator, the motor's first angle being `first` (rad)."""
+        return Gap(self.gap, first + 0.5 * self.gap * self.place, rate)
+
+
+class MisfitSlopes(NamedTuple):
+    """Residual (m,), its derivatives by gap and place (2, m), its square and their products."""
+
+    residual: Array
+    jacobian: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Position less the structure's response to the play operator, reduced to few, white samples.
+
+    Attributes
+    ----------
+    theta_m : (n,) array
+        rad, from the window's first angle on.
+    position : (m,) array
+        Reduced like everything else.
+    basis : (r, m) array
+        Orthonormal nuisances.
+    response : Response
+    decimation : Decimation
+    noise : Autoregression, optional
+        None: not whitened.
+    extra : int
+        Rows at the end that no screw's motion reaches: prior knowledge of nuisances.
+    rate : float
+        rad per sample: how fast the gap grows.
+    """
+
+    theta_m: Array
+    position: Array
+    basis: Array
+    response: Response
+    decimation: Decimation
+    noise: Autoregression | None = None
+    extra: int = 0
+    rate: float = 0.0
+
+    def reduce(self, columns: Array) -> Array:
+        """(k, m) of rows (k, n) at the full rate."""
+        rows = self.decimation.rows(columns)
+        rows = rows if self.noise is None else self.noise.whiten(rows)
+        return np.hstack([rows, np.zeros((len(rows), self.extra))]) if self.extra else rows
+
+    def cost(self, point: Point) -> float:
+        """Squared length of the residual."""
+        screw = np.empty((1, self.theta_m.size))
+        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
+        row = self.position - self.reduce(self.response.respond(screw))[0]
+        remove(self.basis, len(self.basis), row)
+        return float(row @ row)
+
+    def slopes(self, point: Point) -> MisfitSlopes:
+        """Residual and derivatives at a point."""
+        seen = np.empty((4, self.theta_m.size))
+        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), seen)
+        mix_places(seen, point.gap, point.place)
+        rows = self.reduce(self.response.respond(seen[:3]))
+        rows[0] -= self.position
+        for row in rows:
+            remove(self.basis, len(self.basis), row)
+        np.negative(rows, out=rows)
+        return MisfitSlopes(rows[0], rows[1:], float(rows[0] @ rows[0]))
+
+
+@bare
+def mix_places(seen: Array, gap: float, place: float) -> None:
+    """Turn derivatives by gap at fixed theta_d0, and by theta_d0, into those by gap at fixed place, and by place."""
+    half = 0.5 * gap
+    for i in range(seen.shape[1]):
+        seen[1, i] += 0.5 * place * seen[2, i]
+        seen[2, i] *= half
+
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
 _SAMPLES_PER_PERIOD, _SLOWEST, _FEWEST = 40.0, 400.0, 100  # kept at least: of the fastest mode; Hz; in all
@@ -30,7 +111,7 @@ _MOST_GROWTH = 4.0  # standard deviations of the gap's rate
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class NuisancePrior:
     """What is known beforehand of a nuisance, in its own unit."""
 
     mean: float
@@ -49,9 +130,9 @@ class Reduction:
         m.
     response : Response
     decimation : Decimation
-    offset : Prior, optional
+    offset : NuisancePrior, optional
         Of the constant in the position, m.
-    growth : Prior, optional
+    growth : NuisancePrior, optional
         Of the gap's rate, rad per sample; None: the gap is constant.
     rate : float
         rad per sample: the rate at which the screw is followed; what is left of the rate is a nuisance.
@@ -65,8 +146,8 @@ class Reduction:
     position: Array
     response: Response
     decimation: Decimation
-    offset: Prior | None = None
-    growth: Prior | None = None
+    offset: NuisancePrior | None = None
+    growth: NuisancePrior | None = None
     skew: bool = True
     rate: float = 0.0
     rounding: float = 0.0
@@ -77,8 +158,8 @@ class Reduction:
         theta_m: Array,
         position: Array,
         model: Response,
-        offset: Prior | None = None,
-        growth: Prior | None = None,
+        offset: NuisancePrior | None = None,
+        growth: NuisancePrior | None = None,
         skew: bool = True,
     ) -> Reduction:
         """From theta_m (n,) rad and position (n,) m, both from any origin."""
@@ -105,7 +186,7 @@ class Reduction:
         """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
         known = {} if self.offset is None else {first: self.offset}
         if self.growth is not None:
-            known[first + len(self.fixed())] = Prior(self.growth.mean - self.rate, self.growth.std)
+            known[first + len(self.fixed())] = NuisancePrior(self.growth.mean - self.rate, self.growth.std)
         columns = [noise.whiten(rows)]
         for row, prior in known.items():
             column = np.zeros((len(rows), 1))

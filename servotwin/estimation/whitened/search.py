@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt in the gap and the screw's place in it, within bounds, from several starts."""
+"""Bounded searches in gap and screw place: descent, several starts, ways off plateaus."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, contacts
-from servotwin.estimation.whitened.misfit import Misfit, Point, Slopes
+from servotwin.estimation.whitened.reduction import Misfit, MisfitSlopes, Point
 from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower
@@ -33,11 +33,11 @@ PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class SearchResult:
     """Where a search ended."""
 
     point: Point
-    slopes: Slopes
+    slopes: MisfitSlopes
     evaluations: int
     converged: bool
 
@@ -50,7 +50,7 @@ def descend(
     steps: int = 60,
     free: Free = BOTH,
     gain: float = _GAIN,
-) -> Fit:
+) -> SearchResult:
     """From a start to the nearest minimum with 0 <= gap <= largest (rad).
 
     It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises less than the
@@ -61,18 +61,18 @@ def descend(
         step = _step(here, point, damping, largest, free)
         trial = _bounded(point, step, largest)
         if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= gain * here.cost:
-            return Fit(point, here, count, True)
+            return SearchResult(point, here, count, True)
         ahead = misfit.slopes(trial)
         if ahead.cost < here.cost:
             point, here, damping = trial, ahead, max(0.1 * damping, 1e-9)
         else:
             damping = 8.0 * damping
             if damping > _LARGEST_DAMPING:
-                return Fit(point, here, count + 1, True)
-    return Fit(point, here, steps, False)
+                return SearchResult(point, here, count + 1, True)
+    return SearchResult(point, here, steps, False)
 
 
-def _step(here: Slopes, point: Point, damping: float, largest: float, free: Free) -> tuple[float, float]:
+def _step(here: MisfitSlopes, point: Point, damping: float, largest: float, free: Free) -> tuple[float, float]:
     """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
     J = here.jacobian
     a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
@@ -86,7 +86,7 @@ def _step(here: Slopes, point: Point, damping: float, largest: float, free: Free
     return (g / a if gap_free and a > 0.0 else 0.0), (h / c if place_free else 0.0)
 
 
-def _promise(here: Slopes, point: Point, trial: Point) -> float:
+def _promise(here: MisfitSlopes, point: Point, trial: Point) -> float:
     """By how much a step lowers the cost if the residual is linear."""
     change = (trial.gap - point.gap) * here.jacobian[0] + (trial.place - point.place) * here.jacobian[1]
     return -float(change @ (2.0 * here.residual + change))
@@ -101,7 +101,7 @@ def _distance(one: Point, other: Point) -> float:
     return max(abs(one.gap - other.gap), 0.5 * other.gap * abs(one.place - other.place))
 
 
-def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float) -> list[Fit]:
+def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float) -> list[SearchResult]:
     """Minima from several starts: for every place of the screw the best of some gaps (rad).
 
     First the gap alone descends. From where the screw rests for long, gap and place move it alike, and nothing leads
@@ -117,7 +117,7 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
     return [continued(misfit, fit, largest, tolerance) for fit in near]
 
 
-def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+def continued(misfit: Misfit, fit: SearchResult, largest: float, tolerance: float) -> SearchResult:
     """On with both; and again from within, if the screw would have begun in contact, or from there, if close to it.
 
     In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
@@ -129,7 +129,7 @@ def continued(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit
     ends += [descend(misfit, start, largest, tolerance, _SHORT, gain=ROUGH) for start in (*inside, *in_contact(point))]
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
-    return Fit(best.point, best.slopes, evaluations, best.converged)
+    return SearchResult(best.point, best.slopes, evaluations, best.converged)
 
 
 def in_contact(point: Point) -> list[Point]:
@@ -137,7 +137,7 @@ def in_contact(point: Point) -> list[Point]:
     return [point._replace(place=math.copysign(1.0, point.place))] if _WITHIN[-1] <= abs(point.place) < 1.0 else []
 
 
-def off_the_plateau(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+def off_the_plateau(misfit: Misfit, fit: SearchResult, largest: float, tolerance: float) -> SearchResult:
     """A fit, or a lower one from the lowest of other places in the same gap.
 
     A contact in the first moments of a window looks like motion from before it: over much of the gap the place makes no
@@ -150,10 +150,10 @@ def off_the_plateau(misfit: Misfit, fit: Fit, largest: float, tolerance: float) 
         return fit
     other = descend(misfit, points[lowest], largest, tolerance, gain=ROUGH)
     best = min(fit, other, key=lambda one: one.slopes.cost)
-    return Fit(best.point, best.slopes, fit.evaluations + other.evaluations, best.converged)
+    return SearchResult(best.point, best.slopes, fit.evaluations + other.evaluations, best.converged)
 
 
-def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) -> Fit:
+def off_the_plain(misfit: Misfit, fit: SearchResult, largest: float, tolerance: float) -> SearchResult:
     """A fit, or a lower one from the edge of the plain that it lies on.
 
     Where the screw rests until its first contact, gap and place act alike, through the way that the motor went before.
@@ -167,7 +167,7 @@ def off_the_plain(misfit: Misfit, fit: Fit, largest: float, tolerance: float) ->
     starts = _edges(misfit.theta_m, fit.point)
     fits = [fit, *(descend(misfit, start, largest, tolerance, gain=ROUGH) for start in starts)]
     best = min(fits, key=lambda one: one.slopes.cost)
-    return Fit(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
+    return SearchResult(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
 
 
 def _edges(theta_m: Array, point: Point) -> list[Point]:

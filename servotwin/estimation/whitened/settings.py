@@ -12,7 +12,7 @@ from servotwin.errors import InvalidInput
 
 @settings("estimator")
 @dataclass(frozen=True)
-class Settings:
+class WhitenedSettings:
     """Settings of the whitened estimator.
 
     Leave `skew` on unless one clock samples both channels: a delay of a fifth of a millisecond, not accounted for, is

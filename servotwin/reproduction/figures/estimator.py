@@ -13,12 +13,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
-from servotwin.estimation.core.projection import orthonormal, project_out
+from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.core.response import Response, response
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.whitened.misfit import Point
-from servotwin.estimation.whitened.reduction import Reduction
+from servotwin.estimation.whitened.reduction import Point, Reduction
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave

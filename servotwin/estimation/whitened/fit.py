@@ -1,0 +1,370 @@
+"""Fit of a window: from a coarse one to one in the noise that the window really has, channels aligned.
+
+Fit, take the noise from the residual, whiten, fit again. A delay between the channels of more than half a sample is
+taken off in whole samples, and the fit repeated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.estimation.core.decimation import decimation
+from servotwin.estimation.core.least_squares import least_squares, spread
+from servotwin.estimation.core.response import response
+from servotwin.estimation.core.whitening import Autoregression, burg
+from servotwin.estimation.estimate import Interval
+from servotwin.estimation.whitened.reduction import (
+    CONSTANT,
+    GAP,
+    PLACE,
+    RESIDUAL,
+    Misfit,
+    NuisancePrior,
+    Point,
+    Reduction,
+    factor_for,
+)
+from servotwin.estimation.whitened.search import (
+    PLACE_ONLY,
+    PLACES,
+    SearchResult,
+    continued,
+    descend,
+    in_contact,
+    off_the_plain,
+    off_the_plateau,
+    search,
+)
+from servotwin.estimation.whitened.settings import WhitenedSettings
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+_PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
+_EARLY, _PLACES = 1, (-0.85, 0.0, 0.85)  # the pass in which a growing gap is looked at from other places, and these
+_GLANCE = 8  # steps from there
+_ROUGH, _FINE = 1e-5, 1e-7  # of the cost: what a descent may leave; 1e-7 is below a hundredth of a standard deviation
+_SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedFit:
+    """A fit with the noise in which it was made.
+
+    Attributes
+    ----------
+    reduction : Reduction
+    misfit : Misfit
+    fit : SearchResult
+    noise : Autoregression
+    rows : (k, m) array
+        Table of the reduction at the fit, whitened.
+    evaluations : int
+    """
+
+    reduction: Reduction
+    misfit: Misfit
+    fit: SearchResult
+    noise: Autoregression
+    rows: Array
+    evaluations: int
+
+    @property
+    def point(self) -> Point:
+        """The fit's gap and place."""
+        return self.fit.point
+
+    @property
+    def variance(self) -> float:
+        """Of the whitened residual; 1 where the noise was well described."""
+        return self.fit.slopes.cost / max(1, self.rows.shape[1] - len(self.misfit.basis) - 2)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the gap from the Schur complement of the information, rad; inf where there is none."""
+        return spread(self.rows[GAP], self.rows[PLACE:])
+
+
+def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Point]:
+    """The best few different minima of a window at its low rate, where looking around costs a tenth.
+
+    Parameters
+    ----------
+    slow : Reduction
+        Of both channels, decimated.
+    gaps : sequence of float
+        rad, where to look.
+    largest, tolerance : float
+        rad, of the search.
+    count : int
+        At most as many.
+    """
+    misfit = slow.coarse()
+    fits = sorted(search(misfit, gaps, largest, tolerance), key=lambda fit: fit.slopes.cost)
+    fits.insert(0, off_the_plateau(misfit, fits[0], largest, tolerance))
+    different = fits[:1]
+    for fit in fits[1:]:
+        if fit.slopes.cost > (1.0 + _SAME) * different[-1].slopes.cost:
+            different.append(fit)
+    return [fit.point for fit in different[:count]]
+
+
+def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60) -> SearchResult:
+    """The lowest of the minima nearest to some points, or of what so many steps lead to."""
+    fits = [descend(misfit, point, largest, tolerance, steps, gain=_ROUGH) for point in points]
+    best = min(fits, key=lambda fit: fit.slopes.cost)
+    return SearchResult(best.point, best.slopes, sum(fit.evaluations for fit in fits), best.converged)
+
+
+def refine(
+    reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float, passes: int, order: int
+) -> WhitenedFit:
+    """The fit in the noise that it leaves itself, after some passes with autoregressions of at most `order`.
+
+    The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
+    """
+    white = reduction.coarse()
+    fit = continued(white, best_of(white, points, largest, tolerance), largest, tolerance)
+    fit = off_the_plain(white, fit, largest, tolerance)
+    noise, evaluations = Autoregression.white(1.0), fit.evaluations
+    for number in range(passes):
+        noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
+        reduction = reduction.growing(noise, fit.point)
+        misfit = reduction.misfit(noise, fit.point)
+        last = number == passes - 1
+        starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
+        fit = best_of(misfit, starts, largest, tolerance)
+        if reduction.growth and number == _EARLY:
+            others = best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
+            fit = min(fit, others, key=lambda one: one.slopes.cost)
+        evaluations += fit.evaluations
+    fit = off_the_plain(misfit, fit, largest, tolerance)
+    fit = descend(misfit, fit.point, largest, tolerance, gain=_FINE)
+    rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
+    return WhitenedFit(reduction, misfit, fit, noise, rows, evaluations + fit.evaluations)
+
+
+def _elsewhere(point: Point) -> list[Point]:
+    """Other places in a growing gap: at a wrong rate a wrong place looks right, and holds the rate where it is."""
+    return [point._replace(place=place) for place in _PLACES]
+
+
+def noise_left(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:
+    """The noise in the residual of a fit that was made with a first idea of it.
+
+    A fit takes noise away with every parameter, and most where the gap shows. What it may have taken is put back, as
+    as many equally likely series: one standard deviation up and down along every direction of the parameters.
+    """
+    table = reduction.table(point)
+    rows = reduction.prepared(noise, table, CONSTANT)
+    shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
+    left = table[RESIDUAL] - shares @ table[CONSTANT:]
+    if not np.any(left):
+        return Autoregression.white(1.0)
+    if not put:
+        return burg(left[None], order).at_least(reduction.rounding)
+    root = least_squares(rows[GAP:], rows[RESIDUAL]).root
+    taken = math.sqrt(len(root)) * (root @ table[GAP:])
+    return burg(np.vstack([left + taken, left - taken]), order).at_least(reduction.rounding)
+
+
+PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
+_ALIGNMENTS, _NARROWEST = 3, 0.01
+_FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedFit:
+    """A fit, and what it says of the channels.
+
+    Attributes
+    ----------
+    found : WhitenedFit
+    delay : float
+        s, by which the position is late.
+    span : float
+        rad, range of the motor's angle.
+    first : float
+        rad, the motor's first angle of those that were used.
+    """
+
+    found: WhitenedFit
+    delay: float
+    span: float
+    first: float
+
+    @property
+    def largest(self) -> float:
+        """rad, up to where gaps were searched."""
+        return _FREE * self.span
+
+    @property
+    def tolerance(self) -> float:
+        """rad, of a search."""
+        return PRECISION * self.span
+
+
+def align_and_fit(
+    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
+) -> AlignedFit:
+    """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz); `prior` (rad) is one of the starts.
+
+    A delay of more than half a sample is taken off in whole samples, and the fit repeated: what is left of it is small
+    enough to be linear.
+    """
+    shift, points = 0, _look_around(theta_m, position, rate, servo, prior, settings)
+    for attempt in range(_ALIGNMENTS):
+        ahead, behind = max(-shift, 0), max(shift, 0)
+        angle = theta_m[ahead : theta_m.size - behind]
+        seen = position[behind : position.size - ahead]
+        fitted = _fit(angle, seen, rate, servo, points, settings)
+        late = _delay(fitted.found) * rate if settings.skew else 0.0
+        if abs(late) <= 0.5 or abs(shift + late) > settings.largest_skew * rate or attempt == _ALIGNMENTS - 1:
+            break
+        shift, points = shift + round(late), [fitted.found.point]
+    return AlignedFit(fitted.found, (shift + late) / rate, fitted.span, fitted.first)
+
+
+def _look_around(
+    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
+) -> list[Point]:
+    """Where the search at the full rate begins."""
+    reduce = decimation(factor_for(response(servo, rate), theta_m.size))
+    angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
+    model = response(servo, rate / reduce.factor)
+    slow = Reduction.of(angle, seen, model, _offset(settings, model.static_gain, float(theta_m[0]), float(position[0])))
+    span = float(np.ptp(angle))
+    starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
+    return candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
+
+
+def _fit(
+    theta_m: Array, position: Array, rate: float, servo: Servo, points: list[Point], settings: WhitenedSettings
+) -> AlignedFit:
+    span = float(np.ptp(theta_m))
+    model = response(servo, rate)
+    growth = NuisancePrior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
+    offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
+    reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
+    found = refine(reduction, points, _FREE * span, PRECISION * span, settings.passes, settings.order)
+    return AlignedFit(found, 0.0, span, float(theta_m[0]))
+
+
+def gaps_to_try(span: float, count: int) -> list[float]:
+    """Zero and gaps from a hundredth of the motor's range (rad) to all of it, each a constant factor wider."""
+    return [0.0, *(float(gap) for gap in np.geomspace(_NARROWEST * span, span, count - 1))]
+
+
+def _offset(settings: WhitenedSettings, gain: float, angle: float, position: float) -> NuisancePrior | None:
+    """What is known of the constant in the position (m), which is the encoder's offset and where counting began."""
+    if settings.offset is None:
+        return None
+    mean, std = settings.offset
+    return NuisancePrior(gain * (angle + mean) - position, abs(gain) * std)
+
+
+def _delay(found: WhitenedFit) -> float:
+    """s by which the position is late."""
+    nuisances = least_squares(found.rows[CONSTANT:], found.rows[RESIDUAL]).coefficients
+    fixed = len(found.reduction.fixed())
+    moving = nuisances[fixed:]
+    return -float(moving[-1])
+
+
+_PRECISION = 1e-9  # of the motor's range
+
+
+def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:
+    """The minimum nearest to a total gap (rad): no whitening, no other start, no verdict, no delay.
+
+    The screw begins in the middle of the gap.
+    """
+    assert window.theta_m is not None
+    reduction = Reduction.of(window.theta_m, window.position, response(servo, window.sample_rate), skew=False)
+    span = float(np.ptp(window.theta_m))
+    return descend(reduction.coarse(), Point(gap, 0.0), 2.0 * span, _PRECISION * span)
+
+
+_CHI_SQUARED_95 = 3.841458820694124
+_CLOSE, _TRIALS = 0.1, 12
+_FURTHER = 3.0  # times as far, at most, the next trial lies
+_WELL_WITHIN = 1.0 / _FURTHER**2  # of what is allowed: any less makes no difference to the next trial
+_NEAR = 0.1  # of the gap: closer by, the best place is next to that of the fit, if the spread is not wider
+
+
+def profile_interval(found: WhitenedFit, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
+    """95 % interval of the gap, rad; 0 or inf where the likelihood has no end on that side.
+
+    Parameters
+    ----------
+    found : WhitenedFit
+    std : float
+        rad: where to look first; inf is allowed.
+    calibration : float
+        Of the standard deviation.
+    largest : float
+        rad: gaps above this are not told from each other.
+    tolerance : float
+        rad, of the search for the screw's start.
+    """
+    allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
+
+    def rise(gap: float) -> float:
+        """How much worse the best fit with this gap is, in units of what is allowed; well within, how much at most."""
+        near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
+        places = (found.point.place,) if near else (*same_way(found.point, gap), *PLACES)
+        lowest = math.inf
+        for place in dict.fromkeys(places):
+            fit = descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
+            lowest = min(lowest, (fit.slopes.cost - found.fit.slopes.cost) / allowed)
+            if lowest <= _WELL_WITHIN:
+                break
+        return lowest
+
+    first = min(1.96 * std, 0.5 * largest)
+    return _end(rise, found.point.gap, -first, 0.0), _end(rise, found.point.gap, first, largest)
+
+
+def same_way(point: Point, gap: float) -> tuple[float, float, float]:
+    """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
+
+    A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact
+    being the same.
+    """
+    if gap == 0.0:
+        return (point.place,) * 3
+    share = point.gap / gap
+    ahead, behind = share * (1.0 + point.place) - 1.0, 1.0 - share * (1.0 - point.place)
+    return point.place, min(max(ahead, -1.0), 1.0), min(max(behind, -1.0), 1.0)
+
+
+def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
+    """Where `rise` reaches 1 on one side, between what is known to be below and above; the far limit as 0 or inf.
+
+    When the trials do not suffice, what is known to be above.
+    """
+    beyond = math.inf if limit > 0.0 else 0.0
+    room = abs(limit - middle)
+    inside, outside, size = 0.0, math.inf, abs(step)
+    for _ in range(_TRIALS):
+        at_limit = size >= room
+        size = min(size, room)
+        level = max(0.0, rise(middle + math.copysign(size, step)))
+        if abs(level - 1.0) < _CLOSE:
+            break
+        if level < 1.0:
+            if at_limit:
+                return beyond
+            inside = size
+        else:
+            outside = size
+        size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), _FURTHER)
+        if not inside < size < outside:
+            size = 0.5 * (inside + outside)
+    else:
+        size = min(outside, room)
+    return middle + math.copysign(size, step)
