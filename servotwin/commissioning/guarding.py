@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 from servotwin.control.gains import gains_of
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certify import candidates_of

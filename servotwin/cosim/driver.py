@@ -21,7 +21,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
@@ -205,7 +205,7 @@ class Cosimulation:
         """The first sample at or after a time."""
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
-    def _send_up(self, outgoing: Outgoing) -> None:
+    def _send_up(self, outgoing: OutgoingMessage) -> None:
         if isinstance(outgoing.message, Receipt):
             self.receipts.append(outgoing.message)
         elif isinstance(outgoing.message, Fallback):
