@@ -23,6 +23,7 @@ from servotwin.messages import (
     Receipt,
     Setting,
     Update,
+    WindowMessage,
     checksum,
     unpack_channel,
 )
