@@ -112,6 +112,7 @@ class Key:
     makers: Mapping[str, Maker] | None = None
     select: Callable[[Table], Maker] | None = None
     parse: Callable[[Table, str, Any], Any] | None = None
+    dump: Callable[[Any], dict[str, Any]] | None = None
     in_file: bool = True
 
 
@@ -132,6 +133,7 @@ def key(
     makers: Mapping[str, Maker] | None = None,
     select: Callable[[Table], Maker] | None = None,
     parse: Callable[[Table, str, Any], Any] | None = None,
+    dump: Callable[[Any], dict[str, Any]] | None = None,
 ) -> Key:
     """Declare the TOML key of an attribute.
 
@@ -161,9 +163,11 @@ def key(
         is needed for a single one.
     parse : callable
         Takes the table, the key and its value, and gives the attribute; raises `table.invalid`.
+    dump : callable
+        Keys and values of an attribute that `makers` makes.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
-    return Key(names, unit, allowed, help, table, choices, prefix, switch, relative, makers, select, parse)
+    return Key(names, unit, allowed, help, table, choices, prefix, switch, relative, makers, select, parse, dump)
 
 
 def value(
@@ -229,9 +233,9 @@ class Item:
         return self.default is MISSING
 
     @property
-    def inner(self) -> Any:
-        """The class of one inner table, or of each of an array of tables."""
-        return typing.get_args(self.type)[0] if self.form is Form.TABLES else self.type
+    def makers(self) -> Mapping[str, Maker]:
+        """What makes the attribute of an inner table, by kind."""
+        return {"": self.type} if self.key.makers is None else self.key.makers
 
 
 def items_of(maker: Any) -> tuple[Item, ...]:
@@ -359,7 +363,7 @@ def _item(name: str, hint: Any, default: Any) -> Item | None:
     rest = [kind for kind in kinds if kind is not NoneType]
     if optional:
         bare = rest[0] if len(rest) == 1 else typing.Union[tuple(rest)]  # noqa: UP007
-    return Item(name, bare, optional, default, declared, _form(bare))
+    return Item(name, bare, optional, default, declared, _form(bare, declared))
 
 
 _FORMS: dict[Any, Form] = {
@@ -368,13 +372,13 @@ _FORMS: dict[Any, Form] = {
 }  # fmt: skip
 
 
-def _form(bare: Any) -> Form:
-    if isinstance(bare, type) and dataclasses.is_dataclass(bare):
-        return Form.TABLE
+def _form(bare: Any, declared: Key) -> Form:
     arguments = typing.get_args(bare)
-    if len(arguments) == 2 and arguments[1] is ... and dataclasses.is_dataclass(arguments[0]):
+    if len(arguments) == 2 and arguments[1] is ... and declared.makers is not None:
         return Form.TABLES
-    return _FORMS.get(bare, Form.OTHER)
+    if declared.makers is not None or (isinstance(bare, type) and dataclasses.is_dataclass(bare)):
+        return Form.TABLE
+    return Form.TEXT if declared.choices is not None else _FORMS.get(bare, Form.OTHER)
 
 
 def _fits(item: Item, given: object) -> bool:

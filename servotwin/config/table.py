@@ -240,16 +240,6 @@ class Table:
         return f" (found '{self.path(close[0])}' instead)" if close else ""
 
 
-Reader = tuple[str, Callable[[Table, str], Any]]
-"""The name that a key sets, and how the key is read."""
-
-
-def given(table: Table, readers: Mapping[str, Reader]) -> dict[str, Any]:
-    """What a table gives of these keys, by the names they set."""
-    table.known(*readers)
-    return {name: read(table, key) for key, (name, read) in readers.items() if key in table.values}
-
-
 @contextmanager
 def named(table: Table) -> Iterator[None]:
     """Let what a constructor refuses be known by its file and table."""
@@ -262,7 +252,7 @@ def named(table: Table) -> Iterator[None]:
         raise InvalidInput(f"{where}: {error}") from None
 
 
-def part(table: Table, key: str, read: Callable[[Table], _Value]) -> _Value:
+def read_inner(table: Table, key: str, read: Callable[[Table], _Value]) -> _Value:
     """What `read` makes of an inner table, read to its last key."""
     inner = table.table(key)
     with named(inner):

@@ -64,7 +64,7 @@ def _read_items(table: Table, items: list[Item], folder: Path, base: Any, comple
         for item in here:
             _read_item(inner, item, folder, getattr(base, item.name, None), values)
             if complete and item.required and item.name not in values:
-                raise inner.missing(item.names[0], table=item.key.makers is not None or item.form is Form.TABLE)
+                raise inner.missing(item.names[0], table=item.form is Form.TABLE)
         if name:
             inner.done()
     return values
@@ -92,33 +92,32 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
         values[item.name] = None
         return
     for name in item.names:
-        if name in table.values:
+        if name in table.values and table.values[name] != []:
             values[item.name] = _value(table, item, name, folder, base)
 
 
 def _prefixed(table: Table, item: Item, start: Any) -> Any:
     """Settings whose keys begin with a prefix, in the same table."""
-    prefix = item.key.prefix or ""
-    table.known(*(prefix + name for each in items_of(item.inner) for name in each.names))
-    given: Values = {}
-    for each in items_of(item.inner):
+    prefix, given = item.key.prefix or "", Values()
+    for each in items_of(item.type):
+        table.known(*(prefix + name for name in each.names))
         for name in each.names:
             if prefix + name in table.values:
                 given[each.name] = _value(table, each, prefix + name, Path(), None)
     with named(table):
-        return item.inner(**given) if start is MISSING else dataclasses.replace(start, **given)
+        return item.type(**given) if start is MISSING else dataclasses.replace(start, **given)
 
 
 def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> Any:
     """The value of a key that is there, in the attribute's unit."""
     declared = item.key
+    if item.form is Form.TABLES:
+        return tuple(_of_kind(each, item, folder) for each in table.tables(name))
     if declared.makers is not None:
         return _of_kind(table.table(name), item, folder)
     if item.form is Form.TABLE:
         start = base if isinstance(base, type(item.default)) else item.default
-        return part(table, name, item.inner, folder, start if dataclasses.is_dataclass(start) else None)
-    if item.form is Form.TABLES:
-        return tuple(_whole(each, item.inner, folder) for each in table.tables(name))
+        return part(table, name, item.type, folder, start if dataclasses.is_dataclass(start) else None)
     read_value = _plain(table, item, name, folder)
     return read_value if declared.parse is None else declared.parse(table, name, read_value)
 
@@ -150,7 +149,7 @@ def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
 
 def _of_kind(table: Table, item: Item, folder: Path) -> Any:
     """A table of several kinds."""
-    makers = item.key.makers or {}
+    makers = item.makers
     if item.key.select is not None:
         return _whole(table, item.key.select(table), folder)
     if len(makers) == 1:
@@ -164,18 +163,20 @@ def _whole(table: Table, maker: Maker, folder: Path) -> Any:
     return made
 
 
-def values_of(described: Any, only: Collection[str] | None = None) -> Values:
+def values_of(described: Any, maker: Any = None, only: Collection[str] | None = None) -> Values:
     """The keys and values of a table that reads as these settings; what is None is left out.
 
     Parameters
     ----------
     described : object
-        Of a declared class.
+        Has the declared attributes.
+    maker : class or function, optional
+        Declares them; None: the object's class.
     only : collection of str, optional
         The attributes to write, in that order.
     """
     values: Values = {}
-    items = {item.name: item for item in items_of(type(described)) if item.key.in_file}
+    items = {item.name: item for item in items_of(maker or type(described)) if item.key.in_file}
     for item in items.values() if only is None else (items[name] for name in only):
         here = values.setdefault(item.key.table, {}) if item.key.table else values
         given = getattr(described, item.name)
@@ -191,10 +192,11 @@ def values_of(described: Any, only: Collection[str] | None = None) -> Values:
 
 
 def _written(item: Item, given: Any) -> Any:
-    if item.form is Form.TABLE:
-        return values_of(given)
+    """The value of a key, or the values of a table."""
     if item.form is Form.TABLES:
-        return [values_of(each) for each in given]
+        return [(item.key.dump or values_of)(each) for each in given]
+    if item.form is Form.TABLE:
+        return (item.key.dump or values_of)(given)
     unit = unit_of(item.exact_name)
     if unit.exact or isinstance(given, bool | str):
         return str(given) if isinstance(given, Path) else given

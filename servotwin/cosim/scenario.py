@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from servotwin.commissioning.guarding import Guarding, guarding, start_of
+from servotwin.config.keys import check, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.config.toml import read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.cosim import scenario_file
-from servotwin.cosim.scenario_file import Recording
+from servotwin.cosim.scenario_file import GAPS, REFERENCES, Recording, gap_maker, read_parts
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
@@ -47,22 +47,8 @@ class Scenario:
     Parameters
     ----------
     servo : Servo
-    duration : float
-        s, a whole number of samples.
-    seed : int
-        Root of all randomness: each source has its own generator, from (seed, name, source).
-    name : str
-        The servo's name in messages.
-    reference : number or signal
-        m.
-    gap : number or signal
-        rad, total gap.
-    theta_d0 : float
-        rad, screw at the start; the motor's angle is 0 there, so that 0 is the middle of the backlash.
     controller : Controller, optional
         The servo's own by default.
-    noise : Noise, optional
-        On the measured position; needs a sampled controller.
     recording : Recording
         Left open, a window holds 1 s from the change of the reference on. A loop with little or no integral action, as
         the certified policy makes it, is calm: the screw turns back so late that a second often shows one side of the
@@ -72,15 +58,13 @@ class Scenario:
         Edge to twin, and back.
     twin : TwinSettings
         Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
-        Under the policy "certified" the loop begins, twin or no twin, on the fallback set, which is proved for every
+        Under the policy "certified" the loop begins, twin or no twin, on the fallback set, which is verified for every
         gap of the stated range, unless `controller` has other gains than the servo's own, or `supervision` is given.
     supervision : Supervision, optional
         How the edge looks after itself; then updates may set gains too, in a box around the servo's own, and every
         change leaves the voltage where it is. None: made for the policies that send gains, "certified" and
-        "hysteresis", from what is proved; under the others updates set the tolerance, at once, and the edge trusts
+        "hysteresis", from what is verified; under the others updates set the tolerance, at once, and the edge trusts
         them.
-    input_bias, friction : float
-        What disturbs the plant: V on its input, and N m of Coulomb friction on the motor's shaft.
 
     Raises
     ------
@@ -89,27 +73,42 @@ class Scenario:
     """
 
     servo: Servo
-    duration: float
-    seed: int = 0
-    name: str = "servo"
-    reference: SignalLike = 0.0
-    gap: SignalLike = 0.0
-    theta_d0: float = 0.0
+    duration: Annotated[float, key("duration_s", above=0.0, help="Simulated time, a whole number of samples.")]
+    seed: Annotated[
+        int,
+        key(help="Root of all randomness: each source has its own generator, from (seed, name, source)."),
+    ] = 0
+    name: Annotated[str, key(help="The servo's name in messages.")] = "servo"
+    reference: Annotated[SignalLike, key(makers=REFERENCES, help="Reference, m.")] = 0.0
+    gap: Annotated[SignalLike, key(makers=GAPS, select=gap_maker, help="Total gap, rad.")] = 0.0
+    theta_d0: Annotated[
+        float,
+        key(
+            "theta_d0_deg",
+            help="Angle of the screw at the start; the motor's is 0 there, so that 0 is the middle of the backlash.",
+        ),
+    ] = 0.0
     controller: Controller | None = None
-    noise: Noise | None = None
+    noise: Annotated[
+        Noise | None, key(help="Noise on the measured position, which needs a sampled controller; none where absent.")
+    ] = None
     recording: Recording = field(default_factory=Recording)
     uplink: LinkSettings = field(default_factory=LinkSettings)
     downlink: LinkSettings = field(default_factory=LinkSettings)
     twin: TwinSettings = field(default_factory=TwinSettings)
     supervision: Supervision | None = None
-    input_bias: float = 0.0
-    friction: float = 0.0
+    input_bias: Annotated[
+        float, key("input_bias_v", table="disturbances", help="Voltage that is added to the plant's input.")
+    ] = 0.0
+    friction: Annotated[
+        float,
+        key("friction_n_m", table="disturbances", minimum=0.0, help="Coulomb friction on the motor's shaft."),
+    ] = 0.0
 
     def __post_init__(self) -> None:
         if not re.fullmatch(NAME_PATTERN, self.name):
             raise InvalidInput(f"name = {self.name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
-        if not (math.isfinite(self.duration) and self.duration > 0.0):
-            raise InvalidInput(f"duration = {self.duration!r} s: must be positive and finite")
+        check(self)
         self._check_rates()
         as_pieces(self.reference, self.duration)
         as_gap(self.gap, self.duration)
@@ -157,9 +156,12 @@ class Scenario:
     @classmethod
     def from_table(cls, table: Table, folder: Path) -> Scenario:
         """A scenario from a table that was read already; a servo's path in it is relative to `folder`."""
-        values = scenario_file.read(table, folder)
         with named(table):
-            scenario = cls(**values)
+            for name in ("reference", "gap"):
+                if name not in table.values:
+                    raise table.missing(name, table=True)
+            scenario: Scenario = read(table, cls, folder, **read_parts(table, folder))
+            table.done()
             scenario.servo.check_loop(scenario.law)
             scenario.agent_settings()
             return scenario
@@ -279,7 +281,9 @@ class Scenario:
             limits=r.limits,
             model_version=self.servo.version,
             window_filter=self._novelty(),
-            **r.requests,
+            longest_window_s=r.longest_window,
+            longest_pre_trigger_s=r.longest_pre_trigger,
+            probe=r.probe,
         )
 
     def _novelty(self) -> NoveltySettings | None:
@@ -313,11 +317,11 @@ class Scenario:
 
     def _check_size(self, rate: float) -> None:
         """All samples and one window fit into memory."""
-        for key, seconds in (("duration", self.duration), ("window", self.recording.longest_window or self.window)):
+        for name, seconds in (("duration", self.duration), ("window", self.recording.longest_window or self.window)):
             if not seconds * rate <= MOST_SAMPLES:
                 raise InvalidInput(
-                    f"{key} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} "
-                    "are allowed"
+                    f"{name} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; "
+                    f"at most {MOST_SAMPLES:g} are allowed"
                 )
 
     def _check_window(self) -> None:

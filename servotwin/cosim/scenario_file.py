@@ -1,110 +1,187 @@
-"""A scenario's TOML: which key, in which unit, becomes which value."""
+"""A scenario's TOML: what a scenario records, and the tables that depend on its servo."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from servotwin.config.table import Table, part
-from servotwin.config.toml import changes
+from servotwin.config.keys import Maker, key, settings
+from servotwin.config.table import Table, named, read_inner
+from servotwin.config.toml import changes, part, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import read_gains
-from servotwin.edge import settings_file as edgefile
 from servotwin.edge.limits import Limits
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
+from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
-from servotwin.novelty import settings_file as noveltyfile
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.noise import Noise
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.runtime.retry import Retry
 from servotwin.twin.settings import read_twin_settings
 
-MM = 1e-3
-DEG = math.pi / 180.0
 
-
+@settings("recording")
 @dataclass(frozen=True)
 class Recording:
     """What the edge records and sends.
 
     Parameters
     ----------
-    sample_rate : float
-        Hz.
-    window, pre_trigger : float, optional
-        s, length of a window and how much of it lies before the change of the reference; None: as the controller asks
-        for, see `Scenario`.
-    longest_window, longest_pre_trigger : float, optional
-        s, what the twin may request instead; None: no more than that.
     probe : ProbeLimits, optional
-        Which probing moves of the reference it may request; None: none. In a file, [edge.probe].
-    retry : Retry
-        When a window without acknowledgement is sent again.
-    limits : Limits
-        What an update must respect.
+        Probing moves of the reference that the twin may request; None: none. In a file, [edge.probe].
     novelty : NoveltyRules, optional
-        Which windows the edge finds worth sending; None: every one. In a file, [novelty].
-    fine_angle : bool
-        Whether theta_m travels with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the
-        estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do.
+        Rules of the windows that the edge finds worth sending; None: it sends every one. In a file, [novelty].
     """
 
-    sample_rate: float = 5000.0
-    window: float | None = None
-    pre_trigger: float | None = None
-    retry: Retry = field(default_factory=Retry)
-    limits: Limits = field(default_factory=Limits)
-    fine_angle: bool = True
-    longest_window: float | None = None
-    longest_pre_trigger: float | None = None
+    sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
+    window: Annotated[
+        float | None,
+        key("window_s", above=0.0, help="Length of a window; by the controller where absent."),
+    ] = None
+    pre_trigger: Annotated[
+        float | None,
+        key(
+            "pre_trigger_s",
+            minimum=0.0,
+            help="Part of a window before the change of the reference; where absent it follows from the controller.",
+        ),
+    ] = None
+    retry: Annotated[Retry, key(prefix="retry_", help="When an unacknowledged window is sent again.")] = field(
+        default_factory=Retry
+    )
+    limits: Annotated[Limits, key(help="Limits that an update must respect.")] = field(default_factory=Limits)
+    fine_angle: Annotated[
+        bool,
+        key(
+            help="Send theta_m with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the "
+            "estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do."
+        ),
+    ] = True
+    longest_window: Annotated[
+        float | None,
+        key("longest_window_s", above=0.0, help="Longest window that the twin may request; window_s where absent."),
+    ] = None
+    longest_pre_trigger: Annotated[
+        float | None,
+        key(
+            "longest_pre_trigger_s",
+            minimum=0.0,
+            help="Longest pre-trigger that it may request; pre_trigger_s where absent.",
+        ),
+    ] = None
     probe: ProbeLimits | None = None
     novelty: NoveltyRules | None = None
 
-    @property
-    def requests(self) -> dict[str, Any]:
-        """What the twin may request, as `AgentSettings` call it."""
-        before = self.longest_pre_trigger
-        return {"longest_window_s": self.longest_window, "longest_pre_trigger_s": before, "probe": self.probe}
+
+def square_wave(
+    amplitude: Annotated[float, key("amplitude_mm", help="Half the difference of the two levels.")],
+    period: Annotated[float, key("period_s", above=0.0, help="Period.")],
+    offset: Annotated[float, key("offset_mm", help="Mean of the two levels.")] = 0.0,
+) -> SignalLike:
+    """Square wave."""
+    return SquareWave(amplitude, period, offset)
 
 
-def read(table: Table, folder: Path) -> dict[str, Any]:
-    """The values of a `Scenario`; a servo's path is relative to `folder`.
+def step(
+    size: Annotated[float, key("size_mm", help="Size of the step.")],
+    at: Annotated[float, key("at_s", minimum=0.0, help="Time of the step.")] = 0.0,
+) -> SignalLike:
+    """One step."""
+    return Step(size, at)
+
+
+def s_curve(
+    begin_value: Annotated[float, key("from_mm", help="First value.")],
+    end_value: Annotated[float, key("to_mm", help="Last value.")],
+    over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last value.")],
+    begin: Annotated[float, key("begin_s", help="Time at which it begins.")] = 0.0,
+) -> SignalLike:
+    """Smooth change from one value to another."""
+    return SCurve(begin_value, end_value, over, begin)
+
+
+def samples(
+    times: Annotated[tuple[float, ...], key("times_s", help="Times.")],
+    values: Annotated[tuple[float, ...], key("values_mm", help="Values, as many.")],
+) -> SignalLike:
+    """Values at given times, the last one held."""
+    return Samples(times, list(values))
+
+
+def constant(value: Annotated[float, key("value_mm", help="Value.")]) -> SignalLike:
+    """One value at all times."""
+    return value
+
+
+REFERENCES: Mapping[str, Maker] = {
+    "square": square_wave, "step": step, "s-curve": s_curve, "samples": samples, "constant": constant,
+}  # fmt: skip
+
+
+def constant_gap(
+    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
+) -> SignalLike:
+    """Gap that stays as it is."""
+    return total
+
+
+def growing_gap(
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap.")],
+    over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
+    begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
+) -> SignalLike:
+    """Gap that grows as an S-curve."""
+    return SCurve(begin_value, end_value, over, begin)
+
+
+GAPS: Mapping[str, Maker] = {"constant": constant_gap, "growing": growing_gap}
+
+
+def gap_maker(table: Table) -> Maker:
+    """Kind of gap that a table describes."""
+    return constant_gap if "total_deg" in table.values or not table.values else growing_gap
+
+
+def read_parts(table: Table, folder: Path) -> dict[str, Any]:
+    """Read the values of a `Scenario` that depend on its servo or on one another.
 
     Raises
     ------
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    servo = _servo(table, folder)
-    values: dict[str, Any] = {
+    servo = resolve_servo(table, folder)
+    controller = read_inner(table, "controller", lambda inner: _changed(inner, servo.controller))
+    edge = table.table("edge")
+    edge.known("probe")
+    probe = part(edge, "probe", ProbeLimits) if "probe" in edge.values else None
+    supervision = _supervision(edge, controller or servo.controller)
+    edge.done()
+    novelty = part(table, "novelty", NoveltyRules) if "novelty" in table.values else None
+    link = table.table("link")
+    both: LinkSettings = read(link, LinkSettings)
+    uplink, downlink = part(link, "up", LinkSettings, base=both), part(link, "down", LinkSettings, base=both)
+    link.done()
+    table.known("novelty")
+    return {
         "servo": servo,
-        "duration": table.number("duration_s", positive=True),
-        "seed": table.integer("seed", 0),
-        "name": table.text("name", "servo"),
-        "theta_d0": table.number("theta_d0_deg", 0.0) * DEG,
-        "reference": part(table, "reference", _reference),
-        "gap": part(table, "gap", _gap),
-        "recording": replace(part(table, "recording", _recording), probe=_probe(table), novelty=_novelty(table)),
-        "twin": part(table, "twin", lambda inner: read_twin_settings(inner, folder)),
-        **part(table, "disturbances", _disturbances),
+        "controller": controller,
+        "supervision": supervision,
+        "recording": replace(part(table, "recording", Recording), probe=probe, novelty=novelty),
+        "uplink": uplink,
+        "downlink": downlink,
+        "twin": read_inner(table, "twin", lambda inner: read_twin_settings(inner, folder)),
     }
-    values["controller"] = part(table, "controller", lambda t: _controller(t, servo.controller))
-    values["supervision"] = _supervision(table, values["controller"] or servo.controller)
-    values["noise"] = part(table, "noise", _noise) if "noise" in table.values else None
-    values["uplink"], values["downlink"] = part(table, "link", _links)
-    table.table("noise")
-    table.done()
-    return values
 
 
-def _servo(table: Table, folder: Path) -> Servo:
+def resolve_servo(table: Table, folder: Path) -> Servo:
+    """The servo that a file names: a preset, or a TOML file relative to `folder`."""
     name = table.text("servo")
     if name not in PRESETS and not (folder / name).is_file():
         raise table.invalid(
@@ -113,152 +190,22 @@ def _servo(table: Table, folder: Path) -> Servo:
     return Servo.resolve(name, folder)
 
 
-def _reference(table: Table) -> SignalLike:
-    return _REFERENCES[table.text("kind", choices=tuple(_REFERENCES))](table)
-
-
-def _square(table: Table) -> SignalLike:
-    amplitude, offset = table.number("amplitude_mm") * MM, table.number("offset_mm", 0.0) * MM
-    return SquareWave(amplitude, table.number("period_s", positive=True), offset)
-
-
-def _step(table: Table) -> SignalLike:
-    return Step(table.number("size_mm") * MM, table.number("at_s", 0.0, minimum=0.0))
-
-
-def _s_curve(table: Table) -> SignalLike:
-    ends = table.number("from_mm") * MM, table.number("to_mm") * MM
-    return SCurve(*ends, table.number("over_s", positive=True), table.number("begin_s", 0.0))
-
-
-def _samples(table: Table) -> SignalLike:
-    times, values = table.numbers("times_s"), table.numbers("values_mm")
-    return Samples(_listed(times), [value * MM for value in _listed(values)])
-
-
-def _constant(table: Table) -> SignalLike:
-    return table.number("value_mm") * MM
-
-
-_REFERENCES: Mapping[str, Callable[[Table], SignalLike]] = {
-    "square": _square,
-    "step": _step,
-    "s-curve": _s_curve,
-    "samples": _samples,
-    "constant": _constant,
-}
-
-
-def _listed(numbers: float | tuple[float, ...]) -> tuple[float, ...]:
-    return numbers if isinstance(numbers, tuple) else (numbers,)
-
-
-def _gap(table: Table) -> SignalLike:
-    """The total gap: `total_deg`, or an S-curve from `from_deg` to `to_deg` in `over_s`."""
-    if "total_deg" in table.values or not table.values:
-        return table.number("total_deg", minimum=0.0) * DEG
-    ends = table.number("from_deg", minimum=0.0) * DEG, table.number("to_deg", minimum=0.0) * DEG
-    return SCurve(*ends, table.number("over_s", positive=True), table.number("begin_s", 0.0))
-
-
-def _controller(table: Table, controller: Controller) -> Controller | None:
+def _changed(table: Table, controller: Controller) -> Controller | None:
     """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
     changed = changes(table, Controller)
     return controller.replace(**changed) if changed else None
 
 
-def _noise(table: Table) -> Noise:
-    kind = table.text("kind", "highpass", choices=("highpass", "white"))
-    band = _listed(table.numbers("band_hz", (10.0, 50.0), positive=True))
-    if len(band) != 2:
-        raise table.invalid("band_hz", "two numbers, the stop and the pass edge")
-    return Noise(
-        table.number("std_mm", minimum=0.0) * MM, (band[0], band[1]), "white" if kind == "white" else "highpass"
-    )
-
-
-def _links(table: Table) -> tuple[LinkSettings, LinkSettings]:
-    """Edge to twin and back: [link] for both, [link.up] and [link.down] for what differs."""
-    both = _link(table, LinkSettings())
-    return part(table, "up", lambda t: _link(t, both)), part(table, "down", lambda t: _link(t, both))
-
-
-def _link(table: Table, default: LinkSettings) -> LinkSettings:
-    def share(key: str) -> float:
-        return table.number(key, getattr(default, key), minimum=0.0, maximum=1.0)
-
-    outages = tuple(_outage(each) for each in table.tables("outages"))
-    return LinkSettings(
-        delay_s=table.number("delay_s", default.delay_s, minimum=0.0),
-        jitter_s=table.number("jitter_s", default.jitter_s, minimum=0.0),
-        loss=share("loss"),
-        duplicate=share("duplicate"),
-        reorder=share("reorder"),
-        hold_s=table.number("hold_s", default.hold_s, minimum=0.0),
-        outages=outages or default.outages,
-    )
-
-
-def _outage(table: Table) -> tuple[float, float]:
-    begin, end = table.number("from_s"), table.number("to_s")
-    table.done()
-    return begin, end
-
-
-def _recording(table: Table) -> Recording:
-    default = Recording()
-    return Recording(
-        sample_rate=table.number("sample_rate_hz", default.sample_rate, positive=True),
-        window=table.number("window_s", None, positive=True),
-        pre_trigger=table.number("pre_trigger_s", None, minimum=0.0),
-        fine_angle=table.boolean("fine_angle", default.fine_angle),
-        retry=_retry(table, default.retry),
-        limits=part(table, "limits", edgefile.limits),
-        longest_window=table.number("longest_window_s", None, positive=True),
-        longest_pre_trigger=table.number("longest_pre_trigger_s", None, minimum=0.0),
-    )
-
-
-def _retry(table: Table, default: Retry) -> Retry:
-    return Retry(
-        table.number("retry_first_s", default.first_s, positive=True),
-        table.number("retry_factor", default.factor, minimum=1.0),
-        table.number("retry_longest_s", default.longest_s, positive=True),
-    )
-
-
-def _supervision(table: Table, controller: Controller) -> Supervision | None:
+def _supervision(edge: Table, controller: Controller) -> Supervision | None:
     """[edge]: updates may set gains, and the edge looks after itself; without it, they set the tolerance only.
 
-    What it says of probing moves changes nothing of this.
+    Its table `probe` changes nothing of this.
     """
-    if not table.table("edge").values.keys() - {"probe"}:
+    if not edge.values.keys() - {"probe"}:
         return None
 
     def gains(inner: Table) -> Gains:
         return read_gains(inner, controller)
 
-    def whole(inner: Table) -> Supervision:
-        inner.table("probe")
-        return edgefile.supervision(inner, gains)
-
-    return part(table, "edge", whole)
-
-
-def _probe(table: Table) -> ProbeLimits | None:
-    """[edge.probe]: the twin may request probing moves of the reference."""
-    inner = table.table("edge")
-    return part(inner, "probe", edgefile.probe) if "probe" in inner.values else None
-
-
-def _novelty(table: Table) -> NoveltyRules | None:
-    """[novelty]: the edge tells what is worth sending; an empty table takes the defaults."""
-    rules = part(table, "novelty", noveltyfile.rules)
-    return rules if "novelty" in table.values else None
-
-
-def _disturbances(table: Table) -> dict[str, float]:
-    return {
-        "input_bias": table.number("input_bias_v", 0.0),
-        "friction": table.number("friction_n_m", 0.0, minimum=0.0),
-    }
+    with named(edge):
+        return read_supervision(edge, gains)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from servotwin.config.table import Table, named
+from servotwin.config.keys import key
+from servotwin.config.table import Table
+from servotwin.config.toml import read
 from servotwin.edge.drive import ControlDrive, SupervisedDrive
 
 _Drive = TypeVar("_Drive")
+_SILENCE = "Time without an answer, or a new sample, after which the drive counts as lost."
 
 
 def control_drive(table: Table, folder: Path) -> ControlDrive:
@@ -20,58 +23,104 @@ def control_drive(table: Table, folder: Path) -> ControlDrive:
     InvalidInput
         A key is unknown, missing or not allowed, or the kind has no such role.
     """
-    return _read(table, folder, {"simulated": _controlled})
+    return _read(table, folder, CONTROLLED)
 
 
 def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
     """The same of a drive with its own controller."""
-    return _read(table, folder, {"simulated": _supervised, "replay": _replay, "opcua": _opcua})
+    return _read(table, folder, SUPERVISED)
 
 
-def _read(table: Table, folder: Path, kinds: dict[str, Callable[[Table, Path], _Drive]]) -> _Drive:
+def _read(table: Table, folder: Path, kinds: Mapping[str, Callable[..., _Drive]]) -> _Drive:
     make = kinds[table.text("kind", choices=tuple(kinds))]
-    with named(table):
-        drive = make(table, folder)
+    drive: _Drive = read(table, make, folder, base_folder=folder)
     table.done()
     return drive
 
 
-def _controlled(table: Table, folder: Path) -> ControlDrive:
+def _controlled(
+    base_folder: Path,
+    address: Annotated[str, key(help="unix:PATH of the machine's socket, or HOST:PORT.")],
+    silence_s: Annotated[float, key(minimum=0.0, help=_SILENCE)] = 5.0,
+) -> ControlDrive:
+    """Simulated machine whose voltage the edge sets."""
     from servotwin.drives.simulated.client import SimulatedControl
 
-    return SimulatedControl(_address(table, folder), _silence(table))
+    return SimulatedControl(_socket(address, base_folder), silence_s)
 
 
-def _supervised(table: Table, folder: Path) -> SupervisedDrive:
+def _supervised(
+    base_folder: Path,
+    address: Annotated[str, key(help="unix:PATH of the machine's socket, or HOST:PORT.")],
+    silence_s: Annotated[float, key(minimum=0.0, help=_SILENCE)] = 5.0,
+) -> SupervisedDrive:
+    """Simulated machine with its own controller."""
     from servotwin.drives.simulated.client import SimulatedSupervised
 
-    return SimulatedSupervised(_address(table, folder), _silence(table))
+    return SimulatedSupervised(_socket(address, base_folder), silence_s)
 
 
-def _replay(table: Table, folder: Path) -> SupervisedDrive:
+def _replay(
+    base_folder: Path,  # noqa: ARG001
+    log: Annotated[Path, key(help="CSV as `servotwin simulate` writes it.")],
+    speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
+    loop: Annotated[bool, key(help="Begin again at the end.")] = False,
+    block_s: Annotated[float, key(above=0.0, help="Time in one block.")] = 0.05,
+) -> SupervisedDrive:
+    """Recorded log in place of a machine."""
     from servotwin.drives.replay import Replay
 
-    return Replay(
-        folder / table.text("log"),
-        table.number("speed", 1.0, minimum=0.0),
-        table.boolean("loop", False),
-        table.number("block_s", 0.05, positive=True),
+    return Replay(log, speed, loop, block_s)
+
+
+def _opcua(
+    base_folder: Path,
+    url: Annotated[str, key(help="opc.tcp://HOST:PORT[/PATH].")],
+    node: Annotated[
+        str | None, key(help="Browse name of the drive's object below Objects; the model's where absent.")
+    ] = None,
+    user: Annotated[str | None, key(help="User; without certificates on this machine only.")] = None,
+    password_file: Annotated[str | None, key(help="File of mode 0600 with the user's password.")] = None,
+    password_env: Annotated[str | None, key(help="Environment variable with the user's password.")] = None,
+    certificate: Annotated[
+        Path | None, key(help="The edge's certificate, PEM or DER; all three files or none.")
+    ] = None,
+    private_key: Annotated[Path | None, key(help="Its private key.")] = None,
+    server_certificate: Annotated[Path | None, key(help="Certificate of the server.")] = None,
+    poll_s: Annotated[
+        float,
+        key(
+            above=0.0, help="Time from one look at the samples to the next; the rings must hold several times as much."
+        ),
+    ] = 0.05,
+    silence_s: Annotated[float, key(above=0.0, help=_SILENCE)] = 5.0,
+) -> SupervisedDrive:
+    """OPC UA drive."""
+    from servotwin.drives.opcua.drive import OpcUaDrive
+    from servotwin.drives.opcua.settings import OpcUaSettings, read_password
+
+    return OpcUaDrive(
+        OpcUaSettings(
+            url=url,
+            node=OpcUaSettings.node if node is None else node,
+            user=user,
+            password=read_password(password_file, password_env, base_folder),
+            certificate=certificate,
+            private_key=private_key,
+            server_certificate=server_certificate,
+            poll_s=poll_s,
+            silence_s=silence_s,
+        )
     )
 
 
-def _opcua(table: Table, folder: Path) -> SupervisedDrive:
-    from servotwin.drives.opcua.drive import OpcUaDrive
-    from servotwin.drives.opcua.settings import of_table
-
-    return OpcUaDrive(of_table(table, folder))
-
-
-def _address(table: Table, folder: Path) -> str:
-    """Where the machine listens; the path of a socket is relative to the file."""
-    address = table.text("address")
+def _socket(address: str, folder: Path) -> str:
+    """The machine's address; the path of a socket is relative to the file."""
     kind, _, path = address.partition(":")
     return f"unix:{folder / path}" if kind == "unix" and path else address
 
 
-def _silence(table: Table) -> float:
-    return table.number("silence_s", 5.0, minimum=0.0)
+CONTROLLED: Mapping[str, Callable[..., ControlDrive]] = {"simulated": _controlled}
+SUPERVISED: Mapping[str, Callable[..., SupervisedDrive]] = {
+    "simulated": _supervised, "replay": _replay, "opcua": _opcua,
+}  # fmt: skip

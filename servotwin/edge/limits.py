@@ -1,93 +1,120 @@
-"""What an update must respect: pure checks of tolerance and gains against what runs and what the servo is built for."""
+"""Limits of updates: pure checks of tolerance and gains against those in force and the servo's own."""
 
 from dataclasses import dataclass
 from math import inf
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 
 _SCALED = ("Kp", "Ki", "Kd", "Tf")
-_POSITIVE = ("max_step", "max_rate", "lifetime_s")
-_FACTORS = ("gain_factor", "gain_step", "gain_rate")
-_TIMES = ("interval_s", "patience_s")
 
 
+@settings("limits")
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an update must respect.
+    """Limits that an update must respect.
 
-    Parameters
-    ----------
-    minimum, maximum : float
-        Tolerance, m.
-    max_step : float
-        Largest change of the tolerance by one update, m.
-    lifetime_s : float
-        The data may be this old when the update is applied, whatever the update itself says.
-    interval_s : float
-        Shortest time between two applied updates.
-    max_rate : float
-        Largest change of the tolerance per second since the last update, m/s.
-    gain_factor : float
-        Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above.
-    integral_factor : float
-        Largest Ki, in the servo's own: integral action is what makes a loop with a gap cycle. 0: none.
-    gain_step, gain_rate : float
-        Largest factor by which one update may change a gain, and by how much per second since the last update. Ki may
-        fall at once. A gain counts as at least the box's lower edge, so that Ki can leave zero.
-    feedforward : float
-        Largest feedforward, V, either sign.
-    patience_s : float
-        How long an update waits for an instant at which the change of the dead zone neither opens nor closes the loop;
-        after that it is applied wherever the error is. 0: at once.
+    Where a limit on the tolerance is given in mm and in m, the one in mm counts.
     """
 
-    minimum: float = 0.0
-    maximum: float = inf
-    max_step: float = inf
-    lifetime_s: float = inf
-    interval_s: float = 0.0
-    max_rate: float = inf
-    gain_factor: float = 4.0
-    integral_factor: float = 1.0
-    gain_step: float = inf
-    gain_rate: float = inf
-    feedforward: float = 0.25
-    patience_s: float = 0.0
+    minimum: Annotated[float, key("minimum_m", "minimum_mm", minimum=0.0, help="Smallest tolerance.")] = 0.0
+    maximum: Annotated[
+        float,
+        key("maximum_m", "maximum_mm", minimum=0.0, infinite=True, help="Largest tolerance."),
+    ] = inf
+    max_step: Annotated[
+        float,
+        key("max_step_m", "max_step_mm", above=0.0, infinite=True, help="Largest change of it by one update."),
+    ] = inf
+    lifetime_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Largest age of the data when the update is applied, whatever the update itself says.",
+        ),
+    ] = inf
+    interval_s: Annotated[float, key(minimum=0.0, help="Shortest time between two applied updates.")] = 0.0
+    max_rate: Annotated[
+        float,
+        key(
+            "max_rate_m_per_s",
+            "max_rate_mm_per_s",
+            above=0.0,
+            infinite=True,
+            help="Largest change of the tolerance per second since the last update.",
+        ),
+    ] = inf
+    gain_factor: Annotated[
+        float,
+        key(
+            minimum=1.0,
+            infinite=True,
+            help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above.",
+        ),
+    ] = 4.0
+    integral_factor: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            infinite=True,
+            help="Largest Ki, as a multiple of the servo's own: integral action is what makes a loop with a gap cycle. "
+            "0: none.",
+        ),
+    ] = 1.0
+    gain_step: Annotated[
+        float,
+        key(
+            "gain_step_factor",
+            minimum=1.0,
+            infinite=True,
+            help="Largest factor by which one update may change a gain. Ki may fall at once; a gain counts as at least "
+            "the box's lower edge, so that Ki can leave zero.",
+        ),
+    ] = inf
+    gain_rate: Annotated[
+        float,
+        key(
+            "gain_factor_per_s",
+            minimum=1.0,
+            infinite=True,
+            help="Largest factor by which a gain may change per second since the last update.",
+        ),
+    ] = inf
+    feedforward: Annotated[
+        float, key("feedforward_v", minimum=0.0, infinite=True, help="Largest feedforward, either sign.")
+    ] = 0.25
+    patience_s: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            help="Longest time that an update waits for an instant at which the change of the dead zone neither opens "
+            "nor closes the loop; after that it is applied wherever the error is. 0: at once.",
+        ),
+    ] = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.minimum <= self.maximum or self.minimum == inf:
-            raise InvalidInput(
-                f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be 0 or more and in order"
-            )
-        for name in _POSITIVE:
-            if not getattr(self, name) > 0.0:
-                raise InvalidInput(f"limits {name} = {getattr(self, name)!r}: must be greater than 0")
-        for name in _FACTORS:
-            if not getattr(self, name) >= 1.0:
-                raise InvalidInput(f"limits {name} = {getattr(self, name)!r}: must be at least 1")
-        for name in _TIMES:
-            if not 0.0 <= getattr(self, name) < inf:
-                raise InvalidInput(f"limits {name} = {getattr(self, name)!r} s: must be at least 0")
-        for name in ("integral_factor", "feedforward"):
-            if not getattr(self, name) >= 0.0:
-                raise InvalidInput(f"limits {name} = {getattr(self, name)!r}: must be at least 0")
+        check(self)
+        if not self.minimum <= self.maximum:
+            raise InvalidInput(f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be in order")
 
     def allows_tolerance(self, tolerance: float) -> bool:
-        """Whether a tolerance (m) is in bounds."""
+        """True where a tolerance (m) is in bounds."""
         return self.minimum <= tolerance <= self.maximum
 
     def allows_tolerance_step(self, old: float, new: float, since: float) -> bool:
-        """Whether the tolerance (m) may change so far, `since` seconds after the last change."""
+        """True where the tolerance (m) may change so far, `since` seconds after the last change."""
         return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
 
     def allows_gains(self, gains: Gains, own: Gains) -> bool:
-        """Whether gains lie in the box around the servo's own."""
+        """True where gains lie in the box around the servo's own."""
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
-        """Whether gains may change so far, `since` seconds after the last change."""
+        """True where gains may change so far, `since` seconds after the last change."""
         factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
         if factor == inf:
             return True

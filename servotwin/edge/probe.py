@@ -2,41 +2,28 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf
+from typing import Annotated
 
-from servotwin.errors import InvalidInput
+from servotwin.config.keys import check, key, settings
 from servotwin.messages import Probe
 
 
+@settings("probe")
 @dataclass(frozen=True, slots=True)
 class ProbeLimits:
-    """Which probing moves an edge makes.
+    """Probing moves that an edge makes."""
 
-    Parameters
-    ----------
-    size : float
-        Largest move, m, either way.
-    interval_s : float
-        Shortest time from the beginning of one to the next.
-    rest_s : float
-        How long the reference must have rested before one.
-    """
-
-    size: float
-    interval_s: float = 60.0
-    rest_s: float = 1.0
+    size: Annotated[float, key("size_mm", "size_m", above=0.0, help="Largest move, either way.")]
+    interval_s: Annotated[float, key(minimum=0.0, help="Shortest time from the beginning of one to the next.")] = 60.0
+    rest_s: Annotated[float, key(above=0.0, help="Time for which the reference must have rested before one.")] = 1.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("size", "m"), ("rest_s", "s")):
-            if not 0.0 < getattr(self, name) < inf:
-                raise InvalidInput(f"probe {name} = {getattr(self, name)!r} {unit}: must be finite and greater than 0")
-        if not 0.0 <= self.interval_s < inf:
-            raise InvalidInput(f"probe interval_s = {self.interval_s!r} s: must be finite and at least 0")
+        check(self)
 
 
 @dataclass(frozen=True, slots=True)
 class ProbingMove:
-    """What is added to the reference, sample by sample: away for `hold` samples, back for as many, `strokes` times.
+    """Offset added to the reference: `size` for `hold` samples, 0 for as many, `strokes` times.
 
     Parameters
     ----------

@@ -1,14 +1,15 @@
-"""How one servo's agent works."""
+"""Settings of one servo's agent and of its supervision."""
 
 import re
 from dataclasses import dataclass, field
 from math import inf, isfinite
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput
@@ -16,6 +17,7 @@ from servotwin.messages import NAME_PATTERN, Gains
 from servotwin.runtime.retry import Retry
 
 
+@settings("supervision")
 @dataclass(frozen=True, slots=True)
 class Supervision:
     """How the edge looks after itself.
@@ -23,20 +25,24 @@ class Supervision:
     Parameters
     ----------
     fallback : FallbackSet, optional
-        What it falls back to; None: it does not.
-    watch : WatchSettings, optional
-        What counts as evidence against the parameters in force; None: nothing that the loop does.
-    period_s : float
-        How often it looks; a whole number of the watch's slots, at least one.
+        Setting that it falls back to; None: it does not.
     """
 
     fallback: FallbackSet | None = None
-    watch: WatchSettings | None = field(default_factory=WatchSettings)
-    period_s: float = 0.05
+    watch: Annotated[
+        WatchSettings | None,
+        key(
+            switch="watched",
+            help="What counts as evidence against the parameters in force; watched = false: nothing that the loop "
+            "does.",
+        ),
+    ] = field(default_factory=WatchSettings)
+    period_s: Annotated[
+        float, key(above=0.0, help="Period of the supervisor; a whole number of the watch's slots, at least one.")
+    ] = 0.05
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.period_s < inf:
-            raise InvalidInput(f"supervision period_s = {self.period_s!r} s: must be finite and greater than 0")
+        check(self)
 
     def period_samples(self, rate: float) -> int:
         """Samples from one look to the next, at `rate` Hz."""
@@ -44,34 +50,17 @@ class Supervision:
         return slot * max(1, round(self.period_s * rate / slot))
 
 
+@settings("agent")
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """How one servo's agent works.
+    """Settings of one servo's agent.
 
     Parameters
     ----------
-    servo, boot : str
-        Names; a new boot name for each start of the edge.
-    sample_rate : float
-        Hz.
-    window_s, pre_trigger_s : float
-        Length of a window, and how much of it lies before the change of the reference; whole samples.
-    longest_window_s, longest_pre_trigger_s : float, optional
-        What the twin may request instead; None: no more than that.
-    probe : ProbeLimits, optional
-        Which probing moves of the reference the twin may request; None: none.
-    retry : Retry
-        When to repeat an unacknowledged window.
-    limits : Limits
-        What updates must respect.
+    boot : str
+        Name of the boot; a new one for each start of the edge.
     parameters : Parameters
         In force at the start.
-    fine_angle : bool
-        Whether theta_m is sent with 32 bits instead of 16 (as a second channel).
-    reference : float
-        Before the first sample, m; the first sample is a change when it differs.
-    model_version : str
-        Description of the servo the edge runs on.
     controller : Controller, optional
         As configured: what updates start from, and the limits and filters that they do not change. None: updates set
         the tolerance only.
@@ -82,37 +71,63 @@ class AgentSettings:
         Chooses which windows are sent; None: all are.
     """
 
-    servo: str
+    servo: Annotated[str, key(help="Name of the servo.")]
     boot: str
-    sample_rate: float
-    window_s: float = 1.0
-    pre_trigger_s: float = 0.0
-    retry: Retry = field(default_factory=Retry)
-    limits: Limits = field(default_factory=Limits)
+    sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")]
+    window_s: Annotated[
+        float, key(table="window", above=0.0, help="Length of a window, a whole number of samples.")
+    ] = 1.0
+    pre_trigger_s: Annotated[
+        float,
+        key(
+            table="window",
+            minimum=0.0,
+            help="Part of a window before the change of the reference, a whole number of samples below window_s.",
+        ),
+    ] = 0.0
+    retry: Annotated[Retry, key(help="When an unacknowledged window is sent again.")] = field(default_factory=Retry)
+    limits: Annotated[Limits, key(help="Limits that updates must respect.")] = field(default_factory=Limits)
     parameters: Parameters = field(default_factory=Parameters)
-    fine_angle: bool = False
-    reference: float = 0.0
-    model_version: str = ""
+    fine_angle: Annotated[
+        bool, key(table="window", help="Send theta_m with 32 bits instead of 16 (as a second channel).")
+    ] = False
+    reference: Annotated[
+        float,
+        key(
+            "reference_mm",
+            "reference_m",
+            help="Reference before the first sample; the first sample is a change when it differs.",
+        ),
+    ] = 0.0
+    model_version: Annotated[str, key(help="Version of the servo's model, as `Servo.version`.")] = ""
     controller: Controller | None = None
     own: Gains | None = None
     supervision: Supervision = field(default_factory=Supervision)
-    longest_window_s: float | None = None
-    longest_pre_trigger_s: float | None = None
-    probe: ProbeLimits | None = None
+    longest_window_s: Annotated[
+        float | None,
+        key(table="window", above=0.0, help="Longest window that the twin may request; window_s where absent."),
+    ] = None
+    longest_pre_trigger_s: Annotated[
+        float | None,
+        key(table="window", minimum=0.0, help="Longest pre-trigger that it may request; pre_trigger_s where absent."),
+    ] = None
+    probe: Annotated[
+        ProbeLimits | None,
+        key(help="Probing moves of the reference that the twin may request; none where absent."),
+    ] = None
     window_filter: WindowFilterSettings | None = None
 
     def __post_init__(self) -> None:
-        for key in ("servo", "boot"):
-            if not re.fullmatch(NAME_PATTERN, getattr(self, key)):
-                raise InvalidInput(f"agent {key} = {getattr(self, key)!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
-        if not 0.0 < self.sample_rate < inf:
-            raise InvalidInput(f"agent sample_rate = {self.sample_rate!r} Hz: must be greater than 0")
-        for key in ("window_s", "pre_trigger_s"):
-            _check_whole(key, getattr(self, key), self.sample_rate)
+        for name in ("servo", "boot"):
+            if not re.fullmatch(NAME_PATTERN, getattr(self, name)):
+                raise InvalidInput(f"agent {name} = {getattr(self, name)!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        check(self)
+        for name in ("window_s", "pre_trigger_s"):
+            _check_whole(name, getattr(self, name), self.sample_rate)
         if self.window_samples < 1:
             raise InvalidInput(f"agent window_s = {self.window_s!r} s: must be at least one sample")
-        if not 0 <= self.pre_trigger_samples < self.window_samples:
-            allowed = f"must be at least 0 and below window_s = {self.window_s!r} s"
+        if not self.pre_trigger_samples < self.window_samples:
+            allowed = f"must be below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
         if self.window_filter is not None:
@@ -123,14 +138,14 @@ class AgentSettings:
 
     def _check_longest(self) -> None:
         """What may be requested is at least what is configured, and fits together."""
-        for key in ("window_s", "pre_trigger_s"):
-            longest, configured = getattr(self, f"longest_{key}"), getattr(self, key)
+        for name in ("window_s", "pre_trigger_s"):
+            longest, configured = getattr(self, f"longest_{name}"), getattr(self, name)
             if longest is None:
                 continue
-            _check_whole(f"longest_{key}", longest, self.sample_rate)
+            _check_whole(f"longest_{name}", longest, self.sample_rate)
             if longest < configured:
-                allowed = f"must be at least {key} = {configured!r} s"
-                raise InvalidInput(f"agent longest_{key} = {longest!r} s: {allowed}")
+                allowed = f"must be at least {name} = {configured!r} s"
+                raise InvalidInput(f"agent longest_{name} = {longest!r} s: {allowed}")
         if not self.longest_pre_trigger_samples < self.longest_samples:
             allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
             raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")
@@ -175,8 +190,8 @@ class AgentSettings:
         return self.supervision.period_samples(self.sample_rate)
 
 
-def _check_whole(key: str, seconds: float, rate: float) -> None:
+def _check_whole(name: str, seconds: float, rate: float) -> None:
     """A duration must be a whole number of samples."""
     samples = seconds * rate
     if not isfinite(samples) or abs(samples - round(samples)) > 1e-6:
-        raise InvalidInput(f"agent {key} = {seconds!r} s: must be a whole number of samples at {rate!r} Hz")
+        raise InvalidInput(f"agent {name} = {seconds!r} s: must be a whole number of samples at {rate!r} Hz")

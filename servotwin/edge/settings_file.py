@@ -1,121 +1,97 @@
-"""The edge's supervision in TOML tables: which key, in which unit, sets what."""
+"""Tables of an edge whose gains depend on the controller that runs: what it starts with and falls back to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from math import inf
+from collections.abc import Callable
+from typing import Annotated
 
-from servotwin.config.table import Reader, Table, given
-from servotwin.edge.limits import Limits
-from servotwin.edge.probe import ProbeLimits
+from servotwin.config.keys import key
+from servotwin.config.table import Table
+from servotwin.config.toml import Values, read, values_of
+from servotwin.control.gains import written_gains
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
-from servotwin.edge.watch import WatchSettings
 from servotwin.messages import Band, Gains, Setting
 
-MM = 1e-3
 GainsReader = Callable[[Table], Gains | None]
 """Reads the gains that a table gives, with those of the running controller for the others; None: gains stay."""
 
 
-def _millimetres(table: Table, key: str) -> float:
-    return table.number(key, minimum=0.0, infinite=True) * MM
+def band_table(
+    error: Annotated[float, key("error_mm", "error_m", minimum=0.0, help="Largest tracking error.")],
+    error_rms: Annotated[float, key("error_rms_mm", "error_rms_m", minimum=0.0, help="Its root mean square.")],
+    effort: Annotated[float, key("effort_v", minimum=0.0, help="Root mean square of the voltage.")],
+    settling: Annotated[
+        float, key("settling_s", minimum=0.0, help="Time after a change of the reference from which on the band holds.")
+    ],
+) -> Band:
+    """Band that the loop is predicted to stay within while its reference rests."""
+    return Band(error, error_rms, effort, settling)
 
 
-def length(table: Table, name: str, default: float | None = None) -> float:
-    """A length in m, at least 0: `name_mm`, or `name_m` where a program wrote it to the last bit."""
-    exact, key = f"{name}_m", f"{name}_mm"
-    table.known(exact, key)
-    if exact in table.values:
-        return table.number(exact, minimum=0.0, infinite=True)
-    if key not in table.values and default is not None:
-        return default
-    return _millimetres(table, key)
+def setting_table(
+    gains: Gains | None = None,
+    tolerance: Annotated[
+        float, key("tolerance_mm", "tolerance_m", minimum=0.0, help="Half-width of the dead zone; 0: none.")
+    ] = 0.0,
+    band: Annotated[
+        Band | None,
+        key(
+            makers={"": band_table},
+            dump=lambda band: values_of(band, band_table),
+            help="Band that the loop is predicted to stay within while its reference rests.",
+        ),
+    ] = None,
+) -> Setting:
+    """Dead zone, gains and band."""
+    return Setting(tolerance, gains, band)
 
 
-def _number(table: Table, key: str) -> float:
-    return table.number(key, infinite=True)
+def start_table(
+    setting: Setting,
+    fallback: Annotated[bool, key(help="This is the fallback set.")] = False,
+) -> Parameters:
+    """Parameters in force before the first update."""
+    return Parameters(setting=setting, fallback=fallback)
 
 
-def _metres(table: Table, key: str) -> float:
-    return table.number(key, minimum=0.0, infinite=True)
+def read_start(table: Table, gains: GainsReader) -> Parameters:
+    """[start]: the parameters in force before the first update."""
+    parameters: Parameters = read(table, start_table, setting=read(table, setting_table, gains=gains(table)))
+    return parameters
 
 
-LIMITS: Mapping[str, Reader] = {
-    "minimum_m": ("minimum", _metres),
-    "maximum_m": ("maximum", _metres),
-    "max_step_m": ("max_step", _metres),
-    "max_rate_m_per_s": ("max_rate", _metres),
-    "minimum_mm": ("minimum", _millimetres),
-    "maximum_mm": ("maximum", _millimetres),
-    "max_step_mm": ("max_step", _millimetres),
-    "max_rate_mm_per_s": ("max_rate", _millimetres),
-    "lifetime_s": ("lifetime_s", _number),
-    "interval_s": ("interval_s", _number),
-    "patience_s": ("patience_s", _number),
-    "gain_factor": ("gain_factor", _number),
-    "integral_factor": ("integral_factor", _number),
-    "gain_step_factor": ("gain_step", _number),
-    "gain_factor_per_s": ("gain_rate", _number),
-    "feedforward_v": ("feedforward", _number),
-}
-PROBE: Mapping[str, Reader] = {
-    "interval_s": ("interval_s", Table.number),
-    "rest_s": ("rest_s", Table.number),
-}
-WATCH: Mapping[str, Reader] = {
-    "slot_s": ("slot_s", Table.number),
-    "window_s": ("window_s", Table.number),
-    "settling_s": ("settling_s", Table.number),
-    "margin": ("margin", Table.number),
-    "overshoot": ("overshoot", Table.number),
-    "persist_s": ("persist_s", Table.number),
-    "error_floor_m": ("error_floor", _metres),
-    "error_floor_mm": ("error_floor", _millimetres),
-    "effort_floor_v": ("effort_floor", Table.number),
-    "swings": ("swings", Table.integer),
-    "similarity": ("similarity", Table.number),
-}
+def read_supervision(table: Table, gains: GainsReader) -> Supervision:
+    """Supervision: with a table `fallback` the edge falls back, with `watched = false` on silence only."""
+    table.known("fallback")
+    fallback = _read_fallback(table.table("fallback"), gains) if "fallback" in table.values else None
+    supervision: Supervision = read(table, Supervision, fallback=fallback)
+    return supervision
 
 
-def probe(table: Table) -> ProbeLimits:
-    """Which probing moves the twin may request."""
-    return ProbeLimits(**{"size": length(table, "size"), **given(table, PROBE)})
-
-
-def limits(table: Table) -> Limits:
-    """What updates must respect."""
-    return Limits(**given(table, LIMITS))
-
-
-def supervision(table: Table, gains: GainsReader) -> Supervision:
-    """How the edge looks after itself: to a table `fallback` it falls back, with `watched = false` on silence only."""
-    fallback = _fallback(table.table("fallback"), gains) if "fallback" in table.values else None
-    watched = table.boolean("watched", True)
-    return Supervision(fallback, _watch(table.table("watch")) if watched else None, table.number("period_s", 0.05))
-
-
-def _fallback(table: Table, gains: GainsReader) -> FallbackSet:
-    tolerance = length(table, "tolerance", 0.0)
-    found_band = band(table.table("band")) if "band" in table.values else None
-    found = FallbackSet(
-        Setting(tolerance, gains(table), found_band),
-        table.number("silence_s", inf, positive=True, infinite=True),
-        table.number("refuse_s", FallbackSet(Setting(0.0)).refuse_s, minimum=0.0),
-    )
+def _read_fallback(table: Table, gains: GainsReader) -> FallbackSet:
+    fallback: FallbackSet = read(table, FallbackSet, setting=read(table, setting_table, gains=gains(table)))
     table.done()
-    return found
+    return fallback
 
 
-def band(table: Table) -> Band:
-    """What a loop is predicted to stay within."""
-    error, error_rms = (length(table, name) for name in ("error", "error_rms"))
-    found = Band(error, error_rms, table.number("effort_v", minimum=0.0), table.number("settling_s", minimum=0.0))
-    table.done()
-    return found
+def start_values(parameters: Parameters) -> Values:
+    """Keys and values of [start]."""
+    return {**_setting_values(parameters.setting), **values_of(parameters, start_table)}
 
 
-def _watch(table: Table) -> WatchSettings:
-    found = WatchSettings(**given(table, WATCH))
-    table.done()
-    return found
+def supervision_values(supervision: Supervision) -> Values:
+    """Keys and values of [supervision]."""
+    fallback = supervision.fallback
+    if fallback is None:
+        return values_of(supervision)
+    stay: Values = {"gains_stay": True} if fallback.setting.gains is None else {}
+    return {
+        **values_of(supervision),
+        "fallback": {**_setting_values(fallback.setting), **stay, **values_of(fallback)},
+    }
+
+
+def _setting_values(setting: Setting) -> Values:
+    gains = {} if setting.gains is None else written_gains(setting.gains)
+    return {**values_of(setting, setting_table), **gains}

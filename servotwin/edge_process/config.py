@@ -1,14 +1,15 @@
-"""What `edge.toml` says: one servo's edge as a process."""
+"""Configuration of one servo's edge as a process, as `edge.toml` holds it."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import inf, isfinite
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import urlsplit
 
+from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
@@ -23,37 +24,32 @@ UNBOOTED = "unbooted"
 MB = 1_000_000
 
 
+@settings("twin")
 @dataclass(frozen=True, slots=True)
 class TwinLink:
-    """Where the twin is, and how it is spoken to.
+    """Address of the twin, and the secrets for it."""
 
-    Parameters
-    ----------
-    url : str
-        https://host[:port][/path], http:// on this machine itself, or a broker's: mqtt(s)://host[:port].
-    token_file, token_env : str, optional
-        Where the servo's token is: a file of mode 0600, or an environment variable; one of them.
-    ca_file : str, optional
-        Certificates that the twin's, or the broker's, is checked against; None: the system's.
-    timeout_s : float
-        For an answer, s.
-    wait_s : float
-        How long one poll waits for something new, s.
-    user : str, optional
-        Of the edge at the broker.
-    password_file, password_env : str, optional
-        Where the user's password is, as the token is given.
-    """
-
-    url: str
-    token_file: str | None = None
-    token_env: str | None = None
-    ca_file: str | None = None
-    timeout_s: float = 10.0
-    wait_s: float = 25.0
-    user: str | None = None
-    password_file: str | None = None
-    password_env: str | None = None
+    url: Annotated[
+        str,
+        key(
+            help="https://host[:port][/path], http:// on this machine itself, or a broker's: mqtt(s)://host[:port].",
+        ),
+    ]
+    token_file: Annotated[
+        str | None, key(help="File of mode 0600 with the servo's token; either this or token_env.")
+    ] = None
+    token_env: Annotated[str | None, key(help="Environment variable with the servo's token.")] = None
+    ca_file: Annotated[
+        str | None,
+        key(help="Certificates that the twin's, or the broker's, is checked against; the system's where absent."),
+    ] = None
+    timeout_s: Annotated[float, key(above=0.0, help="Longest wait for an answer.")] = 10.0
+    wait_s: Annotated[float, key(minimum=0.0, maximum=30.0, help="Longest wait of one poll for something new.")] = 25.0
+    user: Annotated[str | None, key(help="Name of the edge at the broker.")] = None
+    password_file: Annotated[
+        str | None, key(help="File of mode 0600 with the user's password; either this or password_env.")
+    ] = None
+    password_env: Annotated[str | None, key(help="Environment variable with the user's password.")] = None
 
     def __post_init__(self) -> None:
         if not (self.over_mqtt or _is_http(self.url)):
@@ -67,10 +63,7 @@ class TwinLink:
             raise InvalidInput("user and one of password_file and password_env belong together")
         if (self.token_file is None) == (self.token_env is None):
             raise InvalidInput("token_file or token_env is needed, and only one of them")
-        if not 0.0 < self.timeout_s < inf:
-            raise InvalidInput(f"timeout_s = {self.timeout_s!r} s: must be finite and greater than 0")
-        if not 0.0 <= self.wait_s <= 30.0:
-            raise InvalidInput(f"wait_s = {self.wait_s!r} s: must be 0 to 30")
+        check(self)
 
     @property
     def over_mqtt(self) -> bool:
@@ -78,55 +71,38 @@ class TwinLink:
         return is_mqtt(self.url)
 
 
+@settings("keep")
 @dataclass(frozen=True, slots=True)
 class Keeping:
-    """What is kept on disk; paths are relative to the configuration's folder.
+    """Files that the edge keeps; paths are relative to the configuration's folder."""
 
-    Parameters
-    ----------
-    outbox, parameters, status, boots : str
-        Windows and letters not taken yet; the parameters that were proved last; what `servotwin edge` shows; how often
-        this edge was started.
-    windows, bytes : int
-        The outbox holds no more.
-    """
-
-    outbox: str = "outbox.sqlite"
-    parameters: str = "parameters.json"
-    status: str = "status.json"
-    boots: str = "boots"
-    windows: int = 5000
-    bytes: int = 256 * MB
+    outbox: Annotated[str, key(help="Windows and letters that the twin has not acknowledged.")] = "outbox.sqlite"
+    parameters: Annotated[str, key(help="Parameters that stood the test last.")] = "parameters.json"
+    status: Annotated[str, key(help="Status that `servotwin edge` shows.")] = "status.json"
+    boots: Annotated[str, key(help="Number of starts of this edge.")] = "boots"
+    windows: Annotated[int, key(minimum=1, help="Most windows in the outbox.")] = 5000
+    bytes: Annotated[int, key("megabytes", minimum=MB, help="Largest size of the outbox.")] = 256 * MB
 
     def __post_init__(self) -> None:
-        if self.windows < 1:
-            raise InvalidInput(f"outbox windows = {self.windows!r}: must be at least 1")
-        if self.bytes < MB:
-            raise InvalidInput(f"outbox megabytes = {self.bytes / MB!r}: must be at least 1")
+        check(self)
 
 
+@settings("sensor")
 @dataclass(frozen=True, slots=True)
 class SensorGuard:
-    """What happens when a sample is not finite.
+    """Voltage while samples are not finite."""
 
-    Parameters
-    ----------
-    hold_s : float
-        The last voltage is held this long, s; then the safe one is given until the samples are good again.
-    safe_voltage : float
-        V.
-    """
-
-    hold_s: float = 0.01
-    safe_voltage: float = 0.0
+    hold_s: Annotated[
+        float,
+        key(minimum=0.0, help="Time for which the last voltage is held; then the safe one until samples are good."),
+    ] = 0.01
+    safe_voltage: Annotated[float, key("safe_voltage_v", help="Safe voltage.")] = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.hold_s < inf:
-            raise InvalidInput(f"hold_s = {self.hold_s!r} s: must be finite and at least 0")
-        if not isfinite(self.safe_voltage):
-            raise InvalidInput(f"safe_voltage_v = {self.safe_voltage!r} V: must be finite")
+        check(self)
 
 
+@settings("edge")
 @dataclass(frozen=True, slots=True)
 class EdgeConfig:
     """One servo's edge.
@@ -135,38 +111,44 @@ class EdgeConfig:
     ----------
     agent : AgentSettings
         Of a boot without name; its `controller` is set where updates may set gains.
-    role : str
-        "control": the edge ticks the law; "supervise": the drive has a controller of its own.
     controller : Controller, optional
         As configured; needed to control, and where updates may set gains. Its rate is the samples'.
     drive : mapping of str to TOML value
-        What the drive's kind ("kind") reads.
-    twin : TwinLink, optional
-        None: it runs without a twin, and keeps its windows.
-    keeping : Keeping
-    sensor : SensorGuard
-    priority : int
-        Of the control process among real-time ones (SCHED_FIFO), 1 to 99; 0: it is none.
+        Keys for the drive of the kind that the key `kind` names.
     folder : path
-        What paths are relative to.
+        Folder that paths are relative to.
     source : str
         The file's name in messages.
     """
 
     agent: AgentSettings
-    role: str
+    role: Annotated[
+        str,
+        key(choices=ROLES, help="control: the edge ticks the law; supervise: the drive has a controller of its own."),
+    ]
     controller: Controller | None
     drive: Mapping[str, object]
-    twin: TwinLink | None = None
-    keeping: Keeping = field(default_factory=Keeping)
-    sensor: SensorGuard = field(default_factory=SensorGuard)
-    priority: int = 0
+    twin: Annotated[
+        TwinLink | None, key(help="Where the twin is; where absent the edge runs without one and keeps its windows.")
+    ] = None
+    keeping: Annotated[Keeping, key("keep", help="Files that the edge keeps.")] = field(default_factory=Keeping)
+    sensor: Annotated[SensorGuard, key(help="Voltage while samples are not finite.")] = field(
+        default_factory=SensorGuard
+    )
+    priority: Annotated[
+        int,
+        key(
+            "realtime_priority",
+            minimum=0,
+            maximum=99,
+            help="Priority of the control process among real-time ones (SCHED_FIFO); 0: it is none.",
+        ),
+    ] = 0
     folder: Path = field(default=Path(), compare=False)
     source: str = field(default="edge.toml", compare=False)
 
     def __post_init__(self) -> None:
-        if self.role not in ROLES:
-            raise InvalidInput(f"role = {self.role!r} is not allowed; give one of {', '.join(ROLES)}")
+        check(self)
         if self.controller is None and (self.role == "control" or self.agent.controller is not None):
             raise InvalidInput("table [controller] is missing: it is needed to control, and where updates set gains")
         if self.agent.controller is not None and self.agent.controller != self.controller:
@@ -174,8 +156,6 @@ class EdgeConfig:
         if self.role == "control" and self.law_rate != self.agent.sample_rate:
             allowed = f"must be that of the samples, {self.agent.sample_rate!r} Hz"
             raise InvalidInput(f"controller sample_rate_hz = {self.law_rate!r} Hz: {allowed}")
-        if not 0 <= self.priority <= 99:
-            raise InvalidInput(f"realtime_priority = {self.priority!r}: must be 0 to 99")
         if "kind" not in self.drive:
             raise InvalidInput("key 'drive.kind' is missing")
 

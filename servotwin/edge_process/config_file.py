@@ -1,149 +1,119 @@
-"""`edge.toml`: which key, in which unit, sets what of an `EdgeConfig`; for reading and for writing."""
+"""`edge.toml`: reads an `EdgeConfig`, and writes one so that what is read from it is equal, bit for bit."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
-from servotwin.config.table import Reader, Table, given, named, part, read_toml
-from servotwin.config.toml import read as read_settings
+from servotwin.config.keys import key
+from servotwin.config.table import Table, named, read_toml
+from servotwin.config.toml import Values, changes, dumps, part, read, values_of
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_given, read_gains
-from servotwin.edge import settings_file as edgefile
-from servotwin.edge.parameters import Parameters
-from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge_process.config import MB, ROLES, UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink
-from servotwin.edge_process.config_writer import edge_toml
-from servotwin.messages import Gains, Setting
-from servotwin.novelty import settings_file as noveltyfile
-from servotwin.runtime.retry import Retry
-
-__all__ = ["edge_toml", "load", "read"]
-
-_TWIN: Mapping[str, Reader] = {
-    "url": ("url", Table.text),
-    "token_file": ("token_file", Table.text),
-    "token_env": ("token_env", Table.text),
-    "ca_file": ("ca_file", Table.text),
-    "timeout_s": ("timeout_s", Table.number),
-    "wait_s": ("wait_s", Table.number),
-    "user": ("user", Table.text),
-    "password_file": ("password_file", Table.text),
-    "password_env": ("password_env", Table.text),
-}
-_KEEPING: Mapping[str, Reader] = {
-    "outbox": ("outbox", Table.text),
-    "parameters": ("parameters", Table.text),
-    "status": ("status", Table.text),
-    "boots": ("boots", Table.text),
-    "windows": ("windows", Table.integer),
-    "megabytes": ("bytes", lambda table, key: round(table.number(key) * MB)),
-}
-_SENSOR: Mapping[str, Reader] = {
-    "hold_s": ("hold_s", Table.number),
-    "safe_voltage_v": ("safe_voltage", Table.number),
-}
-_RETRY: Mapping[str, Reader] = {
-    "first_s": ("first_s", Table.number),
-    "factor": ("factor", Table.number),
-    "longest_s": ("longest_s", Table.number),
-}
-_WINDOW: Mapping[str, Reader] = {
-    "window_s": ("window_s", Table.number),
-    "pre_trigger_s": ("pre_trigger_s", Table.number),
-    "longest_window_s": ("longest_window_s", Table.number),
-    "longest_pre_trigger_s": ("longest_pre_trigger_s", Table.number),
-    "fine_angle": ("fine_angle", Table.boolean),
-}
+from servotwin.control.gains import gains_given, read_gains, written_gains
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge.settings_file import read_start, read_supervision, start_values, supervision_values
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.messages import Gains
+from servotwin.novelty.settings import NoveltySettings
 
 
 def load(path: str | os.PathLike[str]) -> EdgeConfig:
-    """The configuration in a file.
+    """Read the configuration in a file.
 
     Raises
     ------
     InvalidInput
         The file is missing or not TOML, a key is unknown or missing, or its value is not allowed.
     """
-    config = read(read_toml(path))
+    config = read_config(read_toml(path))
     return replace(config, folder=Path(path).resolve().parent)
 
 
-def read(table: Table) -> EdgeConfig:
-    """The configuration in a table."""
+def read_config(table: Table) -> EdgeConfig:
+    """Read the configuration in a table."""
     with named(table):
-        rate = table.number("sample_rate_hz", positive=True)
-        controller = part(table, "controller", lambda t: _controller(t, rate)) if "controller" in table.values else None
-        config = EdgeConfig(
-            agent=_agent(table, rate, controller),
-            role=table.text("role", choices=ROLES),
-            controller=controller,
-            drive=dict(table.table("drive", required=True).values),
-            twin=part(table, "twin", lambda t: TwinLink(**given(t, _TWIN))) if "twin" in table.values else None,
-            keeping=part(table, "keep", lambda t: Keeping(**given(t, _KEEPING))),
-            sensor=part(table, "sensor", lambda t: SensorGuard(**given(t, _SENSOR))),
-            priority=table.integer("realtime_priority", 0),
-            source=table.source,
+        controller = _controller(table) if "controller" in table.values else None
+        drive = dict(table.table("drive", required=True).values)
+        agent = _agent(table, controller)
+        config: EdgeConfig = read(
+            table, EdgeConfig, agent=agent, controller=controller, drive=drive, source=table.source
         )
-    table.known("controller", "twin", "own", "start", "probe", "novelty")
+    table.known("controller", "own", "start", "novelty")
     table.done()
     return config
 
 
-def _controller(table: Table, rate: float) -> Controller:
-    """Sampled, as the samples are."""
-    controller: Controller = read_settings(table, Controller)
+def update_gains_table(
+    update_gains: Annotated[bool, key(help="Updates may set gains too, not only the dead zone.")] = False,
+) -> bool:
+    """Whether updates may set gains."""
+    return update_gains
+
+
+def _controller(table: Table) -> Controller:
+    """The controller of the law, sampled as the samples are."""
+    rate = changes(table, AgentSettings, only=("sample_rate",)).get("sample_rate")
+    controller: Controller = part(table, "controller", Controller)
     return controller if controller.sample_rate is not None else controller.replace(sample_rate=rate)
 
 
-def _agent(table: Table, rate: float, controller: Controller | None) -> AgentSettings:
-    """`update_gains` says whether updates may set gains."""
-    settable = controller if table.boolean("update_gains", False) else None
+def _agent(table: Table, controller: Controller | None) -> AgentSettings:
+    settable = controller if read(table, update_gains_table) else None
 
     def gains(inner: Table) -> Gains | None:
         stay = inner.boolean("gains_stay", settable is None)
         return None if stay or settable is None else read_gains(inner, settable)
 
-    probe = part(table, "probe", edgefile.probe) if "probe" in table.values else None
-    return AgentSettings(
-        servo=table.text("servo"),
+    def start_gains(inner: Table) -> Gains | None:
+        given = gains_given(inner)
+        return read_gains(inner, settable) if given and settable is not None else None
+
+    start, supervision = table.table("start"), table.table("supervision")
+    agent: AgentSettings = read(
+        table,
+        AgentSettings,
         boot=UNBOOTED,
-        sample_rate=rate,
-        reference=_reference(table),
-        model_version=table.text("model_version", ""),
-        limits=part(table, "limits", edgefile.limits),
-        retry=part(table, "retry", lambda t: Retry(**given(t, _RETRY))),
         controller=settable,
-        own=part(table, "own", gains) if "own" in table.values else None,
-        parameters=part(table, "start", lambda t: _start(t, settable)),
-        supervision=part(table, "supervision", lambda t: _supervision(t, gains)),
-        probe=probe,
-        window_filter=part(table, "novelty", noveltyfile.settings) if "novelty" in table.values else None,
-        **part(table, "window", lambda t: given(t, _WINDOW)),
+        own=_own(table.table("own"), gains) if "own" in table.values else None,
+        parameters=read_start(start, start_gains),
+        supervision=read_supervision(supervision, gains),
+        window_filter=part(table, "novelty", NoveltySettings) if "novelty" in table.values else None,
     )
+    start.done()
+    supervision.done()
+    return agent
 
 
-def _reference(table: Table) -> float:
-    """Before the first sample, m; any sign."""
-    table.known("reference_mm", "reference_m")
-    return table.number("reference_m", table.number("reference_mm", 0.0) * edgefile.MM)
+def _own(table: Table, gains: Callable[[Table], Gains | None]) -> Gains | None:
+    found = gains(table)
+    table.done()
+    return found
 
 
-def _supervision(table: Table, gains: edgefile.GainsReader) -> Supervision:
-    table.known("fallback", "watch")
-    return edgefile.supervision(table, gains)
+def edge_toml(config: EdgeConfig) -> str:
+    """The text of `edge.toml`.
 
-
-def _start(table: Table, controller: Controller | None) -> Parameters:
-    """In force before the first update."""
-    some = gains_given(table)
-    return Parameters(
-        setting=Setting(
-            edgefile.length(table, "tolerance", 0.0),
-            gains=read_gains(table, controller) if some and controller is not None else None,
-            band=part(table, "band", edgefile.band) if "band" in table.values else None,
-        ),
-        fallback=table.boolean("fallback", False),
-    )
+    Parameters
+    ----------
+    config : EdgeConfig
+        Its folder is not written: paths stay as they are.
+    """
+    agent = config.agent
+    values: Values = {
+        **values_of(agent),
+        **values_of(config),
+        "update_gains": agent.controller is not None,
+        "drive": dict(config.drive),
+        "start": start_values(agent.parameters),
+        "supervision": supervision_values(agent.supervision),
+    }
+    if config.controller is not None:
+        values["controller"] = values_of(config.controller)
+    if agent.own is not None:
+        values["own"] = written_gains(agent.own)
+    if isinstance(agent.window_filter, NoveltySettings):
+        values["novelty"] = values_of(agent.window_filter)
+    return dumps(values)

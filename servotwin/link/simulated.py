@@ -6,44 +6,50 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from hashlib import blake2b
-from math import inf, isfinite
+from math import inf
 from random import Random
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.runtime.clock import VirtualClock
 
 
+def outage_table(
+    begin: Annotated[float, key("from_s", help="Begin of the outage.")],
+    end: Annotated[float, key("to_s", help="End of the outage.")],
+) -> tuple[float, float]:
+    """One outage of a link."""
+    return begin, end
+
+
+@settings("link")
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """How a link treats messages; both directions alike.
+    """How a link treats messages; both directions alike."""
 
-    Parameters
-    ----------
-    delay_s, jitter_s : float
-        A message takes delay_s plus up to jitter_s more, evenly distributed.
-    loss, duplicate, reorder : float
-        Probabilities per message: lost; arriving twice; held back by up to hold_s, so that later ones overtake it.
-    hold_s : float
-    outages : tuple of (float, float)
-        (from, to) in s: what is sent or would arrive in between is lost.
-    """
-
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    loss: float = 0.0
-    duplicate: float = 0.0
-    reorder: float = 0.0
-    hold_s: float = 1.0
-    outages: tuple[tuple[float, float], ...] = ()
+    delay_s: Annotated[float, key(minimum=0.0, help="Time that every message takes.")] = 0.0
+    jitter_s: Annotated[float, key(minimum=0.0, help="A message takes up to this much longer, evenly distributed.")] = (
+        0.0
+    )
+    loss: Annotated[float, key(minimum=0.0, maximum=1.0, help="Probability that a message is lost.")] = 0.0
+    duplicate: Annotated[float, key(minimum=0.0, maximum=1.0, help="Probability that it arrives twice.")] = 0.0
+    reorder: Annotated[
+        float,
+        key(minimum=0.0, maximum=1.0, help="Probability that it is held back, so that later ones overtake it."),
+    ] = 0.0
+    hold_s: Annotated[float, key(minimum=0.0, help="Longest time for which it is held back.")] = 1.0
+    outages: Annotated[
+        tuple[tuple[float, float], ...],
+        key(
+            makers={"": outage_table},
+            dump=lambda outage: {"from_s": outage[0], "to_s": outage[1]},
+            help="Times of outages: what is sent or would arrive in between is lost.",
+        ),
+    ] = ()
 
     def __post_init__(self) -> None:
-        for key in ("delay_s", "jitter_s", "hold_s"):
-            value = getattr(self, key)
-            if not (isfinite(value) and value >= 0.0):
-                raise InvalidInput(f"link {key} = {value!r} s: must be finite and at least 0")
-        for key in ("loss", "duplicate", "reorder"):
-            if not 0.0 <= getattr(self, key) <= 1.0:
-                raise InvalidInput(f"link {key} = {getattr(self, key)!r}: must be a probability from 0 to 1")
+        check(self)
         for begin, end in self.outages:
             if not begin < end < inf:
                 raise InvalidInput(f"link outage from {begin!r} s to {end!r} s: must end after it begins")

@@ -1,4 +1,4 @@
 """Novelty: a window filter that sends only windows which tell the twin something new.
 
-`settings` and `settings_file` need no numbers library; whoever starts the filter loads `detector`, which does.
+`settings` needs no numbers library; whoever starts the filter loads `detector`, which does.
 """

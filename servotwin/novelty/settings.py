@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from importlib.util import find_spec
-from math import inf, isfinite, radians
-from typing import NamedTuple
+from math import isfinite, radians
+from typing import Annotated, NamedTuple
 
+from servotwin.config.keys import check, key, settings
+from servotwin.config.toml import Values, values_of
 from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 
@@ -61,101 +63,157 @@ class NoveltyModel:
             raise InvalidInput(f"novelty model decimation = {self.factor!r} samples: must be at least 1")
 
 
+def model_table(
+    rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")],
+    decay_real: Annotated[tuple[float, ...], key(help="Real parts of exp(pole T), one per mode.")],
+    decay_imag: Annotated[tuple[float, ...], key(help="Imaginary parts of them.")],
+    gain_real: Annotated[tuple[float, ...], key(help="Real parts of the gains, one per mode.")],
+    gain_imag: Annotated[tuple[float, ...], key(help="Imaginary parts of them.")],
+    direct: Annotated[float, key("direct_m_per_rad", help="Position over angle at once.")],
+    static_gain: Annotated[float, key("static_gain_m_per_rad", help="Position over angle at rest.")],
+    unseen: Annotated[
+        float,
+        key("unseen_s", minimum=0.0, help="What the screw does so late in a window has not reached the last mass."),
+    ],
+    factor: Annotated[int, key("decimation", minimum=1, help="Samples per sample that is judged.")],
+) -> NoveltyModel:
+    """Response of the structure, as a program writes it."""
+    if not len(decay_real) == len(decay_imag) == len(gain_real) == len(gain_imag):
+        raise InvalidInput("decay_real, decay_imag, gain_real and gain_imag must have as many numbers as one another")
+    decay, gain = map(complex, decay_real, decay_imag), map(complex, gain_real, gain_imag)
+    modes = tuple(ResponseMode(*pair) for pair in zip(decay, gain, strict=True))
+    return NoveltyModel(rate, modes, direct, static_gain, unseen, factor)
+
+
+def _model_values(model: NoveltyModel) -> Values:
+    """Keys and values that `model_table` reads as this model."""
+    return {
+        "decay_real": [mode.decay.real for mode in model.modes],
+        "decay_imag": [mode.decay.imag for mode in model.modes],
+        "gain_real": [mode.gain.real for mode in model.modes],
+        "gain_imag": [mode.gain.imag for mode in model.modes],
+        **values_of(model, model_table, only=("rate", "direct", "static_gain", "unseen", "factor")),
+    }
+
+
+@settings("novelty")
 @dataclass(frozen=True, slots=True)
 class NoveltyRules:
-    """What counts as news.
+    """Rules by which a window counts as news."""
 
-    Parameters
-    ----------
-    resolution : float
-        rad: no window is taken to be surer of the gap than that, so that far smaller changes are no news.
-    worth : float
-        rad: however sure it is, a change since the twin was last told that is smaller is not sent.
-    score_limit : float
-        Standard deviations from the baseline at which one window is news by itself.
-    allowance, cusum_limit : float
-        Standard deviations: what the cumulative sum lets pass in each window, and from which sum on it is news.
-    margin : float
-        rad: by how much, or by `worth` if that is more, the lost motion at rest may exceed what the twin knows of.
-    travel : float
-        rad: how far the screw must be pushed, both ways, for a window to say something.
-    settle : float
-        rad: how far the baseline may move with an update that stands on a window which was not looked at.
-    relearn : int
-        Windows that the baseline counts as at most after an accepted update.
-    learn : int
-        Windows that say something and are sent after each start, whatever they say.
-    outlier : float
-        rad: a change beyond may be an outlier to the twin, which takes none for granted until another window agrees.
-    confirm : int
-        Windows sent after such a change, whatever they say.
-    patience : int
-        Windows in a row that say nothing and are sent nevertheless, while some are still to be sent: the twin may ask
-        for ones that tell more.
-    period_s : float
-        s: one is sent at least so often.
-    look_s : float
-        s: where the reference does not change for so long, a window is cut and looked at; inf: never.
-    """
-
-    resolution: float = radians(0.005)
-    worth: float = 0.0
-    score_limit: float = 4.5
-    allowance: float = 0.5
-    cusum_limit: float = 8.0
-    margin: float = radians(0.25)
-    travel: float = radians(0.5)
-    settle: float = radians(0.2)
-    relearn: int = 5
-    learn: int = 2
-    outlier: float = radians(1.0)
-    confirm: int = 1
-    patience: int = 4
-    period_s: float = 600.0
-    look_s: float = 60.0
+    resolution: Annotated[
+        float,
+        key(
+            "resolution_deg",
+            "resolution_rad",
+            above=0.0,
+            help="No window is taken to be surer of the gap than that, so that far smaller changes are no news.",
+        ),
+    ] = radians(0.005)
+    worth: Annotated[
+        float,
+        key(
+            "worth_deg",
+            "worth_rad",
+            minimum=0.0,
+            help="A smaller change since the last window that was sent is not sent, however sure it is.",
+        ),
+    ] = 0.0
+    score_limit: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Standard deviations from the baseline that make one window news.",
+        ),
+    ] = 4.5
+    allowance: Annotated[
+        float, key(minimum=0.0, help="Standard deviations that the cumulative sum lets pass in each window.")
+    ] = 0.5
+    cusum_limit: Annotated[
+        float, key(above=0.0, infinite=True, help="Standard deviations from which on the cumulative sum is news.")
+    ] = 8.0
+    margin: Annotated[
+        float,
+        key(
+            "margin_deg",
+            "margin_rad",
+            above=0.0,
+            infinite=True,
+            help="Excess of the lost motion at rest over the gap that the twin knows of; worth_deg if that is more.",
+        ),
+    ] = radians(0.25)
+    travel: Annotated[
+        float,
+        key(
+            "travel_deg",
+            "travel_rad",
+            above=0.0,
+            help="Least travel of the pushed screw, both ways, for a window to say something.",
+        ),
+    ] = radians(0.5)
+    settle: Annotated[
+        float,
+        key(
+            "settle_deg",
+            "settle_rad",
+            above=0.0,
+            help="Largest move of the baseline with an update that stands on a window which was not judged.",
+        ),
+    ] = radians(0.2)
+    relearn: Annotated[
+        int, key(minimum=0, help="Windows that the baseline counts as at most after an accepted update.")
+    ] = 5
+    learn: Annotated[
+        int, key(minimum=0, help="Windows that say something and are sent after each start, whatever they say.")
+    ] = 2
+    outlier: Annotated[
+        float,
+        key(
+            "outlier_deg",
+            "outlier_rad",
+            above=0.0,
+            infinite=True,
+            help="A larger change may be an outlier to the twin, which wants another window that agrees.",
+        ),
+    ] = radians(1.0)
+    confirm: Annotated[int, key(minimum=0, help="Windows sent after such a change, whatever they say.")] = 1
+    patience: Annotated[
+        int,
+        key(
+            minimum=0,
+            help="Windows in a row that say nothing and are sent nevertheless, while some are still to be sent: the "
+            "twin may ask for ones that tell more.",
+        ),
+    ] = 4
+    period_s: Annotated[float, key(above=0.0, infinite=True, help="At least one window is sent in so long.")] = 600.0
+    look_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Where the reference does not change for so long, a window is cut and judged; inf: never.",
+        ),
+    ] = 60.0
 
     def __post_init__(self) -> None:
-        for key in (
-            "resolution",
-            "score_limit",
-            "cusum_limit",
-            "margin",
-            "travel",
-            "settle",
-            "outlier",
-            "period_s",
-            "look_s",
-        ):
-            value = getattr(self, key)
-            if not value > 0.0 or (value == inf and key in ("resolution", "travel", "settle")):
-                raise InvalidInput(f"novelty {key} = {value!r}: must be greater than 0")
-        for key in ("allowance", "worth"):
-            if not 0.0 <= getattr(self, key) < inf:
-                raise InvalidInput(f"novelty {key} = {getattr(self, key)!r}: must be finite and at least 0")
-        for key in ("relearn", "learn", "confirm", "patience"):
-            if getattr(self, key) < 0:
-                raise InvalidInput(f"novelty {key} = {getattr(self, key)!r} windows: must be at least 0")
+        check(self)
 
 
+@settings("novelty")
 @dataclass(frozen=True, slots=True)
 class NoveltySettings:
-    """Model and rules.
+    """Model and rules of the novelty filter."""
 
-    Parameters
-    ----------
-    model : NoveltyModel
-    rules : NoveltyRules
-    gap : float
-        rad: total gap to begin at.
-    """
-
-    model: NoveltyModel
-    rules: NoveltyRules = NoveltyRules()
-    gap: float = 0.0
+    model: Annotated[
+        NoveltyModel,
+        key(makers={"": model_table}, dump=_model_values, help="Response of the structure, as a program writes it."),
+    ]
+    rules: Annotated[NoveltyRules, key(prefix="", help="Rules by which a window counts as news.")] = NoveltyRules()
+    gap: Annotated[float, key("gap_deg", "gap_rad", minimum=0.0, help="Total gap to begin at.")] = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.gap < inf:
-            raise InvalidInput(f"novelty gap = {self.gap!r} rad: must be finite and at least 0")
+        check(self)
 
     @property
     def longest_pause_s(self) -> float:

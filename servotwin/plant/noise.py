@@ -5,12 +5,12 @@ scipy.signal takes most of a second to import, so only what draws noise imports 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
@@ -18,18 +18,13 @@ PASSBAND_RIPPLE_DB = 1.0
 STOPBAND_ATTENUATION_DB = 40.0
 
 
+@settings("noise")
 @dataclass(frozen=True)
 class Noise:
     """Stationary Gaussian noise.
 
-    Parameters
-    ----------
-    std : float
-        m, standard deviation of what comes out (the paper's 0.22 mm; its "20 dB" is another number, erratum E13).
-    band : (float, float)
-        Hz, edges of the high-pass: at least 40 dB down below the first, at most 1 dB above the second (erratum E18).
-        The paper's 10 and 50 Hz give a Butterworth filter of fourth order near 42 Hz. Not used by white noise.
-    kind : "highpass" or "white"
+    A `band` of 10 and 50 Hz, the paper's, gives a Butterworth filter of fourth order near 42 Hz. The paper's noise has
+    a standard deviation of 0.22 mm; its "20 dB" is another number (erratum E13).
 
     Raises
     ------
@@ -37,17 +32,22 @@ class Noise:
         std is negative or not finite, the band is not 0 < stop < pass, or the kind is unknown.
     """
 
-    std: float
-    band: tuple[float, float] = (10.0, 50.0)
-    kind: Literal["highpass", "white"] = "highpass"
+    std: Annotated[float, key("std_mm", minimum=0.0, help="Standard deviation of the filtered noise.")]
+    band: Annotated[
+        tuple[float, float],
+        key(
+            "band_hz",
+            above=0.0,
+            help="Stop and pass edge of the high-pass: at least 40 dB down below the first, at most 1 dB above the "
+            "second (erratum E18); not used by white noise.",
+        ),
+    ] = (10.0, 50.0)
+    kind: Annotated[Literal["highpass", "white"], key(choices=("highpass", "white"), help="Spectrum.")] = "highpass"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.std) and self.std >= 0.0):
-            raise InvalidInput(f"noise std = {self.std} m: must be finite and 0 or more")
-        if self.kind not in ("highpass", "white"):
-            raise InvalidInput(f"noise kind = {self.kind!r}: must be 'highpass' or 'white'")
+        check(self)
         stop, passed = self.band
-        if not 0.0 < stop < passed < math.inf:
+        if not stop < passed:
             raise InvalidInput(f"noise band = {self.band} Hz: must be 0 < stop < pass, finite")
 
     def filter(self, rate: float) -> Array:

@@ -1,11 +1,13 @@
 """Retries: when to try again, and pauses that grow from one failure to the next."""
 
 from dataclasses import dataclass, field
-from math import inf
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 
 
+@settings("retry")
 @dataclass(frozen=True, slots=True)
 class Retry:
     """Pauses between tries: `first_s`, then each `factor` times the last, up to `longest_s`.
@@ -13,15 +15,14 @@ class Retry:
     Where an answer takes a while, `first_s` should exceed the round trip, or everything is sent twice.
     """
 
-    first_s: float = 5.0
-    factor: float = 2.0
-    longest_s: float = 60.0
+    first_s: Annotated[float, key(above=0.0, help="First pause, longer than a round trip.")] = 5.0
+    factor: Annotated[float, key(minimum=1.0, help="Factor from one pause to the next.")] = 2.0
+    longest_s: Annotated[float, key(above=0.0, help="Longest pause, at least the first.")] = 60.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.first_s <= self.longest_s < inf:
-            raise InvalidInput(f"retry from {self.first_s!r} s to {self.longest_s!r} s: must be positive and in order")
-        if not 1.0 <= self.factor < inf:
-            raise InvalidInput(f"retry factor = {self.factor!r}: must be at least 1")
+        check(self)
+        if not self.first_s <= self.longest_s:
+            raise InvalidInput(f"retry from {self.first_s!r} s to {self.longest_s!r} s: must be in order")
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""What a twin's file says of the service itself: its address, its store, who may speak to it, and how much."""
+"""Configuration of the twin's service: its address, its store, who may speak to it, and how much."""
 
 from __future__ import annotations
 
@@ -6,96 +6,146 @@ import ipaddress
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import Annotated
 
-from servotwin.config.table import Reader, Table, given, named, part
+from servotwin.config.keys import check, key, settings
+from servotwin.config.table import Table, read_inner
+from servotwin.config.toml import read
 from servotwin.errors import InvalidInput
+from servotwin.link.broker import Broker
 from servotwin.link.url import is_here
 from servotwin.messages import MAX_BYTES
 from servotwin.twin_service.auth import read_secret
-from servotwin.twin_service.mqtt_config import MqttConfig, mqtt
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
 """Environment variable with the password of the store."""
+MQTT_PASSWORD = "SERVOTWIN_MQTT_PASSWORD"
+"""Environment variable with the password of the service's user at the broker."""
 SQLITE = "sqlite:///"
+GROUP = "twins"
 LOG_LEVELS = ("debug", "info", "warning", "error")
+_MOST = 1_000_000
 
 
+@dataclass(frozen=True)
+class MqttConfig:
+    """Part that the service takes in a broker's traffic.
+
+    Attributes
+    ----------
+    broker : Broker
+    group : str
+        Twin processes of one group share the work.
+    """
+
+    broker: Broker
+    group: str = GROUP
+
+    @property
+    def local(self) -> bool:
+        """Whether the broker runs on this machine."""
+        return is_here(self.broker.address[0])
+
+
+def _group(table: Table, name: str, group: str) -> str:
+    if not group or set(group) & set("/+#"):
+        raise table.invalid(name, "a name without /, + and #")
+    return group
+
+
+def mqtt_table(
+    environment: Mapping[str, str],
+    url: Annotated[str, key(help="mqtt(s)://host[:port].")],
+    user: Annotated[str | None, key(help="Name of the service at the broker.")] = None,
+    password_file: Annotated[
+        Path | None, key(help=f"File of mode 0600 with its password; where absent the environment's {MQTT_PASSWORD}.")
+    ] = None,
+    ca_file: Annotated[
+        str | None,
+        key(relative=True, help="Certificates that the broker's is checked against; the system's where absent."),
+    ] = None,
+    group: Annotated[str, key(parse=_group, help="Twin processes of one group share the work.")] = GROUP,
+) -> MqttConfig:
+    """Broker over which edges may reach the service as well."""
+    password = read_secret(password_file) if password_file is not None else environment.get(MQTT_PASSWORD)
+    return MqttConfig(Broker(url, user, password if user is not None else None, ca_file), group)
+
+
+def _address(table: Table, name: str, address: str) -> str:
+    try:
+        return str(ipaddress.ip_address("127.0.0.1" if address == "localhost" else address))
+    except ValueError:
+        raise table.invalid(name, "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
+
+
+def _file(table: Table, name: str, path: Path) -> Path:
+    if not path.is_file():
+        raise table.invalid(name, "the path of a file, relative to this one")
+    return path
+
+
+@settings("service")
 @dataclass(frozen=True)
 class ServiceConfig:
     """How the service runs.
 
-    Attributes
+    Parameters
     ----------
-    bind : str
-        IP address; anything but the machine itself asks for tokens and for TLS or a proxy that does it.
-    port : int
-        0: any free one.
-    store : str
-        SQLAlchemy URL without a password.
     store_password : str or None
         Not shown.
-    workers : int
-        Processes that estimate.
-    tls_certificate, tls_key : Path or None
-        PEM files; both or none.
-    behind_proxy : bool
-        A proxy on the way does TLS; that asks for tokens too.
-    tokens : Path or None
-        Verifiers of servos and operators; None: whoever reaches the machine itself may do everything.
-    lockstep : bool
-        Time is what requests say it is; nothing is done but on request.
-    proofs_per_minute : float
-        How many proofs are begun at most.
-    retention_days : float
-        How long windows are kept that led to no update.
-    rate_limit_per_s, rate_burst : float
-        Messages of one servo, on average and at once.
-    max_body_bytes : int
-        Of a body, as sent and as decompressed.
-    body_timeout_s : float
-        A body has to be there by then.
-    long_polls : int
-        Open at once.
-    queue : int
-        Messages that wait for their commit.
-    speed : float
-        Sample time passes at most so many times as fast as time.
-    future_slack_s : float
-        s of sample time that a window may lie ahead of that.
-    job_timeout_s : float
-        A worker that takes longer over one servo is replaced.
-    log_level : str
     mqtt : MqttConfig or None
         A broker over which edges may reach the service as well.
     """
 
-    bind: str = "127.0.0.1"
-    port: int = 8765
-    store: str = "sqlite:///twin.db"
+    bind: Annotated[
+        str,
+        key(
+            parse=_address,
+            help="IP address; anything but the machine itself asks for tokens and for TLS or a proxy that does it.",
+        ),
+    ] = "127.0.0.1"
+    port: Annotated[int, key(minimum=0, maximum=65535, help="Port; 0: any free one.")] = 8765
+    store: Annotated[str, key(help="SQLAlchemy URL without a password; a SQLite file is relative to this one.")] = (
+        "sqlite:///twin.db"
+    )
     store_password: str | None = None
-    workers: int = 2
-    tls_certificate: Path | None = None
-    tls_key: Path | None = None
-    behind_proxy: bool = False
-    tokens: Path | None = None
-    lockstep: bool = False
-    proofs_per_minute: float = 6.0
-    retention_days: float = 30.0
-    rate_limit_per_s: float = 20.0
-    rate_burst: float = 200.0
-    max_body_bytes: int = MAX_BYTES
-    body_timeout_s: float = 30.0
-    long_polls: int = 20_000
-    queue: int = 2000
-    speed: float = 1.0
-    future_slack_s: float = 60.0
-    job_timeout_s: float = 300.0
-    log_level: str = "info"
+    workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
+    tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
+    tls_key: Annotated[Path | None, key(parse=_file, help="PEM file with the certificate's key.")] = None
+    behind_proxy: Annotated[bool, key(help="A proxy on the way does TLS; that asks for tokens too.")] = False
+    tokens: Annotated[
+        Path | None,
+        key(
+            help="File with the verifiers of servos and operators; where absent whoever reaches the machine itself may "
+            "do everything."
+        ),
+    ] = None
+    lockstep: Annotated[bool, key(help="Time is what requests say; work is done on request only.")] = False
+    proofs_per_minute: Annotated[float, key(minimum=0.0, help="Most verifications begun.")] = 6.0
+    retention_days: Annotated[
+        float, key(above=0.0, infinite=True, help="Time for which windows are kept that led to no update.")
+    ] = 30.0
+    rate_limit_per_s: Annotated[float, key(above=0.0, help="Messages of one servo on average.")] = 20.0
+    rate_burst: Annotated[float, key(above=0.0, help="Messages of one servo at once.")] = 200.0
+    max_body_bytes: Annotated[
+        int, key(minimum=1024, maximum=MAX_BYTES, help="Size of a body, as sent and as decompressed.")
+    ] = MAX_BYTES
+    body_timeout_s: Annotated[float, key(above=0.0, help="Time by which a body has to be there.")] = 30.0
+    long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Long polls open at once.")] = 20_000
+    queue: Annotated[int, key(minimum=1, maximum=_MOST, help="Messages that wait for their commit.")] = 2000
+    speed: Annotated[float, key(above=0.0, help="Sample time passes at most so many times as fast as time.")] = 1.0
+    future_slack_s: Annotated[float, key(minimum=0.0, help="Sample time by which a window may lie ahead of that.")] = (
+        60.0
+    )
+    job_timeout_s: Annotated[float, key(above=0.0, help="A worker that takes longer over one servo is replaced.")] = (
+        300.0
+    )
+    log_level: Annotated[str, key(choices=LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
 
     def __post_init__(self) -> None:
+        check(self)
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise InvalidInput("tls_certificate and tls_key belong together: give both or none")
         if not self.local and (self.tokens is None or (self.tls_key is None and not self.behind_proxy)):
@@ -119,55 +169,7 @@ class ServiceConfig:
         return is_here(self.bind)
 
 
-def _address(table: Table, key: str) -> str:
-    address = table.text(key)
-    try:
-        return str(ipaddress.ip_address("127.0.0.1" if address == "localhost" else address))
-    except ValueError:
-        raise table.invalid(key, "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
-
-
-def _positive(table: Table, key: str) -> float:
-    return table.number(key, positive=True)
-
-
-def _not_negative(table: Table, key: str) -> float:
-    return table.number(key, minimum=0.0)
-
-
-def _count(table: Table, key: str) -> int:
-    return table.integer(key, minimum=1, maximum=1_000_000)
-
-
-def _days(table: Table, key: str) -> float:
-    return table.number(key, positive=True, infinite=True)
-
-
-PLAIN: Mapping[str, Reader] = {
-    "bind": ("bind", _address),
-    "port": ("port", lambda table, key: table.integer(key, minimum=0, maximum=65535)),
-    "workers": ("workers", lambda table, key: table.integer(key, minimum=1, maximum=256)),
-    "behind_proxy": ("behind_proxy", Table.boolean),
-    "lockstep": ("lockstep", Table.boolean),
-    "proofs_per_minute": ("proofs_per_minute", _not_negative),
-    "retention_days": ("retention_days", _days),
-    "rate_limit_per_s": ("rate_limit_per_s", _positive),
-    "rate_burst": ("rate_burst", _positive),
-    "max_body_bytes": (
-        "max_body_bytes",
-        lambda table, key: table.integer(key, minimum=1024, maximum=MAX_BYTES),
-    ),
-    "body_timeout_s": ("body_timeout_s", _positive),
-    "long_polls": ("long_polls", _count),
-    "queue": ("queue", _count),
-    "speed": ("speed", _positive),
-    "future_slack_s": ("future_slack_s", _not_negative),
-    "job_timeout_s": ("job_timeout_s", _positive),
-    "log_level": ("log_level", lambda table, key: table.text(key, choices=LOG_LEVELS)),
-}
-
-
-def service(table: Table, folder: Path, environment: Mapping[str, str] = os.environ) -> ServiceConfig:
+def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os.environ) -> ServiceConfig:
     """[service]; paths are relative to `folder`.
 
     Raises
@@ -175,24 +177,16 @@ def service(table: Table, folder: Path, environment: Mapping[str, str] = os.envi
     InvalidInput
         A key is unknown, a value is not allowed, a file that it names cannot be read, or is readable by others.
     """
-    paths = given(table, {key: (key, partial(_file, folder)) for key in ("tls_certificate", "tls_key")})
-    paths |= given(table, {"tokens": ("tokens", lambda table, key: folder / table.text(key))})
-    values = {**given(table, PLAIN), **paths, **_store(table, folder, environment)}
+    mqtt = None
     if "mqtt" in table.values:
-        values["mqtt"] = part(table, "mqtt", lambda inner: mqtt(inner, folder, environment))
+        mqtt = read_inner(table, "mqtt", lambda inner: read(inner, mqtt_table, folder, environment=environment))
     table.known("mqtt")
-    with named(table):
-        return ServiceConfig(**values)
+    store, password = _store(table, folder, environment)
+    service: ServiceConfig = read(table, ServiceConfig, folder, store=store, store_password=password, mqtt=mqtt)
+    return service
 
 
-def _file(folder: Path, table: Table, key: str) -> Path:
-    path = folder / table.text(key)
-    if not path.is_file():
-        raise table.invalid(key, f"the path of a file, relative to {folder}")
-    return path
-
-
-def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> dict[str, str | None]:
+def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[str, str | None]:
     """URL and password of the store; a relative path of SQLite lies in `folder`."""
     url = table.text("store", ServiceConfig.store)
     file = table.text("store_password_file", None)
@@ -205,7 +199,7 @@ def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> dict[s
             f"environment variable {PASSWORD}"
         )
     password = environment.get(PASSWORD) if file is None else read_secret(folder / file)
-    return {"store": sqlite_in(url, folder), "store_password": password}
+    return sqlite_in(url, folder), password
 
 
 def sqlite_in(url: str, folder: Path) -> str:

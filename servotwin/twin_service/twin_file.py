@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from servotwin.config.table import part, read_toml
+from servotwin.config.table import read_inner, read_toml
 from servotwin.errors import InvalidInput
-from servotwin.twin.fleet import Fleet
-from servotwin.twin_service.config import ServiceConfig, service
+from servotwin.twin.models import ModelRegistry
+from servotwin.twin_service.config import ServiceConfig, read_service
 from servotwin.twin_service.worker import WorkerStart
 
 
@@ -20,14 +20,14 @@ class TwinFile:
     ----------
     path : Path
     service : ServiceConfig
-    fleet : Fleet
+    fleet : ModelRegistry
     text : str
         Of the file: workers read it once more.
     """
 
     path: Path
     service: ServiceConfig
-    fleet: Fleet
+    fleet: ModelRegistry
     text: str
 
     @property
@@ -46,8 +46,8 @@ def read_twin(path: Path) -> TwinFile:
     """
     table = read_toml(path)
     text, folder = path.read_text(encoding="utf-8"), path.parent
-    config = part(table, "service", lambda inner: service(inner, folder))
-    fleet = Fleet.read(table, folder)
+    config = read_inner(table, "service", lambda inner: read_service(inner, folder))
+    fleet = ModelRegistry.read(table, folder)
     table.done()
     return TwinFile(path, config, fleet, text)
 
@@ -56,6 +56,6 @@ def service_of(path: Path) -> ServiceConfig:
     """[service] alone, for what needs no models: quick."""
     table = read_toml(path)
     try:
-        return part(table, "service", lambda inner: service(inner, path.parent))
+        return read_inner(table, "service", lambda inner: read_service(inner, path.parent))
     except OSError as error:
         raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None

@@ -14,7 +14,7 @@ from servotwin.runtime.child_process import ChildProcess
 from servotwin.runtime.frames import receive_frame
 from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease
-from servotwin.twin_service import config, mqtt_config
+from servotwin.twin_service import config
 from servotwin.twin_service.worker import LeaseResult, WorkerJob, WorkerStart, decode_result, encode_frame
 
 log = logging.getLogger(__name__)
@@ -181,6 +181,6 @@ class WorkerPool:
 
 def _environment() -> Mapping[str, str]:
     """Environment of a worker: the service's without its passwords."""
-    secrets = config.PASSWORD, mqtt_config.PASSWORD
+    secrets = config.PASSWORD, config.MQTT_PASSWORD
     passed = {key: value for key, value in os.environ.items() if key not in secrets}
     return {**passed, "OPENBLAS_NUM_THREADS": "1"}

@@ -209,7 +209,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
         (("FOLDER/run.npz", "--window", "nan"), "--window nan s"),
         (("FOLDER/run.npz", "--window", "90"), "give --start and --duration"),
         (("FOLDER/run.npz", "--pre-trigger", "1"), "--pre-trigger 1.0 s"),
-        (("FOLDER/run.npz", "--method", "best"), "'best' does not exist"),
+        (("FOLDER/run.npz", "--method", "best"), "'best': must be one of whitened, paper"),
         (("FOLDER/run.npz", "--wear-deg", "3"), "belong together"),
         (("FOLDER/run.npz", "--wear-deg", "-3", "--wear-over-s", "4"), "greater than 0"),
         (("FOLDER/run.npz", "--gap-limit-deg", "nan"), "--gap-limit-deg nan"),

@@ -13,13 +13,12 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
-from servotwin.edge_process.config_file import edge_toml, load, read
+from servotwin.edge_process.config_file import edge_toml, load, read_config
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Setting
 from servotwin.runtime.retry import Retry
@@ -40,7 +39,7 @@ filter_time_s = 0.1
 
 
 def again(config: EdgeConfig) -> EdgeConfig:
-    return read(parse_toml(edge_toml(config), "edge.toml"))
+    return read_config(parse_toml(edge_toml(config), "edge.toml"))
 
 
 @pytest.mark.parametrize("preset", ["fig15-sampled", "fig16", "calm", "certified"])
@@ -97,14 +96,22 @@ def test_a_short_file_is_enough(tmp_path: Path) -> None:
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'ftp://x'", "url = 'ftp://x' is not allowed"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'http://x'", "token in clear to another machine"),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[twin]\nurl = 'https://x'", "token_file or token_env is needed"),
-        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[keep]\nwindows = 0", "outbox windows = 0"),
-        ("filter_time_s = 0.1", "filter_time_s = 0.1\n[sensor]\nhold_s = -1", "hold_s = -1.0 s"),
+        (
+            "filter_time_s = 0.1",
+            "filter_time_s = 0.1\n[keep]\nwindows = 0",
+            "keep.windows = 0 is not allowed; give an integer, at least 1",
+        ),
+        (
+            "filter_time_s = 0.1",
+            "filter_time_s = 0.1\n[sensor]\nhold_s = -1",
+            "sensor.hold_s = -1 is not allowed; give a number, at least 0",
+        ),
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[limits]\nmaximum_m = -1", "limits.maximum_m = -1"),
     ],
 )
 def test_what_is_wrong_is_refused_by_name(old: str, new: str, said: str) -> None:
     with pytest.raises(InvalidInput, match=said):
-        read(parse_toml(PLAIN.replace(old, new), "edge.toml"))
+        read_config(parse_toml(PLAIN.replace(old, new), "edge.toml"))
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost"])
@@ -119,8 +126,8 @@ def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
 def test_to_control_a_controller_is_needed() -> None:
     text = PLAIN[: PLAIN.index("[controller]")]
     with pytest.raises(InvalidInput, match=r"table \[controller\] is missing"):
-        read(parse_toml(text, "edge.toml"))
-    assert read(parse_toml(text.replace("control", "supervise"), "edge.toml")).controller is None
+        read_config(parse_toml(text, "edge.toml"))
+    assert read_config(parse_toml(text.replace("control", "supervise"), "edge.toml")).controller is None
 
 
 def test_a_token_is_read_from_a_private_file_or_the_environment(tmp_path: Path) -> None:

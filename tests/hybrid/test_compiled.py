@@ -88,3 +88,36 @@ def test_a_cache_that_has_no_place_is_a_sentence(monkeypatch):
     monkeypatch.setattr("numba.core.caching.FunctionCache.__init__", refused)
     with pytest.raises(InvalidInput, match="name one that may in the environment variable NUMBA_CACHE_DIR"):
         compiled(lambda x: x)
+
+
+RENAMED = """
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.hybrid.compiled import compiled
+
+
+class {name}(NamedTuple):
+    values: np.ndarray
+
+
+@compiled
+def first(pair):
+    return pair.values[0]
+
+
+print(first({name}(np.array([2.5]))))
+"""
+
+
+def test_a_cache_that_names_a_renamed_type_is_compiled_anew(tmp_path):
+    """As after an update of servotwin: the old cache lies beside the new code."""
+    outputs = []
+    for name in ("Before", "After", "After"):
+        (tmp_path / "renamed.py").write_text(RENAMED.format(name=name))
+        run = [sys.executable, "-c", "import renamed"]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+        outputs.append(subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout)
+    assert outputs == ["2.5\n"] * 3
+    assert list((tmp_path / "__pycache__").glob("renamed.first-*.nbi"))

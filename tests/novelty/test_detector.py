@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.config.table import parse_toml
-from servotwin.edge.cut import Cut
+from servotwin.config.toml import read, values_of
+from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
-from servotwin.novelty import settings_file as noveltyfile
 from servotwin.novelty.detector import (
     CUSUM,
     FIRST,
@@ -37,7 +37,7 @@ from servotwin.novelty.detector import (
     start,
 )
 from servotwin.novelty.score import model_of
-from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.novelty.settings import NoveltyRules, NoveltySettings, model_table
 from servotwin.plant.servo import Servo
 
 RATE = 5000.0
@@ -181,34 +181,34 @@ def test_nothing_that_a_sensor_gives_stops_the_judge(steps: list[tuple[float, fl
 def test_rules_and_model_are_read_back_bit_for_bit() -> None:
     rules = NoveltyRules(math.radians(0.02), 0.01, 4.0, 0.4, 6.0, look_s=math.inf, learn=3)
     described = NoveltySettings(MODEL, rules, 0.1)
-    written = noveltyfile.written(described)
+    written = values_of(described)
     inner = written.pop("model")
     lines = [*(f"{key} = {value!r}" for key, value in written.items()), "[model]"]
     text = "\n".join([*lines, *(f"{key} = {value!r}" for key, value in inner.items())])
     table = parse_toml(text, "edge.toml")
-    assert noveltyfile.settings(table) == described
+    assert read(table, NoveltySettings) == described
     table.done()
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("score_limit = -1", "novelty score_limit"),
+        ("score_limit = -1", "score_limit = -1 is not allowed; give a positive number"),
         ("worth_deg = 'a'", "worth_deg"),
         ("learn = 1.5", "learn"),
     ],
 )
 def test_rules_in_toml_are_refused_by_name(text: str, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
-        noveltyfile.rules(parse_toml(text, "scenario.toml"))
+        read(parse_toml(text, "scenario.toml"), NoveltyRules)
 
 
 def test_a_model_in_toml_has_as_many_numbers_everywhere() -> None:
-    inner = noveltyfile.written(SETTINGS)["model"]
+    inner = values_of(SETTINGS)["model"]
     inner["gain_imag"] = inner["gain_imag"][:1]
     text = "\n".join(f"{key} = {value!r}" for key, value in inner.items())
     with pytest.raises(InvalidInput, match="gain_imag"):
-        noveltyfile.model(parse_toml(text, "edge.toml"))
+        read(parse_toml(text, "edge.toml"), model_table)
 
 
 def test_settings_need_no_numbers_library_and_the_check_names_what_is_missing() -> None:
@@ -216,7 +216,7 @@ def test_settings_need_no_numbers_library_and_the_check_names_what_is_missing() 
         "import sys\n"
         "sys.modules.update(dict.fromkeys(('numpy', 'scipy', 'numba')))\n"
         "from servotwin.errors import InvalidInput\n"
-        "from servotwin.novelty import settings, settings_file\n"
+        "from servotwin.novelty import settings\n"
         "model = settings.NoveltyModel(500.0, (settings.ResponseMode(0.9 + 0j, 1j),), 0.0, 1e-3, 0.1)\n"
         "try:\n"
         "    settings.NoveltySettings(model).check(500.0)\n"

@@ -80,7 +80,7 @@ def test_seeds_and_scale() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Noise(-1.0), "noise std = -1.0 m: must be finite and 0 or more"),
+        (lambda: Noise(-1.0), "noise std = -1.0 m: must be a number, at least 0, finite"),
         (lambda: Noise(math.nan), "noise std = nan m"),
         (lambda: Noise(1.0, (50.0, 10.0)), r"noise band = \(50.0, 10.0\) Hz: must be 0 < stop < pass"),
         (lambda: Noise(1.0, (0.0, 10.0)), "noise band"),

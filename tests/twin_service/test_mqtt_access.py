@@ -19,7 +19,7 @@ from servotwin.link.mqtt import MqttTransport
 from servotwin.link.transport import Unreachable
 from servotwin.store.store import Store, open_store
 from servotwin.twin_service.auth import write_private
-from servotwin.twin_service.config import service as read_service
+from servotwin.twin_service.config import read_service
 
 
 @pytest.fixture

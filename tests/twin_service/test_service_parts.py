@@ -18,7 +18,7 @@ from servotwin.link.seal import verifier_of
 from servotwin.messages import Refusal
 from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
-from servotwin.twin_service.config import PASSWORD, ServiceConfig, service
+from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
 from servotwin.twin_service.limits import (
     STATUS,
     BodyReader,
@@ -285,7 +285,7 @@ def test_a_file_of_tokens_that_is_wrong_is_one_sentence_without_what_it_holds(tm
 
 
 def config(folder, values, environment=None):
-    return service(Table("twin.toml", values, "service"), folder, environment or {})
+    return read_service(Table("twin.toml", values, "service"), folder, environment or {})
 
 
 def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not_shown(tmp_path):

@@ -8,13 +8,13 @@ import pytest
 from servotwin.cli.audit import Source, audit
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
-from servotwin.twin_service import auth, mqtt_config, worker_pool
+from servotwin.twin_service import auth, worker_pool
 from servotwin.twin_service.auth import TokenFile, Verifiers, read_tokens, write_private, write_tokens
-from servotwin.twin_service.config import PASSWORD
+from servotwin.twin_service.config import MQTT_PASSWORD, PASSWORD
 
 
 def test_workers_do_not_see_what_the_service_keeps_to_itself(monkeypatch):
-    for name in (PASSWORD, mqtt_config.PASSWORD):
+    for name in (PASSWORD, MQTT_PASSWORD):
         monkeypatch.setenv(name, "hunter2")
     assert "hunter2" not in worker_pool._environment().values()
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from servotwin.config.table import Table
 from servotwin.drives.opcua.model import OBJECT
 from servotwin.errors import InvalidInput
 
@@ -60,41 +59,28 @@ class OpcUaSettings:
             )
 
 
-def of_table(table: Table, folder: Path) -> OpcUaSettings:
-    """From the table [drive]; paths are relative to `folder`.
+def read_password(file: str | None, variable: str | None, folder: Path) -> str | None:
+    """The password in a file of mode 0600, relative to `folder`, or in an environment variable.
 
     Raises
     ------
     InvalidInput
-        A value is not allowed, or a file with the password is readable by others.
+        There is none, or others may read the file.
     """
-    keys = ("certificate", "private_key", "server_certificate")
-    files = {key: folder / path for key in keys if (path := table.text(key, None)) is not None}
-    return OpcUaSettings(
-        table.text("url"),
-        table.text("node", OpcUaSettings.node),
-        table.text("user", None),
-        _password(table, folder),
-        **files,
-        poll_s=table.number("poll_s", OpcUaSettings.poll_s, positive=True),
-        silence_s=table.number("silence_s", OpcUaSettings.silence_s, positive=True),
-    )
-
-
-def _password(table: Table, folder: Path) -> str | None:
-    """From a file of mode 0600, or from an environment variable: never from the table itself."""
-    name, variable = table.text("password_file", None), table.text("password_env", None)
     if variable is not None:
         if variable not in os.environ:
-            raise table.invalid("password_env", "the name of an environment variable that is set")
+            raise InvalidInput(
+                f"password_env = {variable!r} is not allowed; give the name of an environment variable that is set"
+            )
         return os.environ[variable]
-    if name is None:
+    if file is None:
         return None
-    path = folder / name
+    path = folder / file
     try:
         mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
-        raise table.invalid("password_file", "a text file that can be read") from None
+        raise InvalidInput(f"password_file = {file!r} is not allowed; give a text file that can be read") from None
     if mode & 0o077:
-        raise table.invalid("password_file", "a file of mode 0600: this one is open to others")
+        allowed = "give a file of mode 0600: this one is open to others"
+        raise InvalidInput(f"password_file = {file!r} is not allowed; {allowed}")
     return text

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table, named, read_toml
+from servotwin.config.toml import read
 from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.diary import read_speed, read_state
@@ -15,53 +17,74 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
 
 
+@settings("machine")
 @dataclass(frozen=True)
 class MachineSettings:
-    """A machine and its drive.
+    """A simulated machine and its drive.
 
     Parameters
     ----------
     scenario : Scenario
         Its servo, reference, gap, disturbances and noise; in the role supervise also its controller and dead zone at
         the start.
-    role : str
-        "control": the voltage comes from the edge. "supervise": the machine's own controller runs.
     address : wire.Address
-    speed : float
-        Seconds of machine time per second; 0: in lock-step, no further than the edge asks for.
-    endless : bool
-        Whether it runs on after the scenario's `duration_s`, its gap as it then is.
-    watchdog : float
-        s of machine time without a voltage after which it is 0 V; control only.
-    slack : float
-        s by the clock by which the machine may be late, or wait for the edge, and catch up; what is beyond is given up:
-        the edge's tick counts as missed, the machine's time as lost.
-    block : float
-        s of machine time in one block where the reader does not say; supervise only.
-    kept : float
-        s of machine time for which samples wait to be read; supervise only.
-    state_file : Path, optional
-        Where it keeps how long it has run; a start goes on wearing from there, from rest and with its reference anew.
-    speed_file : Path, optional
-        Holds a number that goes before `speed`, at the start and whenever it becomes another.
     begin : float
         s of machine time before this run.
     """
 
     scenario: Scenario
-    role: str
+    role: Annotated[
+        str,
+        key(
+            choices=tuple(wire.ROLES),
+            help="control: the voltage comes from the edge; supervise: the machine's own controller runs.",
+        ),
+    ]
     address: wire.Address
-    speed: float = 1.0
-    endless: bool = True
-    watchdog: float = 0.1
-    slack: float = 0.25
-    block: float = 0.05
-    kept: float = 10.0
-    state_file: Path | None = None
-    speed_file: Path | None = None
+    speed: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            help="Seconds of machine time per second; 0: in lock-step, no further than the edge asks for.",
+        ),
+    ] = 1.0
+    endless: Annotated[bool, key(help="Run on after the scenario's duration_s, with its gap as it then is.")] = True
+    watchdog: Annotated[
+        float,
+        key("watchdog_s", minimum=0.0, help="Machine time without a voltage after which it is 0 V; control only."),
+    ] = 0.1
+    slack: Annotated[
+        float,
+        key(
+            "slack_s",
+            above=0.0,
+            help="Time by the clock by which the machine may be late, or wait for the edge, and catch up; beyond, the "
+            "edge's tick counts as missed, the machine's time as lost.",
+        ),
+    ] = 0.25
+    block: Annotated[
+        float,
+        key("block_s", above=0.0, help="Machine time in one block where the reader does not say; supervise only."),
+    ] = 0.05
+    kept: Annotated[
+        float,
+        key("keep_s", above=0.0, help="Machine time for which samples wait to be read; supervise only."),
+    ] = 10.0
+    state_file: Annotated[
+        Path | None,
+        key(
+            help="File that keeps how long the machine has run; a start goes on wearing from there, from rest and with "
+            "its reference anew."
+        ),
+    ] = None
+    speed_file: Annotated[
+        Path | None,
+        key(help="File with a number that goes before speed, at the start and whenever it becomes another."),
+    ] = None
     begin: float = 0.0
 
     def __post_init__(self) -> None:
+        check(self)
         rate, law = self.rate, self.scenario.law.sample_rate
         if law is None:
             raise InvalidInput("scenario controller sample rate: a machine needs one, in Hz; it has none")
@@ -84,21 +107,11 @@ class MachineSettings:
             The file or its scenario is missing or not allowed.
         """
         table, folder = read_toml(path), Path(path).parent
-        settings: dict[str, Any] = {
-            "scenario": _scenario(table, folder),
-            "role": table.text("role", choices=tuple(wire.ROLES)),
-            "address": _address(table, folder),
-            "speed": table.number("speed", cls.speed, minimum=0.0),
-            "endless": table.boolean("endless", cls.endless),
-            "watchdog": table.number("watchdog_s", cls.watchdog, minimum=0.0),
-            "slack": table.number("slack_s", cls.slack, positive=True),
-            "block": table.number("block_s", cls.block, positive=True),
-            "kept": table.number("keep_s", cls.kept, positive=True),
-            **{key: folder / table.text(key) for key in ("state_file", "speed_file") if key in table.values},
-        }
+        scenario, address = _scenario(table, folder), _address(table, folder)
+        machine: MachineSettings = read(table, cls, folder, scenario=scenario, address=address)
         table.done()
         with named(table):
-            return cls(**settings).resumed()
+            return machine.resumed()
 
     def resumed(self) -> MachineSettings:
         """As its files say: from where it was, at the speed that is asked for.
