@@ -17,8 +17,8 @@ from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.window import Window as NumericWindow
 from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, Window
-from servotwin.twin.policies import policy_of
-from servotwin.twin.store import MemoryStore
+from servotwin.redesign.registry import policy_of
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 
@@ -51,7 +51,8 @@ def deceived_twin(scenario: Scenario, gap: float) -> Twin:
 
     start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
     policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
-    return Twin(scenario.name, estimate, policy, MemoryStore(), scenario.twin, observer, start)
+    model = TwinModel(estimate, policy, scenario.twin, observer, start)
+    return Twin(scenario.name, model)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Update, Window, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin.settings import TriageSettings
 from servotwin.twin.state import TwinState
 from servotwin.twin.work import work
@@ -92,7 +92,7 @@ class Known(NamedTuple):
     version: int
 
 
-def commissioned(fleet: Fleet, servo: str, place: Place) -> Known:
+def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
     """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
     state, version = b"", 0
     learnt = (*place.first, *place.windows)[: SETTLED + 2]

@@ -80,13 +80,13 @@ def identify(request: Request) -> Identified:
     log = read_log(request.log)
     servo = _servo(request, log)
     windows = cut(log, request)
-    estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap, settings.trend)
+    estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap)
     estimates = []
     for window in windows:
         now = window.mid_time
-        estimates.append(estimator(window, wear.expect("log", now, now)))
-        wear.learn("log", estimates[-1], now)
-    limit, trend = settings.gap_limit, wear.trend
+        estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now)))
+        wear, _ = wear.update(settings.trend, "log", estimates[-1], now)
+    limit, trend = settings.gap_limit, wear.trend(settings.trend)
     until = None if limit is None or trend is None else trend.time_until(limit)
     return Identified(servo, windows, tuple(estimates), trend, until)
 

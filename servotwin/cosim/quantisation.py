@@ -8,8 +8,7 @@ from servotwin.cosim.loop import Loop
 from servotwin.estimation.window import Window as NumericWindow
 from servotwin.messages import Window
 from servotwin.simulation import Run
-from servotwin.twin.decode import decode_window
-from servotwin.twin.estimating import estimator_of
+from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.wear import Expectation
 
 

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Protocol
 
-from servotwin.edge.cut import Cut
 from servotwin.edge.packing import is_finite, pack
+from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput

@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from servotwin.edge.cut import Cut
 from servotwin.edge.parameters import Parameters
+from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame

@@ -20,8 +20,7 @@ from servotwin.estimation.window import Window
 from servotwin.plant.signals import as_pieces
 from servotwin.reproduction.measures import MeasuredStep
 from servotwin.reproduction.runs import BIPOLAR, PERIOD, RATE, Square, Trace
-from servotwin.twin.estimating import Estimator, estimator_of
-from servotwin.twin.known import known_gap
+from servotwin.twin.estimating import Estimator, estimator_of, known_gap
 from servotwin.twin.wear import Expectation
 
 PUBLISHED, OURS = paper.METHOD, whitened.METHOD

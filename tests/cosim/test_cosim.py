@@ -19,7 +19,7 @@ from servotwin.plant.signals import SquareWave
 from servotwin.reproduction import measures
 from servotwin.runtime.retry import Retry
 from servotwin.simulation import Simulation, simulate
-from servotwin.twin.known import known_gap
+from servotwin.twin.estimating import known_gap
 from servotwin.twin.settings import TwinSettings
 
 GAP = math.radians(10.0)

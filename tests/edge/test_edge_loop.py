@@ -6,7 +6,7 @@ from functools import partial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
@@ -77,7 +77,7 @@ class CarelessTwin:
 
     lifetime_s: float
     version: int = 1
-    said: list[Message] = field(default_factory=list)
+    updates: list[Message] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
@@ -86,11 +86,11 @@ class CarelessTwin:
         self.seen.add(message.sequence)
         self.version += message.sequence % 3 != 0
         base = max(0, self.version - 1 - message.sequence % 2)
-        self.said.append(make_update(self.version, base, message, self.lifetime_s))
-        return [Acknowledge(message.servo, message.boot, message.sequence), self.said[-1]]
+        self.updates.append(make_update(self.version, base, message, self.lifetime_s))
+        return [Acknowledge(message.servo, message.boot, message.sequence), self.updates[-1]]
 
     def repeat(self) -> list[Message]:
-        return self.said[-6:]
+        return self.updates[-6:]
 
 
 class Loop:
@@ -130,7 +130,7 @@ class Loop:
             self.history.append(self.agent.parameters)
             self.swaps.append((message.base_version, before.version))
 
-    def _up(self, sent: list[Outgoing]) -> None:
+    def _up(self, sent: list[OutgoingMessage]) -> None:
         for out in sent:
             if isinstance(out.message, Receipt):
                 self.receipts.append(out.message)
