@@ -12,7 +12,6 @@ import pytest
 from machines import machine, plant_file
 from test_opcua import server
 
-from servotwin.cli.simulate import Recording, writer
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.parameters import Parameters
@@ -20,6 +19,8 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.logs.formats import SignalTable
+from servotwin.logs.log import write_log
 from servotwin.messages import Setting, Window, unpack_channel
 
 RATE, WINDOW = 5000.0, 0.5
@@ -33,7 +34,7 @@ def replayed(folder: Path, _stack: ExitStack) -> dict[str, Any]:
     run = simulation.run()
     columns = {"time_s": run.time, "reference_m": run.reference, "theta_m_rad": run.theta_m, "voltage_v": run.voltage}
     columns["measured_position_m"] = run.measured_position
-    writer(folder / "run.csv")(Recording(columns, {}), folder / "run.csv")
+    write_log(SignalTable(columns, {}), folder / "run.csv")
     return {"kind": "replay", "log": "run.csv", "speed": 0.0}
 
 
