@@ -14,10 +14,10 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.cosim.scenario_file import Recording
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.table import SUPERVISED
+from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.settings_file import setting_table, start_table
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import update_gains_table
 from servotwin.estimation.gap import METHODS
