@@ -33,10 +33,15 @@ from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit"]
+__all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit", "shortest_window"]
 
 METHOD = "whitened"
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
+
+
+def shortest_window(_settings: WhitenedSettings, sample_rate: float) -> tuple[float, str]:
+    """Shortest window (s) at a sample rate (Hz), and the reason in words."""
+    return SHORTEST / sample_rate, f"method {METHOD!r}, which needs {SHORTEST} samples"
 
 
 def estimate(
