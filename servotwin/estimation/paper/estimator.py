@@ -83,7 +83,7 @@ def judge(residual: PlayResidual, found: Minimum, std: float, settings: PaperSet
 
 
 def _objection(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict | None:
-    """Why the minimum says nothing of the gap, if so."""
+    """Reason why the minimum does not show the gap; empty when it does."""
     if not found.converged:
         return _unknown(f"the minimisation did not converge: {found.message}")
     share = residual.unexplained(found.cost)
@@ -190,7 +190,7 @@ def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
 
 
 def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings) -> str:
-    """Why the motor's motion cannot show a gap; empty when it can."""
+    """Reason why the motor's motion cannot show a gap; empty when it can."""
     seen = motion(theta_m, sample_rate, settings.rest_speed)
     if seen.moving == 0.0:
         return f"the motor never moved faster than {settings.rest_speed:.3g} rad/s"

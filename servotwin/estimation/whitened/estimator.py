@@ -93,7 +93,7 @@ class WindowFit:
     aligned: AlignedFit | None
 
     def one_sided(self) -> str:
-        """Why the window cannot show the gap, whatever else is found: too little contact; empty: it has enough."""
+        """Reason why the window cannot show the gap, which is too little contact; empty when it has enough."""
         return "" if self.aligned is None else one_sided(_travel(self.aligned.found), self.settings)
 
     def rms(self) -> float:
@@ -167,7 +167,7 @@ def _left(found: WhitenedFit) -> float:
 
 
 def _travel(found: WhitenedFit) -> Travel:
-    """Of the screw, without the end of the window, to which the last mass cannot have answered."""
+    """Sum up the screw's motion without the end of the window, to which the last mass cannot have answered."""
     reduction, model = found.reduction, found.reduction.response
     kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
     middle = found.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - kept)
@@ -223,7 +223,7 @@ def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
 
 
 def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
-    """What is known without the window: the prior."""
+    """Make the estimate without the window: the prior."""
     blank = no_estimate(window.mid_time, model_version=servo.version, method=METHOD)
     if isinstance(prior, GapEstimate):
         return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)
