@@ -65,7 +65,21 @@ def _compile(function: _Function, **options: Any) -> _Function:
     dispatcher.stamp = stamp(function, dispatcher.options_key)
     # numba has no public way to set the stamp that its index file is compared with.
     dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
+    _forgive_renamed_types(dispatcher._cache._cache_file)
     return cast(_Function, dispatcher)
+
+
+def _forgive_renamed_types(cache_file: Any) -> None:
+    """Read an index that names a type which is gone as an empty one: the version before left it in the same folder."""
+    load_index = cache_file._load_index
+
+    def load() -> Any:
+        try:
+            return load_index()
+        except (AttributeError, ImportError):
+            return {}
+
+    cache_file._load_index = load
 
 
 def stamp(function: Any, options: str) -> str:

@@ -88,3 +88,28 @@ def test_a_cache_that_has_no_place_is_a_sentence(monkeypatch):
     monkeypatch.setattr("numba.core.caching.FunctionCache.__init__", refused)
     with pytest.raises(InvalidInput, match="name one that may in the environment variable NUMBA_CACHE_DIR"):
         compiled(lambda x: x)
+
+
+PAIR = """
+from typing import NamedTuple
+from servotwin.hybrid.compiled import compiled
+
+class {name}(NamedTuple):
+    a: float
+    b: float
+
+@compiled
+def total(pair):
+    return pair.a + pair.b
+
+print(total({name}(1.0, 2.0)))
+"""
+
+
+def test_a_cache_of_the_version_before_may_name_types_that_are_gone(tmp_path) -> None:
+    for name in ("Pair", "Couple"):
+        (tmp_path / "pairs.py").write_text(PAIR.format(name=name))
+        paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+        env = os.environ | {"PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run([sys.executable, "-c", "import pairs"], env=env, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (0, "3.0\n"), done.stderr
