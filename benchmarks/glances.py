@@ -15,11 +15,10 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.estimation.whitened.quick import quick_fit
-from servotwin.messages import Channel, checksum, decode, encode, pack_channel, pack_finely
-from servotwin.messages import Window as WindowMessage
+from servotwin.messages import Channel, WindowMessage, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.plant.noise import Noise
-from servotwin.twin.decode import decode_window
-from servotwin.twin.glance import Watch, glance
+from servotwin.twin.estimating import decode_window
+from servotwin.twin.triage import TriageState, glance
 
 NAME, SCHEMA = "triage", "servotwin-bench-triage/1"
 GAPS, QUICK = 160, 8
@@ -129,8 +128,8 @@ def _glance_time(case: Case, message: WindowMessage, usual: float) -> float:
     return 1e3 * (time.perf_counter() - begin)
 
 
-def _watch(gap: float, usual: float) -> Watch:
-    return Watch("", "b", 0, 0.0, gap, math.radians(KNOWN_DEG), misfit=usual)
+def _watch(gap: float, usual: float) -> TriageState:
+    return TriageState("", "b", 0, 0.0, gap, math.radians(KNOWN_DEG), misfit=usual)
 
 
 def _message(case: Case) -> WindowMessage:

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from servotwin.control.controller import Controller
-from servotwin.edge.cut import Cut
-from servotwin.edge.drive import Sample
+from servotwin.edge.drive import DriveSample
 from servotwin.edge.packing import CHANNELS, pack
-from servotwin.edge.recorder import as_floats
+from servotwin.edge.parameters import FallbackSet
+from servotwin.edge.recorder import Cut, as_floats
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
@@ -65,7 +64,7 @@ class PacedDrive:
     def close(self) -> None:
         """Nothing to let go of."""
 
-    def read(self) -> Sample | None:
+    def read(self) -> DriveSample | None:
         """Wait for the next instant."""
         now = time.perf_counter()
         if self._number > 0:
@@ -80,7 +79,9 @@ class PacedDrive:
         self.missed += late
         number = self._number + late
         self._number = number + 1
-        return None if number >= self._end else Sample(number, self._wanted(number), self._position, self._position)
+        return (
+            None if number >= self._end else DriveSample(number, self._wanted(number), self._position, self._position)
+        )
 
     def write(self, voltage: float) -> None:
         """A machine that follows its voltage."""

@@ -17,10 +17,10 @@ from servotwin.config.table import parse_toml
 from servotwin.messages import Hello, Setting, encode
 from servotwin.redesign.certified.lookup import Grid
 from servotwin.redesign.certified.lookup_file import build
+from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, MessageKind, WorkResult
 from servotwin.store.store import Store, open_store
-from servotwin.twin.fleet import Fleet, models_of
-from servotwin.twin.policies import certified
+from servotwin.twin.models import ModelRegistry, models_of
 from servotwin.twin.state import TwinState
 
 STORE, TABLE = "fleet.db", "axis.table"
@@ -104,18 +104,18 @@ def prove(folder: Path, scale: Scale) -> None:
     """Write the table of proofs that every twin of the bench looks up."""
     text = _text(scale, enabled=True)
     (model,) = models_of(parse_toml(text, "twin.toml"), folder, checked=False)
-    for _ in build(folder / TABLE, certified(model.servo, model.settings), GRID):
+    for _ in build(folder / TABLE, certified_policy(model.servo, model.settings), GRID):
         pass
 
 
-def write_file(folder: Path, scale: Scale, enabled: bool = True) -> Fleet:
+def write_file(folder: Path, scale: Scale, enabled: bool = True) -> ModelRegistry:
     """Write the twin's file, beside the table; the fleet that it says."""
     text = _text(scale, enabled)
     (folder / "twin.toml").write_text(text, encoding="utf-8")
-    return Fleet.loads(text, "twin.toml", folder)
+    return ModelRegistry.loads(text, "twin.toml", folder)
 
 
-def commission(folder: Path, fleet: Fleet, scale: Scale, places: Sequence[Place]) -> int:
+def commission(folder: Path, fleet: ModelRegistry, scale: Scale, places: Sequence[Place]) -> int:
     """A store in which every servo's twin knows it already; the version of the parameters that all run.
 
     One twin of each place learns; the others are told what it knows.
@@ -161,9 +161,9 @@ def _ages(scale: Scale, numbers: range) -> dict[str, int]:
 
 def _named(state: TwinState, servo: str, glances: int) -> bytes:
     """A twin's state as another servo's."""
-    assert state.watch is not None
-    watch = msgspec.structs.replace(state.watch, glances=glances)
-    return msgspec.msgpack.encode(msgspec.structs.replace(state, servo=servo, watch=watch))
+    assert state.triage is not None
+    triage = msgspec.structs.replace(state.triage, glances=glances)
+    return msgspec.msgpack.encode(msgspec.structs.replace(state, servo=servo, triage=triage))
 
 
 def _hello(servo: str, now: float) -> Incoming:

@@ -10,10 +10,10 @@ import msgspec
 
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Update, Window, decode, encode
+from servotwin.messages import Update, WindowMessage, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin.settings import TriageSettings
 from servotwin.twin.state import TwinState
 from servotwin.twin.work import work
@@ -45,8 +45,8 @@ class Place(NamedTuple):
     """
 
     gap: float
-    first: tuple[Window, ...]
-    windows: tuple[Window, ...]
+    first: tuple[WindowMessage, ...]
+    windows: tuple[WindowMessage, ...]
 
 
 def stock(places: int, windows: int, seed: int = 0) -> list[Place]:
@@ -71,7 +71,7 @@ def _place(number: int, windows: int, seed: int) -> Place:
     return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
 
 
-def readdressed(window: Window, servo: str, sequence: int, start: float, version: int) -> Window:
+def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, version: int) -> WindowMessage:
     """The same measurements as another servo's, at another time; the checksum is over the channels, and stays."""
     shift = start - window.start
     return msgspec.structs.replace(
@@ -92,7 +92,7 @@ class Known(NamedTuple):
     version: int
 
 
-def commissioned(fleet: Fleet, servo: str, place: Place) -> Known:
+def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
     """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
     state, version = b"", 0
     learnt = (*place.first, *place.windows)[: SETTLED + 2]

@@ -18,8 +18,8 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.twin.fleet import models_of
-from servotwin.twin.policies import certified
+from servotwin.redesign.registry import certified_policy
+from servotwin.twin.models import models_of
 from servotwin.twin.settings import TwinSettings
 
 
@@ -114,7 +114,7 @@ def _described(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]
 def _one(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> TableJob:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
-    return TableJob(name, certified(servo, settings), out or Path(settings.table or ""))
+    return TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
 
 
 def _verified(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:

@@ -14,7 +14,7 @@ from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
 from servotwin.messages.compression import decompress
 from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
-from servotwin.twin.fleet import Model
+from servotwin.twin.models import ServoModel
 from servotwin.twin.replay import Replayed, replay
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of
@@ -86,7 +86,7 @@ def tell(servo: str, config: Path, window: str | None, present: bool) -> bool:
     return not any(counts[bad] for bad in BAD)
 
 
-def replayed(store: Store, servo: str, model: Model | None, only: tuple[str, int] | None) -> Iterator[Again]:
+def replayed(store: Store, servo: str, model: ServoModel | None, only: tuple[str, int] | None) -> Iterator[Again]:
     """Each window of a servo, newest first."""
     before = None
     while links := store.audit(servo, limit=PAGE, window=only, before=before):
@@ -104,7 +104,7 @@ def summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
     return "\n".join(lines)
 
 
-def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: Model | None) -> Again:
+def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: ServoModel | None) -> Again:
     held = link.window
     name = f"{held.boot}/{held.sequence}"
     found = next((one for one in reversed(link.found) if one.kind == "estimate"), None)

@@ -11,15 +11,14 @@ from typing import NamedTuple
 
 from servotwin.control.gains import gains_of
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.dead_zones import HysteresisPolicy
-from servotwin.twin.policies import certified, policy_of
+from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.settings import TwinSettings
 
 PATIENCE = 1.0
@@ -56,7 +55,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     """
     if settings.policy not in ("certified", "hysteresis"):
         return None
-    policy = certified(servo, settings)
+    policy = certified_policy(servo, settings)
     proved = policy.fallback()
     gains, band = gains_of(proved.setting.controller), band_of(proved, noise)
     supervision = Supervision(FallbackSet(Setting(proved.setting.tolerance, gains, band), policy.horizon))

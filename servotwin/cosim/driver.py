@@ -21,7 +21,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
@@ -32,7 +32,8 @@ from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
 from servotwin.simulation.inputs import shifted
 from servotwin.twin.estimating import Estimator
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 
 Progress = Callable[[float], object]
@@ -125,9 +126,11 @@ class Cosimulation:
         self.machine = machine
         self.outbox = MemoryOutbox()
         self.agent = Agent(scenario.agent_settings(), self.outbox)
-        self.store = MemoryStore()
+        self.store = EvidenceLog()
         start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
-        self.twin = twin or Twin.of(scenario.name, scenario.model, self.store, scenario.twin, estimator, start)
+        self.twin = twin or Twin(
+            scenario.name, TwinModel.of(scenario.model, scenario.twin, start, estimator), self.store
+        )
         ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
         self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
         self.receipts: list[Receipt] = []
@@ -202,7 +205,7 @@ class Cosimulation:
         """The first sample at or after a time."""
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
-    def _send_up(self, outgoing: Outgoing) -> None:
+    def _send_up(self, outgoing: OutgoingMessage) -> None:
         if isinstance(outgoing.message, Receipt):
             self.receipts.append(outgoing.message)
         elif isinstance(outgoing.message, Fallback):

@@ -15,14 +15,13 @@ from typing import NamedTuple
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.edge.cut import TIMED, Cut
-from servotwin.edge.desk import Granted, decide
 from servotwin.edge.guard import Instant
 from servotwin.edge.outlet import LocalOutlet, Outlet
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
-from servotwin.edge.recorder import Floats, Recorder, as_floats
+from servotwin.edge.recorder import TIMED, Cut, Floats, Recorder, as_floats
+from servotwin.edge.requests import RequestState, decide
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
@@ -31,15 +30,15 @@ from servotwin.link.outbox import Outbox
 from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
 
 
-class Outgoing(NamedTuple):
-    """A message and the sample instant (samples absorbed so far) at which it leaves."""
+class OutgoingMessage(NamedTuple):
+    """A message, and the sample instant (samples absorbed so far) at which it is sent."""
 
     sample: int
     message: Message
 
 
-class Opened(NamedTuple):
-    """A window that is being recorded, samples first .. last - 1, and why."""
+class OpenWindow(NamedTuple):
+    """A window that is being recorded, samples first .. last - 1, and its reason."""
 
     first: int
     last: int
@@ -59,9 +58,9 @@ class Agent:
     outbox : Outbox, optional
         In memory by default.
     store : ParameterStore, optional
-        Of the last parameters that were proved; without one each boot begins as configured.
+        Of the last parameters that kept their band; without one each boot begins as configured.
     outlet : Outlet, optional
-        Where cut windows go; by default they are packed here and kept in `outbox`.
+        Takes the cut windows; by default they are packed here and kept in `outbox`.
     """
 
     def __init__(
@@ -78,16 +77,16 @@ class Agent:
         self._recorder = Recorder(tuple(CHANNELS), capacity)
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
-            self._supervisor.asked(0.0)
-        self._granted = Granted(settings.window_samples, settings.pre_trigger_samples)
+            self._supervisor.window_sent(0.0)
+        self._requests = RequestState(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
-        self._opened: Opened | None = None
+        self._opened: OpenWindow | None = None
         self._cut_at = 0
         self._deadline = self._next_deadline()
 
     @property
     def parameters(self) -> Parameters:
-        """In force from the next sample on."""
+        """Parameters in force from the next sample on."""
         return self._supervisor.parameters
 
     @property
@@ -99,17 +98,17 @@ class Agent:
     @property
     def probe(self) -> ProbingMove | None:
         """The probing move under way."""
-        return self._granted.probe
+        return self._requests.probe
 
     @property
     def offset(self) -> float:
-        """m, what the reference of the next sample is to be beside what is wanted."""
+        """Offset to be added to the reference of the next sample, m."""
         return 0.0 if self.probe is None else self.probe.offset(self.samples)
 
     @property
     def shortest_wait(self) -> int:
         """Samples from a change of the reference to the end of its window."""
-        return self._granted.window - self._granted.pre_trigger
+        return self._requests.window - self._requests.pre_trigger
 
     @property
     def samples(self) -> int:
@@ -123,7 +122,7 @@ class Agent:
 
     @property
     def deadline(self) -> int | None:
-        """`samples` at which it will send something by itself if the reference rests; None: never."""
+        """`samples` at which it will send something by itself while the reference rests; None: never."""
         return None if self._deadline == inf else int(self._deadline)
 
     @property
@@ -131,19 +130,21 @@ class Agent:
         """Windows that will never be sent again without having been acknowledged, by reason."""
         return Counter(self.outlet.dropped)
 
-    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[Outgoing]:
-        """Take one sample (m, rad, m, V); returns what is to be sent now."""
+    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[OutgoingMessage]:
+        """Take one sample (m, rad, m, V); return what is to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
         if reference != self._expected:
             self._reference_changed(reference)
         return self._act() if self._recorder.samples >= self._deadline else []
 
-    def absorb_block(self, reference: Floats, theta_m: Floats, position: Floats, voltage: Floats) -> list[Outgoing]:
+    def absorb_block(
+        self, reference: Floats, theta_m: Floats, position: Floats, voltage: Floats
+    ) -> list[OutgoingMessage]:
         """Take equally long blocks of samples: the same effect as one by one."""
         blocks = [as_floats(block) for block in (reference, theta_m, position, voltage)]
         if len({len(block) for block in blocks}) != 1:
             raise InvalidInput(f"blocks of {[len(block) for block in blocks]} samples: must be equally long")
-        sent: list[Outgoing] = []
+        sent: list[OutgoingMessage] = []
         done = 0
         while done < len(blocks[0]):
             stop = self._stop(blocks[0], done)
@@ -155,86 +156,88 @@ class Agent:
             done = stop
         return sent
 
-    def receive(self, message: Message) -> list[Outgoing]:
-        """Take a message from the twin; returns what is to be sent now. Messages not meant for an edge are ignored."""
+    def receive(self, message: Message) -> list[OutgoingMessage]:
+        """Take a message from the twin; return what is to be sent now. Messages not meant for an edge are ignored."""
         if isinstance(message, Update):
-            said = self._supervisor.offer(message)
-            self._heard(message.servo)
-            return [Outgoing(self.samples, each) for each in said]
+            replies = self._supervisor.offer(message)
+            self._twin_answered(message.servo)
+            return [OutgoingMessage(self.samples, each) for each in replies]
         if isinstance(message, Request):
-            return self._requested(message)
+            return self._handle_request(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self.outlet.acknowledge(message)
-            self._heard(message.servo)
+            self._twin_answered(message.servo)
         return []
 
     def outlet_changed(self) -> None:
         """Take note that the outlet's unacknowledged windows have changed by themselves."""
         if self.outlet.unacknowledged:
-            self._supervisor.asked(self.time)
+            self._supervisor.window_sent(self.time)
         else:
-            self._supervisor.answered(self.time, more=False)
+            self._supervisor.twin_answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
-    def restore(self, former: Parameters) -> list[Outgoing]:
-        """The drive does not take what is in force, and runs on those; returns what is to be sent now."""
-        said = self._supervisor.restore(former)
+    def restore(self, former: Parameters) -> list[OutgoingMessage]:
+        """Put former parameters in force again, as the drive has refused the present ones; return messages."""
+        messages = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
-        return [Outgoing(self.samples, each) for each in said]
+        return [OutgoingMessage(self.samples, each) for each in messages]
 
     def hello(self) -> Hello:
-        """Who this is and what is in force: to be sent after a start or a reconnection."""
+        """Make the message that introduces the edge: send it after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller
         setting = Setting(p.setting.tolerance, None if law is None else gains_of(law))
         return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
-        """Where in a block the next thing may happen: its end, the deadline, just after a change of the reference."""
+        """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""
         stop = int(min(len(reference), done + self._deadline - self.samples))
         if self._opened is not None and self.probe is None:
             return stop
         last = self._expected
         return next((k + 1 for k in range(done, stop) if reference[k] != last), stop)
 
-    def _heard(self, servo: str) -> None:
-        """The twin said something."""
+    def _twin_answered(self, servo: str) -> None:
+        """Note an answer of the twin's."""
         if servo == self.settings.servo:
-            self._supervisor.answered(self.time, more=self.outlet.unacknowledged)
+            self._supervisor.twin_answered(self.time, more=self.outlet.unacknowledged)
         self._deadline = self._next_deadline()
 
-    def _requested(self, request: Request) -> list[Outgoing]:
+    def _handle_request(self, request: Request) -> list[OutgoingMessage]:
         """Decide about a request; a probing move begins with the next sample."""
         s, before = self.settings, self.probe
         here = Instant(s.servo, s.boot, self.samples, s.sample_rate)
-        self._granted, answer = decide(request, self._granted, s, here, self._calm())
+        self._requests, answer = decide(request, self._requests, s, here, self._at_rest())
         move = self.probe
         if move is not None and move is not before:
-            self._opened = Opened(max(0, move.first - self._granted.pre_trigger), move.last, "probe")
+            self._opened = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
             self._expected = self._reference + self.offset
-        self._heard(request.servo)
-        return [Outgoing(self.samples, answer)]
+        self._twin_answered(request.servo)
+        return [OutgoingMessage(self.samples, answer)]
 
-    def _calm(self) -> bool:
-        """Whether the reference rests and no window is being recorded."""
-        return self._opened is None and self._recorder.held("reference", self.settings.rest_samples) == self._reference
+    def _at_rest(self) -> bool:
+        """True where the reference rests and no window is being recorded."""
+        return (
+            self._opened is None and self._recorder.constant("reference", self.settings.rest_samples) == self._reference
+        )
 
     def _reference_changed(self, reference: float) -> None:
-        """The sample just absorbed brought a new reference; until the next one, what a probing move added is in it."""
+        """Note a new reference in the last sample, and abort a probing move; what that has added is in the sample."""
         self._reference = reference
         self._abort()
         if self._opened is None:
-            first = max(0, self.samples - 1 - self._granted.pre_trigger)
-            self._opened = Opened(first, first + self._granted.window, "reference")
+            first = max(0, self.samples - 1 - self._requests.pre_trigger)
+            self._opened = OpenWindow(first, first + self._requests.window, "reference")
             self._deadline = self._next_deadline()
 
     def _abort(self) -> None:
-        """No probing move, nor its window, any more."""
+        """End the probing move and its window."""
         if self.probe is not None:
-            self._granted = replace(self._granted, probe=None)
+            self._requests = replace(self._requests, probe=None)
             self._opened = None
         self._expected = self._reference
 
-    def _act(self) -> list[Outgoing]:
+    def _act(self) -> list[OutgoingMessage]:
         """Cut the window that is complete, and send what is due."""
         opened = self._opened
         if opened is not None and self.samples >= opened.last:
@@ -242,25 +245,25 @@ class Agent:
             self._abort()
             self._opened = None
         elif opened is None and self.samples >= self._timed:
-            self._cut(Opened(self.samples - self._granted.window, self.samples, TIMED))
-        sent = [Outgoing(self.samples, window) for window in self.outlet.due(self.time)]
-        said = self._supervisor.look()
-        if any(isinstance(each, Fallback) for each in said):
+            self._cut(OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
+        sent = [OutgoingMessage(self.samples, window) for window in self.outlet.due(self.time)]
+        messages = self._supervisor.check()
+        if any(isinstance(each, Fallback) for each in messages):
             self._abort()
         self._expected = self._reference + self.offset
         self._deadline = self._next_deadline()
-        return sent + [Outgoing(self.samples, each) for each in said]
+        return sent + [OutgoingMessage(self.samples, each) for each in messages]
 
-    def _cut(self, opened: Opened) -> None:
-        """Let a window go; what the twin then owes an answer to is the outlet's to know."""
+    def _cut(self, opened: OpenWindow) -> None:
+        """Cut a window and hand it to the outlet, which knows whether the twin then owes an answer."""
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
         self._cut_at = self.samples
-        self.outlet.offer(self._raw(opened, sequence), self.time)
+        self.outlet.offer(self._cut_samples(opened, sequence), self.time)
         if self.outlet.unacknowledged:
-            self._supervisor.asked(self.time)
+            self._supervisor.window_sent(self.time)
 
-    def _raw(self, opened: Opened, sequence: int) -> Cut:
-        """Samples, and what is in force."""
+    def _cut_samples(self, opened: OpenWindow, sequence: int) -> Cut:
+        """Copy the samples, and note the parameters in force."""
         p, signals = self.parameters, self._recorder.cut(opened.first, opened.last)
         basis = p.window[1] if p.window is not None and p.window[0] == self.settings.boot else None
         return Cut(opened.first, sequence, opened.reason, p.version, self._before(opened.first), signals, p.gap, basis)
@@ -268,7 +271,7 @@ class Agent:
     @property
     def _timed(self) -> float:
         """`samples` at which a window is cut if nothing else has led to one."""
-        return self._cut_at + max(self.settings.look_samples, self._granted.window)
+        return self._cut_at + max(self.settings.look_samples, self._requests.window)
 
     def _before(self, first: int) -> float:
         """The reference just before a sample, m."""
@@ -276,11 +279,11 @@ class Agent:
 
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
-        wanted = self._supervisor.next_look
-        wanted = min(wanted, self._timed if self._opened is None else self._opened.last)
+        deadline = self._supervisor.next_check
+        deadline = min(deadline, self._timed if self._opened is None else self._opened.last)
         if self.probe is not None:
-            wanted = min(wanted, self.probe.next_change(self.samples))
+            deadline = min(deadline, self.probe.next_change(self.samples))
         due = self.outlet.next_time
         if due is None:
-            return wanted
-        return min(wanted, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))
+            return deadline
+        return min(deadline, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))

@@ -1,4 +1,4 @@
-"""What stands between the edge and its machine: a drive, in one of two roles.
+"""Drive: the interface between the edge and its machine, in one of two roles.
 
 *Control*: the edge ticks the law. The drive paces: `read` waits for the next sample instant, `write` gives the voltage
 that is held until the one after it. *Supervise*: the drive has a controller of its own. `read` gives the samples since
@@ -27,7 +27,7 @@ class DriveRefused(Exception):
     """The drive does not take these parameters; it runs on with those it had."""
 
 
-class Sample(NamedTuple):
+class DriveSample(NamedTuple):
     """One sample instant, before its tick.
 
     Attributes
@@ -71,7 +71,7 @@ class Block(NamedTuple):
 
 
 class Drive(Protocol):
-    """What both roles have in common."""
+    """Interface that both roles have in common."""
 
     @property
     def rate(self) -> float:
@@ -96,7 +96,7 @@ class Drive(Protocol):
 class ControlDrive(Drive, Protocol):
     """A machine whose voltage the edge sets, tick by tick."""
 
-    def read(self) -> Sample | None:
+    def read(self) -> DriveSample | None:
         """Wait for the next sample instant; None: the run is over. Raises `DriveLost`."""
 
     def write(self, voltage: float) -> None:
@@ -108,11 +108,11 @@ class SupervisedDrive(Drive, Protocol):
 
     @property
     def can_move(self) -> bool:
-        """Whether it adds probing moves to its reference; where not, the agent's settings must allow none."""
+        """It adds probing moves to its reference; where not, the agent's settings must allow none."""
 
     @property
     def patient(self) -> bool:
-        """Whether samples wait until they are read, however long that takes."""
+        """Samples wait until they are read, however long that takes."""
 
     def read(self, most: int = 0) -> Block | None:
         """The next samples, at least one of them unless nothing came for a while; None: the run is over.

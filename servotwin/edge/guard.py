@@ -1,4 +1,4 @@
-"""Decides whether an update may be applied: a pure function, so that nothing unsafe depends on who calls it.
+"""Guard: decides whether an update may be applied. A pure function, so that nothing unsafe depends on its caller.
 
 Several updates may be in flight. Each names the version it replaces, and only one that replaces the version in force
 is applied (compare-and-swap); so of two made on the same base the first to arrive wins, and the other is refused.
@@ -20,7 +20,7 @@ from servotwin.messages import Gains, Reason, Receipt, Update
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """Which edge, and its next sample."""
+    """An edge (servo, boot) and its next sample, at `rate` Hz."""
 
     servo: str
     boot: str
@@ -33,12 +33,12 @@ class Instant:
         return self.sample / self.rate
 
 
-def repeats(update: Update, current: Parameters, here: Instant) -> bool:
-    """Whether an update is the one in force, once more."""
+def is_repeat(update: Update, current: Parameters, here: Instant) -> bool:
+    """True where an update is the one in force, sent again."""
     return update.version == current.version and update.window == current.window and update.servo == here.servo
 
 
-def applied(update: Update, current: Parameters, sample: int) -> Parameters:
+def updated_parameters(update: Update, current: Parameters, sample: int) -> Parameters:
     """Parameters in force from `sample` on; an update without gains leaves them."""
     gains = current.setting.gains if update.setting.gains is None else update.setting.gains
     setting = replace(update.setting, gains=gains)
@@ -46,7 +46,7 @@ def applied(update: Update, current: Parameters, sample: int) -> Parameters:
 
 
 def judge(update: Update, current: Parameters, limits: Limits, here: Instant, own: Gains | None = None) -> Reason:
-    """Why an update is refused, or `Reason.APPLIED`.
+    """Return the reason for which an update is refused, or `Reason.APPLIED`.
 
     Parameters
     ----------
@@ -89,6 +89,6 @@ def _judge_gains(gains: Gains, current: Parameters, limits: Limits, own: Gains, 
 
 
 def receipt(update: Update, reason: Reason, sample: int, current: Parameters, here: Instant) -> Receipt:
-    """What the twin is told: `current` is in force after the decision."""
-    done = reason is Reason.APPLIED
-    return Receipt(here.servo, update.version, done, sample, reason, current.version, here.boot)
+    """Make the receipt of a decision; `current` is in force after it."""
+    is_applied = reason is Reason.APPLIED
+    return Receipt(here.servo, update.version, is_applied, sample, reason, current.version, here.boot)

@@ -1,4 +1,4 @@
-"""What an update must respect: pure checks of tolerance and gains against what runs and what the servo is built for."""
+"""Limits of updates: pure checks of tolerance and gains against those in force and the servo's own."""
 
 from dataclasses import dataclass
 from math import inf
@@ -101,20 +101,20 @@ class Limits:
             raise InvalidInput(f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be in order")
 
     def allows_tolerance(self, tolerance: float) -> bool:
-        """Whether a tolerance (m) is in bounds."""
+        """True where a tolerance (m) is in bounds."""
         return self.minimum <= tolerance <= self.maximum
 
     def allows_tolerance_step(self, old: float, new: float, since: float) -> bool:
-        """Whether the tolerance (m) may change so far, `since` seconds after the last change."""
+        """True where the tolerance (m) may change so far, `since` seconds after the last change."""
         return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
 
     def allows_gains(self, gains: Gains, own: Gains) -> bool:
-        """Whether gains lie in the box around the servo's own."""
+        """True where gains lie in the box around the servo's own."""
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
-        """Whether gains may change so far, `since` seconds after the last change."""
+        """True where gains may change so far, `since` seconds after the last change."""
         factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
         if factor == inf:
             return True

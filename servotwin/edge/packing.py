@@ -1,22 +1,22 @@
-"""Cut samples become a window: int16 channels, the list of reference changes, a checksum."""
+"""Packing of cut samples into a window: int16 channels, the list of reference changes, a checksum."""
 
 from array import array
 from itertools import chain, pairwise
 
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.messages import Channel, Window, checksum, pack_channel, pack_finely
+from servotwin.messages import Channel, WindowMessage, checksum, pack_channel, pack_finely
 from servotwin.messages.checks import all_finite
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
-"""What is recorded, in this order, with units."""
+"""Recorded channels, in this order, with their units."""
 
 MAX_CHANGES = 256
 """Reference changes listed per window; the reference channel has them all."""
 
 
-def pack(cut: Cut, settings: AgentSettings) -> Window:
-    """The window that is sent.
+def pack(cut: Cut, settings: AgentSettings) -> WindowMessage:
+    """Pack a cut into the window that is sent.
 
     Raises
     ------
@@ -25,7 +25,7 @@ def pack(cut: Cut, settings: AgentSettings) -> Window:
     """
     packed = (_packed(name, values, settings.fine_angle) for name, values in cut.signals.items())
     channels = tuple(chain.from_iterable(packed))
-    return Window(
+    return WindowMessage(
         servo=settings.servo,
         boot=settings.boot,
         sequence=cut.sequence,
@@ -41,7 +41,7 @@ def pack(cut: Cut, settings: AgentSettings) -> Window:
 
 
 def is_finite(cut: Cut) -> bool:
-    """Whether no sample is missing: only then can anything be said of it, or it be sent."""
+    """True where no sample is missing: only then can a cut be filtered or sent."""
     return all(map(all_finite, cut.signals.values()))
 
 

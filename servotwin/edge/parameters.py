@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 from math import inf
+from typing import Annotated
 
+from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 
@@ -53,3 +55,38 @@ class Parameters:
             raise InvalidInput(f"tolerance in force = {self.setting.tolerance!r} m: must be finite and at least 0")
         if self.version < 0:
             raise InvalidInput(f"version in force = {self.version!r}: must be at least 0")
+
+
+@settings("fallback")
+@dataclass(frozen=True, slots=True)
+class FallbackSet:
+    """Setting that serves every gap in the servo's stated range, and when the edge falls back to it.
+
+    Parameters
+    ----------
+    setting : Setting
+        Gains None: the gains stay. The band is certified for the servo: no update may do worse in error and settling,
+        whatever it predicts.
+    """
+
+    setting: Setting
+    silence_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Time for which the twin may leave a window unanswered before the edge falls back; inf: for ever.",
+        ),
+    ] = inf
+    refuse_s: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            help="Time for which updates are refused after the first fallback, twice as long after each further one.",
+        ),
+    ] = 10.0
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not self.setting.has_valid_tolerance():
+            raise InvalidInput(f"fallback tolerance = {self.setting.tolerance!r} m: must be finite and at least 0")

@@ -23,7 +23,7 @@ class ProbeLimits:
 
 @dataclass(frozen=True, slots=True)
 class ProbingMove:
-    """What is added to the reference, sample by sample: away for `hold` samples, back for as many, `strokes` times.
+    """Offset added to the reference: `size` for `hold` samples, 0 for as many, `strokes` times.
 
     Parameters
     ----------

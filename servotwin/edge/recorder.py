@@ -1,15 +1,62 @@
-"""A ring buffer of named signals."""
+"""Ring buffer of named signals, and the windows that are cut from it."""
 
 from array import array
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
 
 Floats = Iterable[float]
 
+TIMED = "timed"
+"""Reason of a window that was cut because the filter's longest pause was over."""
+
+
+class Cut(NamedTuple):
+    """Window of recorded samples first .. last - 1 of one boot, before it is filtered or packed.
+
+    Attributes
+    ----------
+    first : int
+        Index of the first sample since the start of the edge.
+    sequence : int
+        Number of the window in this boot.
+    reason : str
+        For which it was cut.
+    parameter_version : int
+        In force when it was cut.
+    before : float
+        Reference just before the first sample, m.
+    signals : dict of str to array of double
+        Channel by channel, equally long: m, rad, m, V.
+    gap : float or None
+        rad, that the update in force was made for; None: none is in force, or it has none.
+    basis : int or None
+        Sequence of the window of this boot that this update was made from.
+    """
+
+    first: int
+    sequence: int
+    reason: str
+    parameter_version: int
+    before: float
+    signals: dict[str, "array[float]"]
+    gap: float | None = None
+    basis: int | None = None
+
+    @property
+    def samples(self) -> int:
+        """Samples per channel."""
+        return len(self.signals["reference"])
+
+    @property
+    def last(self) -> int:
+        """Index of the first sample after it."""
+        return self.first + self.samples
+
 
 class Recorder:
-    """Keeps the last `capacity` samples of each channel; samples are known by their index since the start.
+    """Ring buffer of the last `capacity` samples of each channel, numbered since the start.
 
     Parameters
     ----------
@@ -46,7 +93,7 @@ class Recorder:
         self.samples += count
 
     def cut(self, first: int, last: int) -> dict[str, "array[float]"]:
-        """Samples first ... last - 1 of every channel.
+        """Copy samples first ... last - 1 of every channel.
 
         Raises
         ------
@@ -57,8 +104,8 @@ class Recorder:
             raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
         return {name: self._read(ring, first, last) for name, ring in zip(self.names, self._rings, strict=True)}
 
-    def held(self, name: str, count: int) -> float | None:
-        """The value of a channel in all of the last `count` samples; None: it changed, or there are too few."""
+    def constant(self, name: str, count: int) -> float | None:
+        """Return the value of a channel in all of the last `count` samples; None: it changed, or there are too few."""
         if not 0 < count <= self.samples:
             return None
         values = set(self.cut(self.samples - count, self.samples)[name])
@@ -78,7 +125,7 @@ class Recorder:
 
 
 def as_floats(block: Floats) -> "array[float]":
-    """The block as an array of doubles; buffers of doubles (numpy's) are copied as a whole."""
+    """Convert a block to an array of doubles; buffers of doubles (numpy's) are copied as a whole."""
     if isinstance(block, array) and block.typecode == "d":
         return block
     try:

@@ -8,9 +8,8 @@ from typing import Annotated
 from servotwin.config.keys import check, key, settings
 from servotwin.control.controller import Controller
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput

@@ -9,9 +9,8 @@ from servotwin.config.keys import key
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, read, values_of
 from servotwin.control.gains import written_gains
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.messages import Band, Gains, Setting
 
 GainsReader = Callable[[Table], Gains | None]

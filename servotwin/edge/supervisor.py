@@ -1,6 +1,6 @@
-"""Which parameters are in force: joins the switch, the watch, the twin's silence and the store of what was proved.
+"""Supervisor of the parameters in force: it joins the switch, the watch, the twin's silence and the parameter store.
 
-It looks every `period` samples, at multiples of the period, and only when there is something to look for; so it decides
+It checks every `period` samples, at multiples of the period, and only when there is something to check; so it decides
 the same whether samples come one by one or in blocks.
 """
 
@@ -16,24 +16,23 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Recorder
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import ParameterStore
-from servotwin.edge.switch import Rules, Step, Switch
-from servotwin.edge.verdict import Verdict
-from servotwin.edge.watch import Watch
+from servotwin.edge.switch import Rules, Switch, Transition
+from servotwin.edge.watch import Violation, Watch
 from servotwin.messages import Cause, Fallback, Receipt, Update
 
-Said = tuple[Receipt | Fallback, ...]
+Messages = tuple[Receipt | Fallback, ...]
 
 
 class Supervisor:
-    """Decides about parameters; the agent tells it what happens.
+    """Decides about parameters; the agent reports what happens.
 
     Parameters
     ----------
     settings : AgentSettings
     recorder : Recorder
-        Where the agent puts its samples.
+        The agent's samples.
     store : ParameterStore, optional
-        What it holds goes before the configured parameters.
+        Its parameters replace the configured ones.
     """
 
     def __init__(self, settings: AgentSettings, recorder: Recorder, store: ParameterStore | None = None) -> None:
@@ -42,51 +41,56 @@ class Supervisor:
         self._state = Switch(self._first_parameters())
         self._fallback = settings.supervision.fallback
         self._watch = self._new_watch()
-        self._asked: float | None = None
+        self._unanswered_since: float | None = None
         self._saved = True
 
     @property
     def parameters(self) -> Parameters:
-        """In force from the next sample on."""
+        """Parameters in force from the next sample on."""
         return self._state.current
 
     @property
-    def next_look(self) -> float:
-        """Number of samples at which it looks next; inf: nothing to look for."""
+    def next_check(self) -> float:
+        """Number of samples at which it checks next; inf: nothing to check."""
         period, samples = self._settings.period_samples, self._recorder.samples
         next_one = (samples // period + 1) * period
-        if self._watching or self._state.waiting is not None:
+        if self._watching or self._state.pending is not None:
             return next_one
-        if self._asked is None or self._fallback is None or self._fallback.silence_s == inf or self.parameters.fallback:
+        if (
+            self._unanswered_since is None
+            or self._fallback is None
+            or self._fallback.silence_s == inf
+            or self.parameters.fallback
+        ):
             return inf
-        late = (self._asked + self._fallback.silence_s) * self._settings.sample_rate
+        late = (self._unanswered_since + self._fallback.silence_s) * self._settings.sample_rate
         return max(next_one, ceil(late / period - 1e-9) * period)
 
-    def offer(self, update: Update) -> Said:
+    def offer(self, update: Update) -> Messages:
         """Take an update from the twin."""
-        return self._take(switch.offer(self._state, update, self._rules, self._here, self._error))
+        return self._advance(switch.offer(self._state, update, self._rules, self._here, self._error))
 
-    def restore(self, former: Parameters) -> Said:
-        """The drive runs on those, as it does not take what is in force."""
-        return self._take(switch.restore(self._state, former, self._here))
+    def restore(self, former: Parameters) -> Messages:
+        """Put former parameters in force again: the drive has refused the present ones."""
+        return self._advance(switch.restore(self._state, former, self._here))
 
-    def asked(self, now: float) -> None:
-        """A window is on its way to the twin."""
-        self._asked = now if self._asked is None else self._asked
+    def window_sent(self, now: float) -> None:
+        """Note that a window is on its way to the twin."""
+        self._unanswered_since = now if self._unanswered_since is None else self._unanswered_since
 
-    def answered(self, now: float, more: bool) -> None:
-        """The twin was heard; whether windows still wait for its answer."""
-        self._asked = now if more else None
+    def twin_answered(self, now: float, more: bool) -> None:
+        """Note an answer of the twin's; `more` windows may still wait for theirs."""
+        self._unanswered_since = now if more else None
 
-    def look(self) -> Said:
-        """Decide on what is known, if this is one of the samples to look at."""
+    def check(self) -> Messages:
+        """Check the loop and the twin, if this is one of the samples at which to."""
         if self._recorder.samples % self._settings.period_samples != 0:
             return ()
-        verdict = self._verdict()
-        if verdict is not None and self._fallback is not None:
-            return self._take(switch.fall_back(self._state, self._fallback, verdict, self._here))
-        self._keep()
-        return self._take(switch.settle(self._state, self._rules, self._here, self._error))
+        violation = self._violation()
+        if violation is not None and self._fallback is not None:
+            return self._advance(switch.fall_back(self._state, self._fallback, violation, self._here))
+        self._store_verified()
+        return self._advance(switch.apply_pending(self._state, self._rules, self._here, self._error))
 
     @property
     def _watching(self) -> bool:
@@ -106,9 +110,9 @@ class Supervisor:
         return last["reference"][0] - last["position"][0]
 
     def _first_parameters(self) -> Parameters:
-        """As kept by the last boot, otherwise as configured."""
-        kept = None if self._store is None else self._store.load()
-        first = self._settings.parameters if kept is None else kept
+        """Parameters stored by the last boot, otherwise the configured ones."""
+        stored = None if self._store is None else self._store.load()
+        first = self._settings.parameters if stored is None else stored
         if first.setting.gains is None and self._settings.controller is not None:
             setting = msgspec.structs.replace(first.setting, gains=gains_of(self._settings.controller))
             return replace(first, setting=setting)
@@ -122,40 +126,42 @@ class Supervisor:
         watch.restart(self.parameters.setting.band, 0)
         return watch
 
-    def _take(self, step: Step) -> Said:
-        """Go on from a decision."""
-        before, self._state = self._state, step.state
+    def _advance(self, transition: Transition) -> Messages:
+        """Take over the state after a decision, and return its messages."""
+        before, self._state = self._state, transition.state
         if self._state.current is not before.current:
             self._saved = False
             if self._watch is not None:
                 self._watch.restart(self.parameters.setting.band, self.parameters.sample)
-            self._keep()
-        return step.said
+            self._store_verified()
+        return transition.messages
 
-    def _keep(self) -> None:
-        """Save the parameters in force once the loop has proved them; the fallback set is proved already."""
+    def _store_verified(self) -> None:
+        """Store the parameters in force once the loop has kept their band; the fallback set at once."""
         if self._store is None or self._saved:
             return
-        if not self._watching or (self._watch is not None and self._watch.proven):
+        if not self._watching or (self._watch is not None and self._watch.verified):
             self._store.save(self.parameters)
             self._saved = True
 
-    def _verdict(self) -> Verdict | None:
+    def _violation(self) -> Violation | None:
         """Evidence against the parameters in force; none against the fallback set, since nothing is left to do."""
         if self._fallback is None or self.parameters.fallback:
             return None
-        return self._seen() or self._silence()
+        return self._watch_loop() or self._silence()
 
-    def _seen(self) -> Verdict | None:
+    def _watch_loop(self) -> Violation | None:
         if self._watch is None:
             return None
         last = self._recorder.samples
         first = last - self._settings.period_samples
         part = self._recorder.cut(first, last)
-        return self._watch.see(first, part["reference"], part["position"], part["voltage"])
+        return self._watch.update(first, part["reference"], part["position"], part["voltage"])
 
-    def _silence(self) -> Verdict | None:
-        if self._fallback is None or self._asked is None:
+    def _silence(self) -> Violation | None:
+        if self._fallback is None or self._unanswered_since is None:
             return None
-        waited = self._here.time - self._asked
-        return Verdict(Cause.SILENCE, waited, self._fallback.silence_s) if waited >= self._fallback.silence_s else None
+        waited = self._here.time - self._unanswered_since
+        return (
+            Violation(Cause.SILENCE, waited, self._fallback.silence_s) if waited >= self._fallback.silence_s else None
+        )

@@ -1,25 +1,31 @@
-"""Watches the loop itself: does it still do what was predicted of the parameters in force?
+"""Watch of the control loop: it compares the loop with the prediction for the parameters in force.
 
 The error is watched at all times: while the loop may still follow its reference it may be as large as the reference
-moved and a little more, otherwise it stays within the band. Cycles and energies are evidence only while the reference
-rests and the loop had time to settle, since the last step of the reference and since the last change of parameters; in
-that time new parameters are held to what is certified, then to what is predicted of them. Samples are taken together in
-slots of 10 ms: the mean error of a slot keeps what the loop does and little of the sensor's noise, the sums of squares
-keep everything.
+moved and a little more, otherwise it stays within the band. Limit cycles and energies are evidence only while the
+reference rests and the loop had time to settle, since the last step of the reference and since the last change of
+parameters; in that time new parameters are compared with the certified band, then with the predicted one. Samples are
+taken together in slots of 10 ms: the mean error of a slot keeps the loop's motion and little of the sensor's noise, the
+sums of squares keep everything.
 """
 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from math import isfinite, sqrt
 from operator import mul, sub
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import check, key, settings
-from servotwin.edge.moves import Moves
-from servotwin.edge.turns import Turns
-from servotwin.edge.verdict import Verdict, judged_by
 from servotwin.messages import Band, Cause
+
+
+class Violation(NamedTuple):
+    """Evidence against the parameters in force: m, V or s, as the cause says."""
+
+    cause: Cause
+    measured: float
+    allowed: float
 
 
 @settings("watch")
@@ -66,7 +72,7 @@ class WatchSettings:
 
 
 class Watch:
-    """Takes samples, gives verdicts.
+    """Compares samples with the predicted and the certified band.
 
     Parameters
     ----------
@@ -76,7 +82,7 @@ class Watch:
     reference : float
         Before the first sample, m.
     certified : Band, optional
-        What the loop has to stay within at all times, whatever is predicted.
+        Band that the loop has to stay within at all times, whatever is predicted.
     """
 
     def __init__(
@@ -87,26 +93,26 @@ class Watch:
         self._certified = certified
         self._reference: float | None = None
         self._before = reference
-        self._moves = Moves()
+        self._moves = ReferenceMoves()
         self.restart(None, 0)
 
     @property
-    def proven(self) -> bool:
-        """Whether the parameters in force did for a whole window what was predicted of them."""
+    def verified(self) -> bool:
+        """The loop kept the predicted band for a whole window under the parameters in force."""
         return len(self._squares) == self._squares.maxlen
 
     def restart(self, predicted: Band | None, sample: int) -> None:
-        """Other parameters from a sample on: what was seen so far says nothing about them."""
-        self._band = judged_by(predicted, self._certified)
+        """Begin anew with other parameters, in force from a sample on."""
+        self._band = effective_band(predicted, self._certified)
         self._floor = max(self.settings.error_floor, 0.0 if self._band is None else sqrt(2.0) * self._band.error_rms)
-        self._proving = sample + self._settling
+        self._verify_from = sample + self._settling
         self._outside = 0
-        self._forget()
+        self._clear()
 
-    def see(
+    def update(
         self, first: int, reference: Sequence[float], position: Sequence[float], voltage: Sequence[float]
-    ) -> Verdict | None:
-        """Take whole slots of samples, the first of them number `first`; the evidence against the parameters, if any.
+    ) -> Violation | None:
+        """Take whole slots of samples, the first of them number `first`; return a violation, if any.
 
         Parameters
         ----------
@@ -114,37 +120,37 @@ class Watch:
             m, m, V; equally long.
         """
         errors = list(map(sub, reference, position))
-        found: Verdict | None = None
+        first_violation: Violation | None = None
         for start in range(0, len(errors), self.slot):
             part = slice(start, start + self.slot)
-            verdict = self._slot(first + start, reference[part], errors[part], voltage[part])
-            found = found or verdict
-        return found or self._energies()
+            violation = self._update_slot(first + start, reference[part], errors[part], voltage[part])
+            first_violation = first_violation or violation
+        return first_violation or self._check_energies()
 
     @property
     def _settling(self) -> int:
-        """In samples."""
+        """Settling time in samples."""
         return round((self.settings.settling_s if self._band is None else self._band.settling) * self.rate)
 
-    def _slot(
+    def _update_slot(
         self, sample: int, reference: Sequence[float], errors: Sequence[float], voltage: Sequence[float]
-    ) -> Verdict | None:
-        """One more slot, which begins with a sample."""
+    ) -> Violation | None:
+        """Take one more slot, which begins with a sample."""
         mean = sum(errors) / len(errors)
         if not isfinite(mean):
             return None
         self._note_moves(sample, reference, abs(errors[0]))
         if self._moves:
-            self._forget()
-        verdict = self._error(sample, abs(mean))
-        if verdict is not None or self._moves or sample < self._proving:
-            return verdict
+            self._clear()
+        violation = self._check_error(sample, abs(mean))
+        if violation is not None or self._moves or sample < self._verify_from:
+            return violation
         self._squares.append(sum(map(mul, errors, errors)) / len(errors))
         self._efforts.append(sum(map(mul, voltage, voltage)) / len(voltage))
-        return self._cycle(mean)
+        return self._check_cycle(mean)
 
     def _note_moves(self, sample: int, reference: Sequence[float], size: float) -> None:
-        """Keep what the reference did while the loop may still follow it; the first error counts as a step."""
+        """Note moves of the reference; the first error counts as a step."""
         until = sample + len(reference) + self._settling
         if self._reference is None:
             self._reference = self._before
@@ -155,15 +161,15 @@ class Watch:
             self._reference = reference[-1]
         self._moves.expire(sample)
 
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         window = max(1, round(self.settings.window_s * self.rate / self.slot))
         self._squares: deque[float] = deque(maxlen=window)
         self._efforts: deque[float] = deque(maxlen=window)
-        self._turns = Turns(self._floor, self.settings.swings)
+        self._turns = TurningPoints(self._floor, self.settings.swings)
 
-    def _error(self, sample: int, size: float) -> Verdict | None:
-        """Larger for too long than the band and the reference's moves allow?"""
-        band = self._certified if sample < self._proving else self._band
+    def _check_error(self, sample: int, size: float) -> Violation | None:
+        """Compare the error with the band and the reference's moves: it may be larger for a short time."""
+        band = self._certified if sample < self._verify_from else self._band
         if band is None:
             return None
         allowed = max(self.settings.margin * band.error, self.settings.error_floor)
@@ -171,18 +177,18 @@ class Watch:
             allowed += self.settings.overshoot * self._moves.travel
         self._outside = self._outside + 1 if size > allowed else 0
         long = self._outside * self.slot >= self.settings.persist_s * self.rate
-        return Verdict(Cause.ERROR, size, allowed) if long else None
+        return Violation(Cause.ERROR, size, allowed) if long else None
 
-    def _cycle(self, mean: float) -> Verdict | None:
-        """An oscillation that lasts?"""
+    def _check_cycle(self, mean: float) -> Violation | None:
+        """Look for an oscillation that lasts."""
         if not self._turns.add(mean):
             return None
         amplitude = self._turns.sustained(self._floor, self.settings.similarity)
-        return None if amplitude is None else Verdict(Cause.LIMIT_CYCLE, amplitude, self._floor)
+        return None if amplitude is None else Violation(Cause.LIMIT_CYCLE, amplitude, self._floor)
 
-    def _energies(self) -> Verdict | None:
-        """More error or effort than predicted over a whole window?"""
-        if self._band is None or not self.proven:
+    def _check_energies(self) -> Violation | None:
+        """Compare error and effort over a whole window with the prediction."""
+        if self._band is None or not self.verified:
             return None
         kinds = (
             (Cause.ERROR_ENERGY, self._squares, self._band.error_rms, self.settings.error_floor),
@@ -191,5 +197,115 @@ class Watch:
         for cause, squares, predicted, floor in kinds:
             measured, allowed = sqrt(sum(squares) / len(squares)), max(self.settings.margin * predicted, floor)
             if measured > allowed:
-                return Verdict(cause, measured, allowed)
+                return Violation(cause, measured, allowed)
         return None
+
+
+def effective_band(predicted: Band | None, certified: Band | None) -> Band | None:
+    """Band that the loop is compared with: error and settling are certified at worst, the effort is predicted.
+
+    A smaller error counts where the loop is predicted to come to it as soon as to what is certified.
+    """
+    if predicted is None or certified is None:
+        return predicted or certified
+    if predicted.settling > certified.settling:
+        return Band(certified.error, certified.error_rms, predicted.effort, certified.settling)
+    return Band(
+        min(predicted.error, certified.error),
+        min(predicted.error_rms, certified.error_rms),
+        predicted.effort,
+        predicted.settling,
+    )
+
+
+class Extreme(NamedTuple):
+    """A value (m), and the sample until which it counts."""
+
+    until: int
+    value: float
+
+
+class ReferenceMoves:
+    """Moves of the reference that the loop may still follow; they end in the order in which they were made."""
+
+    def __init__(self) -> None:
+        self._until = 0
+        self._lows: deque[Extreme] = deque()
+        self._highs: deque[Extreme] = deque()
+
+    def __bool__(self) -> bool:
+        """True while the loop may still follow a move."""
+        return bool(self._lows)
+
+    @property
+    def travel(self) -> float:
+        """Distance from the lowest to the highest reference, m; only while there is a move."""
+        return self._highs[0].value - self._lows[0].value
+
+    def add(self, until: int, low: float, high: float) -> None:
+        """Add a move between two references (m), which is followed until a sample."""
+        self._until = max(until, self._until) if self else until
+        while self._lows and self._lows[-1].value >= low:
+            self._lows.pop()
+        while self._highs and self._highs[-1].value <= high:
+            self._highs.pop()
+        self._lows.append(Extreme(self._until, low))
+        self._highs.append(Extreme(self._until, high))
+
+    def expire(self, sample: int) -> None:
+        """Forget moves that need not be followed any more."""
+        for extremes in (self._lows, self._highs):
+            while extremes and extremes[0].until <= sample:
+                extremes.popleft()
+
+
+class TurningPoints:
+    """Turning points of a signal, by their size: one counts when the signal has come back from it by more than
+    `reversal`.
+
+    Parameters
+    ----------
+    reversal : float
+        In the signal's unit.
+    swings : int
+        Swings, from turn to turn, that are kept.
+    """
+
+    def __init__(self, reversal: float, swings: int) -> None:
+        self._reversal, self._swings = reversal, swings
+        self._points: deque[tuple[int, float]] = deque(maxlen=swings + 1)
+        self._found = 0
+        self._place, self._direction = 0, 1.0
+        self._extreme: tuple[int, float] | None = None
+
+    def add(self, value: float) -> bool:
+        """Take the next value; True where it confirms a turn."""
+        self._place += 1
+        if self._extreme is None or self._direction * (value - self._extreme[1]) >= 0.0:
+            self._extreme = self._place, value
+            return False
+        if abs(value - self._extreme[1]) <= self._reversal:
+            return False
+        self._points.append(self._extreme)
+        self._found += 1
+        self._direction, self._extreme = -self._direction, (self._place, value)
+        return True
+
+    def sustained(self, smallest: float, similarity: float) -> float | None:
+        """Return the amplitude (half of the last swing) of an oscillation that does not die out; None: there is none.
+
+        Parameters
+        ----------
+        smallest : float
+            Amplitude that every swing reaches.
+        similarity : float
+            Factor by which a swing may be smaller than one before it, and half a period differ from another.
+        """
+        if self._found < self._swings + 2:  # the first point is where the record began, no turn
+            return None
+        pairs = list(pairwise(self._points))
+        sizes = [abs(after[1] - before[1]) for before, after in pairs]
+        times = [after[0] - before[0] for before, after in pairs]
+        lasting = all(size * similarity >= largest for size, largest in zip(sizes, accumulate(sizes, max), strict=True))
+        regular = max(times) <= similarity * min(times)
+        return 0.5 * sizes[-1] if lasting and regular and min(sizes) >= 2.0 * smallest else None

@@ -5,7 +5,7 @@ The agent's settings carry a `WindowFilterSettings`. The edge's core names no im
 
 from typing import Protocol
 
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 
 
 class WindowFilter(Protocol):

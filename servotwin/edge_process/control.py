@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isfinite
 
 from servotwin.control.law import LawParameters, LawState, start, tick, transfer
-from servotwin.edge.drive import ControlDrive, Sample
+from servotwin.edge.drive import ControlDrive, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process.edge import EdgeRuntime
 
@@ -99,7 +99,7 @@ class ControlRole:
         if self._drive.read() is not None:
             self._drive.write(self._safe)
 
-    def _tick(self, sample: Sample) -> None:
+    def _tick(self, sample: DriveSample) -> None:
         edge, agent = self._edge, self._edge.agent
         if isfinite(sample.reference):
             self._reference = sample.reference  # where there is none, the last one holds

@@ -11,7 +11,7 @@ from array import array
 import msgspec
 from msgspec import Struct
 
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.messages import InvalidMessage
 

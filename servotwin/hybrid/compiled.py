@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from types import CodeType
 from typing import Any, TypeVar, cast
 
@@ -64,22 +65,21 @@ def _compile(function: _Function, **options: Any) -> _Function:
     dispatcher.options_key = repr(sorted(sorted_options.items()))
     dispatcher.stamp = stamp(function, dispatcher.options_key)
     # numba has no public way to set the stamp that its index file is compared with.
-    dispatcher._cache._cache_file._source_stamp = dispatcher.stamp
-    _forgive_renamed_types(dispatcher._cache._cache_file)
+    index = dispatcher._cache._cache_file
+    index._source_stamp = dispatcher.stamp
+    index._load_index = partial(_load_index, index._load_index)
     return cast(_Function, dispatcher)
 
 
-def _forgive_renamed_types(cache_file: Any) -> None:
-    """Read an index that names a type which is gone as an empty one: the version before left it in the same folder."""
-    load_index = cache_file._load_index
+def _load_index(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
+    """Load numba's index of compiled versions; empty where it names a type that this version of servotwin has not.
 
-    def load() -> Any:
-        try:
-            return load_index()
-        except (AttributeError, ImportError):
-            return {}
-
-    cache_file._load_index = load
+    The index is a pickle of argument types, so that renaming a tuple of arguments made an old cache unreadable.
+    """
+    try:
+        return load()
+    except (AttributeError, ImportError):
+        return {}
 
 
 def stamp(function: Any, options: str) -> str:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec import Struct, structs
 
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
 from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, score

@@ -9,7 +9,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Gains, Setting
 
-UNASKED = nothing_known(float("nan"), "nobody looked")
+NOT_OBSERVED = nothing_known(float("nan"), "not observed")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Evidence:
     """
 
     estimate: GapEstimate
-    disturbance: Disturbance = UNASKED
+    disturbance: Disturbance = NOT_OBSERVED
     trend: Trend | None = None
     setting: Setting | None = None
     tuned_for: float | None = None

@@ -74,7 +74,7 @@ class Stage(StrEnum):
 
 
 @dataclass(frozen=True)
-class Seen:
+class WindowSummary:
     """What one window said, and what is known when it did.
 
     Attributes
@@ -99,8 +99,8 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Memory:
-    """What the policy remembers of one boot of the edge.
+class ExcitationState:
+    """State of the policy within one boot of the edge.
 
     Attributes
     ----------
@@ -116,11 +116,11 @@ class Memory:
     probing: Stage = Stage.OPEN
     probed: float = -math.inf
 
-    def rebooted(self) -> Memory:
+    def rebooted(self) -> ExcitationState:
         """What is left of it after a boot of the edge: its windows are as configured again."""
-        return Memory(probed=self.probed)
+        return ExcitationState(probed=self.probed)
 
-    def answered(self, ask: Ask, outcome: Outcome | None) -> Memory:
+    def answered(self, ask: Ask, outcome: Outcome | None) -> ExcitationState:
         """After the edge's last word on a request; None: it never said anything.
 
         What it does not allow is not asked for again.
@@ -134,7 +134,7 @@ class Memory:
 class Decision:
     """What to ask for, and why, or why nothing."""
 
-    memory: Memory
+    state: ExcitationState
     ask: Ask | None
     reason: str
 
@@ -153,59 +153,59 @@ class ExcitationPolicy:
     pitch: float
     settings: ExcitationSettings
 
-    def look(self, memory: Memory, seen: Seen) -> Decision:
+    def decide(self, state: ExcitationState, window: WindowSummary) -> Decision:
         """Decide after one more window."""
-        if seen.status not in _SILENT:
-            known = seen.status is GapStatus.OK
+        if window.status not in _SILENT:
+            known = window.status is GapStatus.OK
             why = "the window shows the gap" if known else "the window is at odds with the model, which no motion cures"
-            return Decision(replace(memory, misses=0), None, why)
-        memory = replace(memory, misses=memory.misses + 1)
-        if not seen.long and memory.window is not Stage.REFUSED:
-            return self._window(memory)
-        if memory.misses < self.settings.after:
-            return Decision(memory, None, self._missed(memory))
-        return self._probe(memory, seen)
+            return Decision(replace(state, misses=0), None, why)
+        state = replace(state, misses=state.misses + 1)
+        if not window.long and state.window is not Stage.REFUSED:
+            return self._window(state)
+        if state.misses < self.settings.after:
+            return Decision(state, None, self._missed(state))
+        return self._probe(state, window)
 
-    def needed(self, seen: Seen) -> float:
+    def needed(self, window: WindowSummary) -> float:
         """Size of a probing move, m: across the widest gap that is possible, and the margin beyond it.
 
         Settled, the screw follows the reference but for the dead zone, whatever the gap; that the loop crosses the gap
         within the hold takes an error of the gap's size.
         """
-        return seen.slack + self.pitch * (seen.upper + self.settings.margin)
+        return window.slack + self.pitch * (window.upper + self.settings.margin)
 
-    def _missed(self, memory: Memory) -> str:
-        several = f"{memory.misses} windows in a row tell" if memory.misses > 1 else "1 window tells"
-        enough = "" if memory.misses >= self.settings.after else f", {self.settings.after} are waited for"
-        refused = ", longer ones are refused" if memory.window is Stage.REFUSED else ""
+    def _missed(self, state: ExcitationState) -> str:
+        several = f"{state.misses} windows in a row tell" if state.misses > 1 else "1 window tells"
+        enough = "" if state.misses >= self.settings.after else f", {self.settings.after} are waited for"
+        refused = ", longer ones are refused" if state.window is Stage.REFUSED else ""
         return f"{several} too little of the gap{enough}{refused}"
 
-    def _window(self, memory: Memory) -> Decision:
+    def _window(self, state: ExcitationState) -> Decision:
         """Shorter windows than could be had: they count until longer ones are asked for, and not against those."""
         s = self.settings
-        if memory.window is not Stage.OPEN:
-            return Decision(replace(memory, misses=0), None, f"a longer window is {memory.window.value} already")
-        if memory.misses < s.after:
-            return Decision(memory, None, self._missed(memory))
-        why = f"{self._missed(memory)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
-        asked = replace(memory, misses=0, window=Stage.ASKED)
+        if state.window is not Stage.OPEN:
+            return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
+        if state.misses < s.after:
+            return Decision(state, None, self._missed(state))
+        why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
+        asked = replace(state, misses=0, window=Stage.ASKED)
         return Decision(asked, LongerWindow(s.window, s.pre_trigger), why)
 
-    def _probe(self, memory: Memory, seen: Seen) -> Decision:
-        s, needed = self.settings, self.needed(seen)
-        why_not = self._why_not(memory, seen, needed)
+    def _probe(self, state: ExcitationState, window: WindowSummary) -> Decision:
+        s, needed = self.settings, self.needed(window)
+        why_not = self._why_not(state, window, needed)
         if why_not:
-            return Decision(memory, None, f"{self._missed(memory)}, and {why_not}")
-        asked = replace(memory, misses=0, probing=Stage.ASKED, probed=seen.time)
-        why = f"{self._missed(memory)}: a move of {_mm(needed)} crosses a gap of {math.degrees(seen.upper):.3g} deg"
+            return Decision(state, None, f"{self._missed(state)}, and {why_not}")
+        asked = replace(state, misses=0, probing=Stage.ASKED, probed=window.time)
+        why = f"{self._missed(state)}: a move of {_mm(needed)} crosses a gap of {math.degrees(window.upper):.3g} deg"
         return Decision(asked, Probe(needed, s.hold, s.strokes), why)
 
-    def _why_not(self, memory: Memory, seen: Seen, needed: float) -> str:
+    def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
         """Why no probing move is asked for; empty where it may be."""
-        s, since = self.settings, seen.time - memory.probed
+        s, since = self.settings, window.time - state.probed
         if s.probe == 0.0:
             return "a probing move is not allowed"
-        if memory.probing is Stage.REFUSED:
+        if state.probing is Stage.REFUSED:
             return "this edge refuses probing moves"
         if since < s.interval:
             return f"the last probing move was asked for {since:.3g} s ago, where {s.interval:g} s must lie between two"

@@ -10,11 +10,11 @@ import numpy as np
 
 import servotwin as st
 from servotwin.errors import InvalidInput
+from servotwin.redesign.registry import policy_of
 from servotwin.reproduction.measures import DEFINITIONS as MEASURES
 from servotwin.reproduction.measures import TAIL, Array, between, tail
 from servotwin.reproduction.runs import Trace
 from servotwin.reproduction.twin_runs import NOISY, SAMPLED, SettingOrigin, TwinRun, run_twin
-from servotwin.twin.policies import policy_of
 from servotwin.twin.settings import TwinSettings
 
 POLICIES = ("paper", "margin", "hysteresis", "certified")

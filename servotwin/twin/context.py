@@ -27,7 +27,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup_file import spelled
 from servotwin.twin.settings import TwinSettings
 
-SOURCES = ("control", "hybrid", "identify", "messages", "plant", "redesign", "simulation", "twin")
+SOURCES = ("control", "estimation", "hybrid", "messages", "plant", "redesign", "simulation", "twin")
 """Packages that an estimate, or what is made of it, may depend on; each has a digest of its own."""
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
 _BLAS = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

@@ -1,10 +1,13 @@
-"""What a twin finds and does, as rows for the store: bodies in MessagePack, every double with all its bits."""
+"""Evidence of a twin: typed records as a step returns them, in memory, and as rows for the store.
+
+Bodies are MessagePack, every double with all its bits.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,7 +24,7 @@ from servotwin.messages import (
     Receipt,
     Request,
     Update,
-    Window,
+    WindowMessage,
     encode,
     finite,
 )
@@ -29,157 +32,258 @@ from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
-from servotwin.twin.decode import decode_channel
-from servotwin.twin.glance import Glance
-from servotwin.twin.lookups import Question
-from servotwin.twin.state import TrendState, restored_trend, trend_state
-from servotwin.twin.wear import Expectation
+from servotwin.twin.lookups import VerificationRequest
+from servotwin.twin.triage import Glance
+from servotwin.twin.wear import Expectation, TrendState
 
-LONGEST_STATUS = 300
-"""Characters; the rest is in the body."""
-_TAIL = 10  # the last one of so many parts of a window
+MAX_STATUS = 300
+"""Characters of a status; the rest is in the body."""
 
 
-class Prior(Struct, frozen=True):
-    """What was expected of a window: an `Expectation`, as plain numbers."""
+class GlanceRecord(NamedTuple):
+    """A glance at a window, all there is of one for which it was enough; `tail` as in `EvidenceRecord`."""
+
+    window: WindowMessage
+    glance: Glance
+    tail: float | None
+
+
+class GapEstimateRecord(NamedTuple):
+    """An estimate with what was expected before, so that it can be made again."""
+
+    window: WindowMessage
+    estimate: GapEstimate
+    expected: Expectation
+    tail: float | None
+
+
+class DisturbanceRecord(NamedTuple):
+    """Input bias and noise of a window."""
+
+    window: WindowMessage
+    disturbance: Disturbance
+
+
+class TrendRecord(NamedTuple):
+    """Gap and wear after a window; None before the first estimate."""
+
+    window: WindowMessage
+    trend: Trend | None
+
+
+class RedesignRecord(NamedTuple):
+    """A redesign, or why there is none."""
+
+    window: WindowMessage
+    redesign: Redesign
+
+
+class ExcitationRecord(NamedTuple):
+    """A decision to request a more informative window, or why not."""
+
+    window: WindowMessage
+    decision: Decision
+
+
+class VerificationRecord(NamedTuple):
+    """Result of verifying the setting that an update carries."""
+
+    request: VerificationRequest
+    result: Certificate | NotVerified
+
+
+class WithdrawalRecord(NamedTuple):
+    """A setting that is withdrawn, and why."""
+
+    request: VerificationRequest
+    why: str
+
+
+Record = (
+    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | RedesignRecord | ExcitationRecord
+    | VerificationRecord | WithdrawalRecord | VerificationRequest
+    | Update | Request | Receipt | Fallback | Answer | Hello
+)  # fmt: skip
+"""Evidence of one step; messages stand for themselves: an update or a request on its way, a receipt that came."""
+
+WindowId = tuple[str, str, int]
+"""(servo, boot, sequence) of a window."""
+
+
+@dataclass
+class EvidenceLog:
+    """Windows and evidence in memory, for simulation and tests."""
+
+    windows: dict[WindowId, WindowMessage] = field(default_factory=dict)
+    glances: dict[WindowId, Glance] = field(default_factory=dict)
+    estimates: dict[WindowId, GapEstimate] = field(default_factory=dict)
+    disturbances: dict[WindowId, Disturbance] = field(default_factory=dict)
+    trends: dict[WindowId, Trend | None] = field(default_factory=dict)
+    redesigns: dict[WindowId, Redesign] = field(default_factory=dict)
+    excitations: dict[WindowId, Decision] = field(default_factory=dict)
+    updates: list[Update] = field(default_factory=list)
+    requests: list[Request] = field(default_factory=list)
+    receipts: list[Receipt] = field(default_factory=list)
+    fallbacks: list[Fallback] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
+    hellos: list[Hello] = field(default_factory=list)
+    unverified: list[VerificationRequest] = field(default_factory=list)
+    verifications: list[VerificationRecord] = field(default_factory=list)
+    withdrawals: list[WithdrawalRecord] = field(default_factory=list)
+
+    def add_window(self, window: WindowMessage) -> bool:
+        """Store a window under its identity; False when it was there already."""
+        new = window.identity not in self.windows
+        self.windows.setdefault(window.identity, window)
+        return new
+
+    def add(self, records: Iterable[Record]) -> None:
+        """Store the evidence of a step."""
+        for record in records:
+            self._add(record)
+
+    def _add(self, record: Record) -> None:
+        match record:
+            case GlanceRecord(window, glance):
+                self.glances[window.identity] = glance
+            case GapEstimateRecord(window, estimate):
+                self.estimates[window.identity] = estimate
+            case DisturbanceRecord(window, disturbance):
+                self.disturbances[window.identity] = disturbance
+            case TrendRecord(window, trend):
+                self.trends[window.identity] = trend
+            case RedesignRecord(window, redesign):
+                self.redesigns[window.identity] = redesign
+            case ExcitationRecord(window, decision):
+                self.excitations[window.identity] = decision
+            case VerificationRecord():
+                self.verifications.append(record)
+            case WithdrawalRecord():
+                self.withdrawals.append(record)
+            case VerificationRequest():
+                self.unverified.append(record)
+            case Update():
+                self.updates.append(record)
+            case Request():
+                self.requests.append(record)
+            case Receipt():
+                self.receipts.append(record)
+            case Fallback():
+                self.fallbacks.append(record)
+            case Answer():
+                self.answers.append(record)
+            case Hello():
+                self.hellos.append(record)
+
+
+class StoredExpectation(Struct, frozen=True):
+    """An `Expectation` as plain numbers."""
 
     previous: float
     trend: TrendState | None
 
     @classmethod
-    def of(cls, expected: Expectation) -> Prior:
-        """That of an expectation."""
-        return cls(float(expected.previous), None if expected.trend is None else trend_state(expected.trend))
+    def of(cls, expected: Expectation) -> StoredExpectation:
+        """The numbers of an expectation."""
+        return cls(float(expected.previous), None if expected.trend is None else TrendState.of(expected.trend))
 
     def expectation(self, settings: TrendSettings) -> Expectation:
         """The expectation, bit for bit."""
-        return Expectation(self.previous, None if self.trend is None else restored_trend(self.trend, settings))
+        return Expectation(self.previous, None if self.trend is None else self.trend.trend(settings))
 
 
-class Estimated(Struct, frozen=True):
-    """Body of an estimate: what an estimator said of a window of `boot`, and what it was told before."""
+class StoredEstimate(Struct, frozen=True):
+    """Body of an estimate: the estimate of a window of `boot`, and the expectation before it."""
 
     estimate: msgspec.Raw
-    prior: Prior
+    prior: StoredExpectation
     boot: str
 
 
-class Rows:
-    """A twin's store that makes rows of what it is given, for one message after the other.
+def rows(records: Sequence[Record], message: int, context: str) -> list[EvidenceRecord]:
+    """Rows for the store.
 
     Parameters
     ----------
-    context : str
-        Key of what is computed under.
-
-    Attributes
-    ----------
+    records : sequence of Record
+        Verification requests among them are left out: they go to the queue.
     message : int
-        Id of the message that everything now follows from; 0: none.
-    found : list of EvidenceRecord
-    questions : list of Question
-        What is still to be proved.
+        Id of the message that led to them; 0: none.
+    context : str
+        Key of the context in which they were computed.
     """
-
-    def __init__(self, context: str) -> None:
-        self.context, self.message = context, 0
-        self.found: list[EvidenceRecord] = []
-        self.questions: list[Question] = []
-
-    def add_window(self, _window: Window) -> bool:
-        """It is in the store already, or it would not be here."""
-        return True
-
-    def add_glance(self, window: Window, glance: Glance) -> None:
-        """What a glance saw: all there is of a window of which it was enough."""
-        gap, std, version = finite(glance.gap), finite(glance.std), window.parameter_version
-        self._computed("glance", plain(glance), glance.why, version=version, gap=gap, std=std, tail=tail_of(window))
-
-    def add_estimate(self, window: Window, estimate: GapEstimate, expected: Expectation) -> None:
-        """With its prior, so that it can be made again."""
-        body = Estimated(msgspec.Raw(plain(estimate)), Prior.of(expected), window.boot)
-        self._computed(
-            "estimate",
-            plain(body),
-            estimate.status.value,
-            version=window.parameter_version,
-            gap=finite(estimate.gap),
-            std=finite(estimate.std_total),
-            tail=tail_of(window),
-        )
-
-    def add_disturbance(self, _window: Window, disturbance: Disturbance) -> None:
-        """Input bias and noise."""
-        self._computed("disturbance", plain(disturbance), "; ".join(disturbance.reasons))
-
-    def add_trend(self, _window: Window, trend: Trend | None) -> None:
-        """Gap and wear; nothing before there is a trend."""
-        if trend is not None:
-            state, reasons = plain(trend_state(trend)), "; ".join(trend.reasons)
-            self._computed("trend", state, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
-
-    def add_redesign(self, _window: Window, redesign: Redesign) -> None:
-        """What was made of a window, or why nothing."""
-        self._computed("redesign", plain(_parts(redesign)), redesign.reason, gap=finite(redesign.gap))
-
-    def add_excitation(self, _window: Window, decision: Decision) -> None:
-        """What was asked for, or why nothing."""
-        self._computed("excitation", plain(decision), decision.reason)
-
-    def add_update(self, update: Update) -> None:
-        """An update on its way."""
-        window = "{}/{}".format(*update.window)
-        values = {"version": update.version, "gap": update.gap, "std": update.std, "window": window}
-        self._computed("update", encode(update), update.status, **values)
-
-    def add_request(self, request: Request) -> None:
-        """A request on its way."""
-        self._message("request", request, request.reason)
-
-    def add_receipt(self, receipt: Receipt) -> None:
-        """What became of an update."""
-        self._message("receipt", receipt, receipt.reason.value, receipt.version)
-
-    def add_fallback(self, fallback: Fallback) -> None:
-        """What the edge left."""
-        self._message("fallback", fallback, fallback.cause.value, fallback.replaced)
-
-    def add_answer(self, answer: Answer) -> None:
-        """What became of a request."""
-        self._message("answer", answer, answer.outcome.value)
-
-    def add_question(self, question: Question) -> None:
-        """A proof that is still to come."""
-        self.questions.append(question)
-
-    def add_proof(self, question: Question, found: Certificate | NotVerified) -> None:
-        """What a proof showed of the setting that an update carries."""
-        shown = found if isinstance(found, Certificate) else found.best
-        body = {"question": question, "certificate": shown and _timeless(shown)}
-        self._of_update("proof", question, plain(body), "" if isinstance(found, Certificate) else found.reason)
-
-    def add_withdrawn(self, question: Question, why: str) -> None:
-        """What is taken back."""
-        self._of_update("withdrawn", question, plain({"version": question.version, "why": why}), why)
-
-    def add_hello(self, hello: Hello) -> None:
-        """A start of the edge."""
-        self._message("hello", hello, hello.boot, hello.parameter_version)
-
-    def _computed(self, kind: str, body: bytes, status: str, **values: Any) -> None:
-        self.found.append(
-            EvidenceRecord(kind, self.message, body, status=short(status), context=self.context, **values)
-        )
-
-    def _of_update(self, kind: str, question: Question, body: bytes, status: str) -> None:
-        self._computed(kind, body, status, version=question.version, window="{}/{}".format(*question.window))
-
-    def _message(self, kind: str, message: ParameterMessage, status: str, version: int | None = None) -> None:
-        self.found.append(EvidenceRecord(kind, self.message, encode(message), version=version, status=short(status)))
+    made = (_row(record) for record in records if not isinstance(record, VerificationRequest))
+    return [
+        row._replace(message=message, context="" if row.kind in _WITHOUT_CONTEXT else context)
+        for row in made
+        if row is not None
+    ]
 
 
-def failed(message: int, why: str, body: Mapping[str, Any] | None = None) -> EvidenceRecord:
-    """That nothing could be made of a message."""
+_WITHOUT_CONTEXT = ("request", "receipt", "fallback", "answer", "hello")
+"""Kinds that are not computed (the decision that led to a request has a row of its own)."""
+
+
+def _row(record: Record) -> EvidenceRecord | None:
+    """The row of a record, without message and context; None before there is a trend."""
+    match record:
+        case GlanceRecord(window, glance, tail):
+            made = _made("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
+            return made._replace(version=window.parameter_version)
+        case GapEstimateRecord(window, estimate, expected, tail):
+            body = StoredEstimate(msgspec.Raw(plain(estimate)), StoredExpectation.of(expected), window.boot)
+            gap, std = finite(estimate.gap), finite(estimate.std_total)
+            made = _made("estimate", body, estimate.status.value, gap=gap, std=std, tail=tail)
+            return made._replace(version=window.parameter_version)
+        case DisturbanceRecord(_, disturbance):
+            return _made("disturbance", disturbance, "; ".join(disturbance.reasons))
+        case TrendRecord(_, trend):
+            if trend is None:
+                return None
+            numbers, reasons = TrendState.of(trend), "; ".join(trend.reasons)
+            return _made("trend", numbers, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
+        case RedesignRecord(_, redesign):
+            return _made("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
+        case ExcitationRecord(_, decision):
+            return _made("excitation", decision, decision.reason)
+        case VerificationRecord(request, result):
+            shown = result if isinstance(result, Certificate) else result.best
+            body_of = {"question": request, "certificate": shown and _timeless(shown)}
+            reason = "" if isinstance(result, Certificate) else result.reason
+            return _made("proof", body_of, reason, **_of_update(request))
+        case WithdrawalRecord(request, why):
+            return _made("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
+        case Update():
+            window_key = "{}/{}".format(*record.window)
+            row = _sent("update", record, record.status, record.version)
+            return row._replace(gap=record.gap, std=record.std, window=window_key)
+        case Request():
+            return _sent("request", record, record.reason)
+        case Receipt():
+            return _sent("receipt", record, record.reason.value, record.version)
+        case Fallback():
+            return _sent("fallback", record, record.cause.value, record.replaced)
+        case Answer():
+            return _sent("answer", record, record.outcome.value)
+        case Hello():
+            return _sent("hello", record, record.boot, record.parameter_version)
+    raise TypeError(f"{type(record).__name__} is no evidence")
+
+
+def _made(kind: str, body: object, status: str, **values: Any) -> EvidenceRecord:
+    return EvidenceRecord(kind, 0, plain(body), status=short(status), **values)
+
+
+def _sent(kind: str, message: ParameterMessage, status: str, version: int | None = None) -> EvidenceRecord:
+    return EvidenceRecord(kind, 0, encode(message), version=version, status=short(status))
+
+
+def _of_update(request: VerificationRequest) -> dict[str, Any]:
+    return {"version": request.version, "window": "{}/{}".format(*request.window)}
+
+
+def failure_row(message: int, why: str, body: Mapping[str, Any] | None = None) -> EvidenceRecord:
+    """A row for a message of which nothing could be made."""
     said = {"failed": why, **(body or {})}
     return EvidenceRecord("estimate", message, plain(said), status=short(f"failed: {why}"))
 
@@ -191,31 +295,21 @@ def plain(value: object) -> bytes:
 
 def short(status: str) -> str:
     """A status that every database takes."""
-    return status.replace("\0", "")[:LONGEST_STATUS]
+    return status.replace("\0", "")[:MAX_STATUS]
 
 
-def tail_of(window: Window) -> float | None:
-    """The largest tracking error (m) in the last tenth of a window; None: it lacks one of the channels."""
-    position, reference = window.channel("position"), window.channel("reference")
-    if position is None or reference is None:
-        return None
-    last = 2 * -(-window.samples // _TAIL)
-    ends = (decode_channel(msgspec.structs.replace(each, data=each.data[-last:])) for each in (position, reference))
-    return finite(float(np.max(np.abs(np.subtract(*ends)))))
-
-
-def _parts(redesign: Redesign) -> dict[str, Any]:
-    """Of its certificate all but how long it took, so that equal twins keep equal evidence."""
-    parts = {field.name: getattr(redesign, field.name) for field in fields(redesign)}
+def _redesign_body(redesign: Redesign) -> dict[str, Any]:
+    """All of a redesign but how long its certificate took, so that equal twins store equal evidence."""
+    parts = {each.name: getattr(redesign, each.name) for each in fields(redesign)}
     return {**parts, "certificate": redesign.certificate and _timeless(redesign.certificate)}
 
 
 def _timeless(certificate: Certificate) -> dict[str, Any]:
-    return {field.name: getattr(certificate, field.name) for field in fields(certificate) if field.compare}
+    return {each.name: getattr(certificate, each.name) for each in fields(certificate) if each.compare}
 
 
 def _plain_value(value: object) -> object:
-    """What MessagePack knows of a number or an array of numpy's."""
+    """The value of a number or an array of numpy's that MessagePack knows."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
     raise TypeError(f"evidence holds {type(value).__name__}, which has no place in it")

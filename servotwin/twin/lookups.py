@@ -1,28 +1,28 @@
-"""What becomes of looked-up settings: each is proved for the exact evidence later, and withdrawn where that fails."""
+"""Settings looked up in a table: each is verified for the exact evidence later, and withdrawn where that fails.
+
+An optional part, pure.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass
 
 import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting, Update
-from servotwin.redesign.certified.certificate import NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.uncertainty import Region
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
 
-if TYPE_CHECKING:
-    from servotwin.twin.store import Store
 
-
-class Question(Struct, frozen=True, tag="proof/1"):
-    """A proof that a twin asks itself for.
+class VerificationRequest(Struct, frozen=True, tag="proof/1"):
+    """A verification that a twin requests of itself, through the service's queue.
 
     Attributes
     ----------
@@ -32,8 +32,9 @@ class Question(Struct, frozen=True, tag="proof/1"):
     window : (str, int)
         Boot and sequence of the one that it stands on.
     region : Region
-        What the setting is to hold for.
+        Range that the setting must serve.
     setting : Design
+        The controller that was looked up.
     """
 
     servo: str
@@ -42,97 +43,94 @@ class Question(Struct, frozen=True, tag="proof/1"):
     region: Region
     setting: Design
 
+    @classmethod
+    def of(cls, update: Update, redesign: Redesign) -> VerificationRequest | None:
+        """The verification that an update still needs; None: none."""
+        if redesign.to_verify is None:
+            return None
+        assert redesign.certificate is not None
+        return cls(update.servo, update.version, update.window, redesign.to_verify, redesign.certificate.setting)
 
-class Memory(Struct, frozen=True):
-    """What proofs have shown of the table, for one servo: a part of the twin's state.
+
+class LookupState(Struct, frozen=True):
+    """Slice of the twin's state.
 
     Attributes
     ----------
     why : str
         Why the fallback set goes out next; empty: nothing is withdrawn.
     misled : bool
-        Whether a proof has failed: then nothing is looked up any more, and everything proved before it is sent.
+        True once a verification has failed: then nothing is looked up any more, and every setting is verified before it
+        is sent.
     """
 
     why: str = ""
     misled: bool = False
 
 
+@dataclass(frozen=True)
 class Lookups:
-    """The policy with a table, of one servo.
+    """The table's policy with the memory of what failed.
 
     Parameters
     ----------
     policy : TablePolicy
-
-    Attributes
-    ----------
-    memory : Memory
     """
 
-    needs_estimate: ClassVar[bool] = False
+    policy: TablePolicy
 
-    def __init__(self, policy: TablePolicy) -> None:
-        self.policy, self.memory = policy, Memory()
+    def redesign(self, state: LookupState, evidence: Evidence) -> tuple[LookupState, Redesign]:
+        """A setting of the table; the fallback set once after a verification has failed, and none of the table then."""
+        if state.why:
+            redesign = self.policy.withdrawn(evidence, state.why)
+            return (state if redesign.setting is None else LookupState(misled=True)), redesign
+        return state, (self.policy.policy if state.misled else self.policy).redesign(evidence)
 
-    def redesign(self, evidence: Evidence) -> Redesign:
-        """A setting of the table; the fallback set once after a proof has failed, and proved settings from then on."""
-        if self.memory.why:
-            sent = self.policy.withdrawn(evidence, self.memory.why)
-            if sent.setting is not None:
-                self.memory = Memory(misled=True)
-            return sent
-        return (self.policy.policy if self.memory.misled else self.policy).redesign(evidence)
-
-    def settle(self, question: Question, running: Sequence[Setting | None], store: Store) -> str:
-        """Prove a setting for the evidence that it was sent on; why it is withdrawn, empty where it is not.
+    def verify(
+        self, state: LookupState, request: VerificationRequest, current: Sequence[Setting | None]
+    ) -> tuple[LookupState, Certificate | NotVerified, str]:
+        """Verify a setting for the evidence that it was sent on.
 
         Parameters
         ----------
-        question : Question
-        running : sequence of Setting or None
-            What is in force, or on its way: another setting is neither proved any more nor withdrawn.
-        store : Store
+        state : LookupState
+        request : VerificationRequest
+        current : sequence of Setting or None
+            In force, or pending: another setting is neither verified any more nor withdrawn.
+
+        Returns
+        -------
+        LookupState, Certificate or NotVerified, str
+            The last: why the setting is withdrawn; empty where it is not.
         """
-        wanted = question.setting.setting()
-        if not any(one is not None and wanted.same_loop(one) for one in running):
-            store.add_proof(question, NotVerified("not proved: another setting is in force by now"))
-            return ""
-        found = self.policy.policy.confirm(question.region, question.setting)
-        store.add_proof(question, found)
-        if not isinstance(found, NotVerified):
-            return ""
-        why = f"the proof of version {question.version} failed: {found.reason}"
-        self.memory = Memory(why, misled=True)
-        store.add_withdrawn(question, why)
-        return why
+        sent = request.setting.setting()
+        if not any(setting is not None and sent.same_loop(setting) for setting in current):
+            return state, NotVerified("not verified: another setting is in force by now"), ""
+        result = self.policy.policy.confirm(request.region, request.setting)
+        if not isinstance(result, NotVerified):
+            return state, result, ""
+        why = f"the verification of version {request.version} failed: {result.reason}"
+        return LookupState(why, misled=True), result, why
 
 
-def question_of(update: Update, redesign: Redesign) -> Question:
-    """What is to be proved of an update that was made of a redesign with a proof owed."""
-    assert redesign.to_verify is not None
-    assert redesign.certificate is not None
-    return Question(update.servo, update.version, update.window, redesign.to_verify, redesign.certificate.setting)
+def encode_request(request: VerificationRequest) -> bytes:
+    """Encode a request for the queue."""
+    return _encoder.encode(request)
 
 
-def encode_question(question: Question) -> bytes:
-    """Its bytes, for the queue."""
-    return _encoder.encode(question)
-
-
-def decode_question(data: bytes) -> Question:
-    """The question in these bytes.
+def decode_request(data: bytes) -> VerificationRequest:
+    """Decode a request from the queue.
 
     Raises
     ------
     InvalidInput
-        They hold none.
+        The bytes hold none.
     """
     try:
         return _decoder.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidInput(f"the proof that is asked for is not understood: {error}") from None
+        raise InvalidInput(f"the verification request is not understood: {error}") from None
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(Question)
+_decoder = msgspec.msgpack.Decoder(VerificationRequest)

@@ -9,11 +9,11 @@ import msgspec
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import InvalidMessage, Window
+from servotwin.messages import InvalidMessage, WindowMessage
 from servotwin.twin.context import context_of, described, differing, parts_of
-from servotwin.twin.estimating import estimate_from, estimator_of
-from servotwin.twin.evidence import Estimated, plain
-from servotwin.twin.fleet import Model
+from servotwin.twin.estimating import DecodedWindow, estimator_of
+from servotwin.twin.evidence import StoredEstimate, plain
+from servotwin.twin.models import ServoModel
 
 
 class Replayed(NamedTuple):
@@ -38,10 +38,10 @@ class Replayed(NamedTuple):
     changed: tuple[str, ...]
 
 
-_estimated = msgspec.msgpack.Decoder(Estimated)
+_estimated = msgspec.msgpack.Decoder(StoredEstimate)
 
 
-def replay(window: bytes, body: bytes, context: str, model: Model | None = None) -> Replayed:
+def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> Replayed:
     """Make an estimate again and compare.
 
     Parameters
@@ -52,7 +52,7 @@ def replay(window: bytes, body: bytes, context: str, model: Model | None = None)
         Of the estimate's evidence.
     context : str
         The JSON that the evidence names.
-    model : Model, optional
+    model : ServoModel, optional
         What to estimate with; None: model and settings as they were then.
 
     Raises
@@ -63,24 +63,25 @@ def replay(window: bytes, body: bytes, context: str, model: Model | None = None)
     message, stored, then = _window(window), _stored(body), parts_of(context)
     servo, settings = described(then) if model is None else (model.servo, model.settings)
     now = parts_of(context_of(servo, settings)[1])
-    estimate = estimate_from(message, estimator_of(servo, settings), stored.prior.expectation(settings.trend))
+    expected = stored.prior.expectation(settings.trend)
+    estimate = DecodedWindow.of(message).estimate(estimator_of(servo, settings), expected)
     again = plain(estimate)
     return Replayed(estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again))
 
 
-def _window(data: bytes) -> Window:
+def _window(data: bytes) -> WindowMessage:
     try:
         message = messages.decode(data)
     except InvalidMessage as error:
         raise InvalidInput(f"the stored window is not understood: {error}") from None
-    if not isinstance(message, Window):
+    if not isinstance(message, WindowMessage):
         raise InvalidInput(
             f"the stored message is a {type(message).__name__}, and only a window can be estimated again"
         )
     return message
 
 
-def _stored(body: bytes) -> Estimated:
+def _stored(body: bytes) -> StoredEstimate:
     try:
         return _estimated.decode(body)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:

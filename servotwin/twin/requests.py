@@ -1,160 +1,152 @@
-"""What a twin asks its edge for when windows tell too little: one request at a time, repeated until it is answered."""
+"""Requests for more informative windows: one at a time, repeated until it is answered. An optional part, pure."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from dataclasses import replace as changed
 
-import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import Answer, Outcome, Probe, Request, Setting, Window
+from servotwin.messages import Answer, Outcome, Probe, Request, Setting, WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.redesign.excitation import Decision, ExcitationPolicy, Memory, Seen, long_enough
+from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import Store
+from servotwin.twin.versions import Attempts
 
 
-@dataclass(frozen=True)
-class Insistence:
-    """How a twin insists.
+class RequestState(Struct, frozen=True):
+    """Slice of the twin's state.
 
     Attributes
     ----------
-    retry : float
-        s without an answer after which a request is sent again.
-    attempts : int
-        How often it is sent before it is given up.
-    validity : float
-        s after a window's first sample for which a request that stands on it may still be begun.
+    pending : Request or None
+        Sent, and not answered yet.
+    excitation : ExcitationState
+    boot : str
+        Of the edge.
+    serial : int
+        Highest given out in this boot.
+    attempts : Attempts
+        Of the pending request.
     """
 
-    retry: float = 5.0
-    attempts: int = 4
-    validity: float = 60.0
+    pending: Request | None = None
+    excitation: ExcitationState = ExcitationState()
+    boot: str = ""
+    serial: int = 0
+    attempts: Attempts = Attempts()
+
+    def not_after(self, now: float) -> RequestState:
+        """The same on a clock that was put back to `now` (s)."""
+        excitation = self.excitation
+        if excitation.probed > now:
+            excitation = changed(excitation, probed=now)
+        return replace(self, attempts=self.attempts.not_after(now), excitation=excitation)
+
+    def closed(self, outcome: Outcome | None) -> RequestState:
+        """With the pending request over; outcome None: the edge never answered."""
+        assert self.pending is not None
+        return replace(self, excitation=self.excitation.answered(self.pending.ask, outcome), pending=None)
 
 
+@dataclass(frozen=True)
 class Requests:
-    """Windows and answers in, requests out.
+    """Decides what to request after each window, and repeats it.
 
     Parameters
     ----------
-    servo : str
     policy : ExcitationPolicy
-    insistence : Insistence
+    retry : float
+        s without an answer after which a request is sent again.
+    attempts : int
+        Number of times a request is sent before it is given up.
+    validity : float
+        s after a window's first sample for which a request that stands on it may still be begun.
     widest : float
         rad: the gap is no wider than this.
     """
 
-    def __init__(self, servo: str, policy: ExcitationPolicy, insistence: Insistence, widest: float) -> None:
-        self.servo, self.policy, self.insistence, self.widest = servo, policy, insistence, widest
-        self.pending: Request | None = None
-        self.memory, self.boot, self.serial = Memory(), "", 0
-        self.sent_at, self.attempts = -math.inf, 0
+    policy: ExcitationPolicy
+    retry: float
+    attempts: int
+    validity: float
+    widest: float
 
-    def learn(self, window: Window, estimate: GapEstimate, widest: float, runs: Setting | None, now: float) -> Decision:
-        """Decide after a window; what is asked for is `pending` then.
+    @classmethod
+    def of(cls, servo: Servo, settings: TwinSettings) -> Requests | None:
+        """The part that a twin's settings describe; None: nothing is ever requested."""
+        if settings.excitation is None:
+            return None
+        policy = ExcitationPolicy(servo.p, settings.excitation)
+        return cls(policy, settings.retry, settings.attempts, settings.validity, settings.uncertainty.gap[1])
+
+    def decide(
+        self,
+        state: RequestState,
+        window: WindowMessage,
+        estimate: GapEstimate,
+        widest: float,
+        in_force: Setting | None,
+        now: float,
+    ) -> tuple[RequestState, Decision]:
+        """Decide after a window; a new request is pending, and counts as sent.
 
         Parameters
         ----------
-        window : Window
+        state : RequestState
+        window : WindowMessage
         estimate : GapEstimate
-            What it says of the gap.
+            Of its gap.
         widest : float
-            rad: what else bounds the gap from above.
-        runs : Setting or None
-            In force at the edge; None: not known.
+            rad: another upper bound of the gap.
+        in_force : Setting or None
         now : float
             s.
         """
-        if window.boot != self.boot:
-            self.boot, self.serial, self.memory, self.pending = window.boot, 0, self.memory.rebooted(), None
+        if window.boot != state.boot:
+            state = RequestState(boot=window.boot, excitation=state.excitation.rebooted(), attempts=state.attempts)
         long = window.reason == "probe" or long_enough(*_extent(window), self.policy.settings)
         upper = min(self.widest, widest, estimate.interval[1])
-        decision = self.policy.look(self.memory, Seen(now, estimate.status, long, upper, _slack(runs)))
-        self.memory = decision.memory
-        if estimate.ok and self.pending is not None and isinstance(self.pending.ask, Probe):
-            self._close(None)
-        if decision.ask is not None:
-            until = window.start + self.insistence.validity
-            self.serial += 1
-            self.pending = Request(self.servo, self.boot, self.serial, decision.ask, until, decision.reason[:256])
-            self.attempts = 0
-        return decision
+        summary = WindowSummary(now, estimate.status, long, upper, _slack(in_force))
+        decision = self.policy.decide(state.excitation, summary)
+        state = replace(state, excitation=decision.state)
+        if estimate.ok and state.pending is not None and isinstance(state.pending.ask, Probe):
+            state = state.closed(None)
+        if decision.ask is None:
+            return state, decision
+        serial, until = state.serial + 1, window.start + self.validity
+        request = Request(window.servo, state.boot, serial, decision.ask, until, decision.reason[:256])
+        return replace(state, pending=request, serial=serial, attempts=Attempts(now, 1)), decision
 
-    def after(
-        self, window: Window, estimate: GapEstimate, widest: float, runs: Setting | None, store: Store, now: float
-    ) -> list[Request]:
-        """What to send after a window, as of `learn`; decision and request are stored."""
-        decision = self.learn(window, estimate, widest, runs, now)
-        store.add_excitation(window, decision)
-        return self._stored(self.pending if decision.ask else None, store, now)
+    def answered(self, state: RequestState, answer: Answer, now: float) -> tuple[RequestState, Request | None]:
+        """The state after an answer, and the request to send instead, where the twin had lost count of its serials."""
+        pending = state.pending
+        if pending is None or (answer.boot, answer.serial) != (pending.boot, pending.serial) or answer.outcome.passing:
+            return state, None
+        if answer.outcome is not Outcome.DUPLICATE:
+            return state.closed(answer.outcome), None
+        serial = max(state.serial, answer.newest) + 1
+        again = replace(pending, serial=serial)
+        return replace(state, pending=again, serial=serial, attempts=Attempts(now, 1)), again
 
-    def answered(self, answer: Answer, store: Store, now: float) -> list[Request]:
-        """What to send after an answer, as of `settle`, stored."""
-        return self._stored(self.settle(answer), store, now)
+    def next_wake(self, state: RequestState) -> float | None:
+        """Time at which the answer is overdue, s; None: none is awaited."""
+        return None if state.pending is None else state.attempts.sent_at + self.retry
 
-    def settle(self, answer: Answer) -> Request | None:
-        """Note an answer; the request to send instead, where this twin had forgotten how far its numbers went."""
-        asked = self.pending
-        if asked is None or (answer.boot, answer.serial) != (asked.boot, asked.serial) or answer.outcome.passing:
-            return None
-        if answer.outcome is Outcome.DUPLICATE:
-            self.serial = max(self.serial, answer.newest) + 1
-            self.pending = msgspec.structs.replace(asked, serial=self.serial)
-            self.attempts = 0
-            return self.pending
-        self._close(answer.outcome)
-        return None
-
-    def send(self, now: float) -> list[Request]:
-        """The pending request, which counts as sent."""
-        if self.pending is None:
-            return []
-        self.sent_at, self.attempts = now, self.attempts + 1
-        return [self.pending]
-
-    def steady(self, now: float) -> None:
-        """Nothing happened later than `now` (s), whatever the clock said then."""
-        self.sent_at = min(self.sent_at, now)
-        self.memory = replace(self.memory, probed=min(self.memory.probed, now))
-
-    def next_wake(self) -> float | None:
-        """When `wake` is due, s; None: nothing is waited for."""
-        return None if self.pending is None else self.sent_at + self.insistence.retry
-
-    def wake(self, now: float) -> list[Request]:
+    def wake(self, state: RequestState, now: float) -> tuple[RequestState, tuple[Request, ...]]:
         """The pending request once more when its answer is overdue; given up after `attempts`."""
-        due = self.next_wake()
-        if due is None or now < due:
-            return []
-        if self.attempts >= self.insistence.attempts:
-            self._close(None)
-        return self.send(now)
-
-    def _stored(self, request: Request | None, store: Store, now: float) -> list[Request]:
-        """Store and send a new request."""
-        if request is None:
-            return []
-        store.add_request(request)
-        return self.send(now)
-
-    def _close(self, outcome: Outcome | None) -> None:
-        """The pending request is over."""
-        assert self.pending is not None
-        self.memory = self.memory.answered(self.pending.ask, outcome)
-        self.pending = None
+        due = self.next_wake(state)
+        if state.pending is None or due is None or now < due:
+            return state, ()
+        if state.attempts.count >= self.attempts:
+            return state.closed(None), ()
+        return replace(state, attempts=state.attempts.another(now)), (state.pending,)
 
 
-def requests_of(name: str, servo: Servo, settings: TwinSettings) -> Requests | None:
-    """What a twin's settings ask for, of a servo of that name and model; None: nothing."""
-    if settings.excitation is None:
-        return None
-    insistence = Insistence(settings.retry, settings.attempts, settings.validity)
-    return Requests(name, ExcitationPolicy(servo.p, settings.excitation), insistence, settings.uncertainty.gap[1])
-
-
-def _extent(window: Window) -> tuple[float, float]:
+def _extent(window: WindowMessage) -> tuple[float, float]:
     """Length, and how much of it lies before the first change of the reference, s.
 
     Nothing lies before a boot's first sample: there, no longer pre-trigger could be had.
@@ -163,8 +155,8 @@ def _extent(window: Window) -> tuple[float, float]:
     return window.samples / window.rate, math.inf if window.start == 0.0 else first - window.start
 
 
-def _slack(runs: Setting | None) -> float:
-    """m: both thresholds of the dead zone together; NaN: not known."""
-    if runs is None or runs.gains is None:
+def _slack(setting: Setting | None) -> float:
+    """Both thresholds of the dead zone together, m; NaN: not known."""
+    if setting is None or setting.gains is None:
         return math.nan
-    return (runs.gains.enter + runs.gains.leave) * runs.tolerance
+    return (setting.gains.enter + setting.gains.leave) * setting.tolerance

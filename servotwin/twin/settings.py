@@ -17,9 +17,7 @@ from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
-
-POLICIES = ("certified", "margin", "hysteresis", "paper")
-_OWNERS = {"table": "certified", "k_dz": "paper", "smoothing": "paper", "k_noise": "margin"}
+from servotwin.redesign.registry import POLICIES
 
 
 @settings("triage")
@@ -78,11 +76,11 @@ class TwinSettings:
     policy: Annotated[
         str,
         key(
-            choices=POLICIES,
+            choices=tuple(POLICIES),
             help="What makes a setting of an estimate: certified sends what it has verified, margin and hysteresis set "
             "a dead zone, paper is Eq 21.",
         ),
-    ] = POLICIES[0]
+    ] = next(iter(POLICIES))
     uncertainty: Annotated[
         Uncertainty,
         key(
@@ -163,9 +161,9 @@ class TwinSettings:
 
     def __post_init__(self) -> None:
         check(self)
-        for name, owner in _OWNERS.items():
-            if getattr(self, name) is not None and owner != self.policy:
-                value = getattr(self, name)
+        for name, owner in ((name, owner) for owner, entry in POLICIES.items() for name in entry.options):
+            value = getattr(self, name)
+            if value is not None and owner != self.policy:
                 raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False, as the trend already joins the windows")

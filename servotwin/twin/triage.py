@@ -1,112 +1,274 @@
-"""The triage of one servo's windows: a glance at each, and what it is compared with.
+"""Triage of windows: all get a glance, and only those that may say something new are estimated. An optional part, pure.
 
-After every estimate the glance at the same window is compared with it: where glances mislead, all are estimated.
+A glance takes the plain fit next to the gap that was estimated last, and compares. Nothing moved only where that was
+possible to see: a window that does not show the gap, a fit that does not converge, and anything unusual is estimated,
+and the reason stored. After every estimate the glance at the same window is compared with it: a servo on which glances
+mislead gets none.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
 from servotwin.estimation.whitened.quick import QuickFit, quick_fit
-from servotwin.messages import Window as WindowMessage
+from servotwin.estimation.window import Window
+from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.twin.decode import decode_window
-from servotwin.twin.glance import Glance, Watch, allowed, glance
-from servotwin.twin.requests import Requests
 from servotwin.twin.settings import TriageSettings
-from servotwin.twin.store import Store
 from servotwin.twin.wear import Expectation
 
+ROUTINE = ("reference", "periodic")
+"""Reasons of windows that come anyway; any other says that something is new, or was asked for."""
+
+_SHORTEST = 400  # samples, as for the estimator
 _FADES = 0.95  # of the usual misfit, per window: steps to one side may leave more than those to the other
+_PATIENCE, _SPARSE = 3, 8  # estimates in a row that did not count, after which only one window in so many is tried
 
 
+class TriageState(Struct, frozen=True):
+    """Slice of the twin's state: the window that was estimated last, with which glances are compared.
+
+    Attributes
+    ----------
+    doubt : str
+        Why no glance is enough; empty: the last window that was estimated may be relied on.
+    boot, version : str, int
+        Of the window that was estimated last, and of the parameters in force in it.
+    time : float
+        Of its middle, s.
+    gap, std : float
+        rad, as estimated.
+    bias, bias_std : float
+        V; NaN and inf where it did not rest.
+    misfit : float
+        m, usual.
+    glances : int
+        Windows since.
+    vain : int
+        Estimates in a row that did not count.
+    """
+
+    doubt: str = "no window was estimated yet"
+    boot: str = ""
+    version: int = 0
+    time: float = 0.0
+    gap: float = math.nan
+    std: float = math.inf
+    bias: float = math.nan
+    bias_std: float = math.inf
+    misfit: float = math.nan
+    glances: int = 0
+    vain: int = 0
+
+    def doubted(self, why: str) -> TriageState:
+        """With a reason for which the next window is estimated, whatever it shows."""
+        return replace(self, doubt=why, glances=0, vain=0)
+
+    def glanced(self, seen: Glance) -> TriageState:
+        """After a window of which a glance was enough."""
+        usual = self.misfit if math.isnan(seen.misfit) else max(_FADES * self.misfit, seen.misfit)
+        return replace(self, misfit=usual, glances=self.glances + 1)
+
+
+class Glance(Struct, frozen=True):
+    """What a glance saw.
+
+    Attributes
+    ----------
+    gap, std : float
+        rad; NaN and inf where it saw none.
+    misfit : float
+        m.
+    bias, bias_std : float
+        V; NaN and inf where nothing rests.
+    moved : bool
+        Whether the window is to be estimated.
+    why : str
+        Why, in words; where it is not, what was found.
+    """
+
+    gap: float
+    std: float
+    misfit: float
+    bias: float
+    bias_std: float
+    moved: bool
+    why: str
+
+
+def due(message: WindowMessage, state: TriageState, settings: TriageSettings) -> str:
+    """Why a window is estimated whatever it shows; empty: a glance may be enough."""
+    if state.doubt:
+        return state.doubt
+    if message.boot != state.boot:
+        return "the edge has started anew"
+    if message.reason not in ROUTINE:
+        return f"the edge sent it because of: {message.reason or 'nothing stated'}"
+    if state.glances + 1 >= settings.every:
+        return f"due: {state.glances} windows since the last estimate"
+    if abs(message.middle - state.time) >= settings.longest:
+        return f"due: {abs(message.middle - state.time):.6g} s since the last estimate"
+    return ""
+
+
+def in_vain(message: WindowMessage, state: TriageState) -> str:
+    """Why a window is not even looked at: estimates of such windows have said nothing lately; empty: it is.
+
+    A loop that always shows one contact, of an encoder whose offset is not known, would be estimated for ever.
+    """
+    changed = (message.boot, message.parameter_version) != (state.boot, state.version) or message.reason not in ROUTINE
+    if changed or state.vain < _PATIENCE or state.glances + 1 >= _SPARSE:
+        return ""
+    return f"not looked at: {state.vain} estimates in a row did not count, and one window in {_SPARSE} is tried"
+
+
+def glance(
+    message: WindowMessage,
+    window: Window,
+    servo: Servo,
+    state: TriageState,
+    offset: tuple[float, float] | None = None,
+    settings: TriageSettings | None = None,
+) -> Glance:
+    """Whether a window has to be estimated.
+
+    Parameters
+    ----------
+    message : messages.WindowMessage
+        For its boot, version and reason.
+    window : Window
+        The same, decoded.
+    servo : Servo
+    state : TriageState
+    offset : (float, float), optional
+        The encoder's offset as earlier windows showed it, mean and standard deviation, rad.
+    settings : TriageSettings, optional
+    """
+    settings, tired = settings or TriageSettings(), in_vain(message, state)
+    if tired:
+        return _blind(tired, moved=False)
+    if window.theta_m is None or window.position.size < _SHORTEST:
+        return _blind("the window has no theta_m, or too few samples: what to make of it, the estimator says")
+    if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
+        return _blind(state.doubt or "the motor's angle is constant")
+    seen = quick_fit(window, servo, state.gap, offset)
+    bias, bias_std = quick_bias(window, servo)
+    found = Glance(seen.gap, seen.std, seen.misfit, bias, bias_std, True, "")
+    why = due(message, state, settings) or _unclear(seen, settings) or _moved(found, state, settings)
+    return replace(found, moved=bool(why), why=why or "nothing moved")
+
+
+def _blind(why: str, moved: bool = True) -> Glance:
+    return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
+
+
+def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
+    """Why a glance cannot say whether the gap moved."""
+    if not seen.settled:
+        return "the plain fit did not converge"
+    if not seen.std <= settings.widest:
+        return f"at a glance the window shows the gap to {math.degrees(seen.std):.3g} deg only"
+    return ""
+
+
+def _moved(seen: Glance, state: TriageState, settings: TriageSettings) -> str:
+    """What moved since the last estimate, in words; empty: nothing."""
+    off = abs(seen.gap - state.gap)
+    if not off <= allowed(math.hypot(seen.std, state.std), settings):
+        now, before = math.degrees(seen.gap), math.degrees(state.gap)
+        return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
+    if not seen.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
+        return f"{1e6 * seen.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
+    spread = settings.deviations * math.hypot(seen.bias_std, state.bias_std)
+    if abs(seen.bias - state.bias) > max(settings.bias, spread):
+        return f"the input bias moved: {seen.bias:.4g} V, {state.bias:.4g} V before"
+    return ""
+
+
+def allowed(std: float, settings: TriageSettings) -> float:
+    """rad by which gaps may differ that are one, for a spread (rad) of their difference."""
+    return max(settings.gap, settings.deviations * std)
+
+
+@dataclass(frozen=True)
 class Triage:
-    """The triage of one servo: it remembers what it compares with.
+    """The triage of one servo's windows.
 
     Parameters
     ----------
     servo : Servo
     settings : TriageSettings
-
-    Attributes
-    ----------
-    watch : Watch
     """
 
-    def __init__(self, servo: Servo, settings: TriageSettings) -> None:
-        self.servo, self.settings, self.watch = servo, settings, Watch()
+    servo: Servo
+    settings: TriageSettings
 
-    def spares(self, message: WindowMessage, trend: Trend | None, asks: Requests | None, store: Store) -> bool:
-        """Whether a glance at a window is enough; what it saw is stored.
+    def glance(
+        self, state: TriageState, message: WindowMessage, window: Window, trend: Trend | None, requested: bool
+    ) -> tuple[TriageState, Glance | None]:
+        """Glance at a window; None where that is not possible, and the estimator says why.
 
         Parameters
         ----------
-        message : messages.Window
+        state : TriageState
+        message, window
+            The window, and the same decoded.
         trend : Trend or None
             As it was left by the windows that counted.
-        asks : Requests or None
-            While the edge is asked for a window that tells more, all are estimated.
-        store : Store
+        requested : bool
+            True while the edge is asked for a more informative window: all are estimated then.
         """
-        asked = asks is not None and asks.pending is not None
-        watch = msgspec.structs.replace(self.watch, doubt="a request is open", vain=0) if asked else self.watch
+        compared = replace(state, doubt="a request is open", vain=0) if requested else state
         try:
-            seen = glance(message, decode_window(message), self.servo, watch, _offset(trend), self.settings)
+            found = glance(message, window, self.servo, compared, _offset(trend), self.settings)
         except InvalidInput:
-            return False  # why it is no window, the estimator says
-        store.add_glance(message, seen)
-        if not seen.moved:
-            self.watch = _glanced(self.watch, seen)
-        return not seen.moved
+            return state, None
+        return (state if found.moved else state.glanced(found)), found
 
-    def doubt(self, why: str) -> None:
-        """The next window is estimated, whatever it shows."""
-        self.watch = msgspec.structs.replace(self.watch, doubt=why, glances=0, vain=0)
+    def estimated(
+        self,
+        state: TriageState,
+        message: WindowMessage,
+        window: Window | None,
+        estimate: GapEstimate,
+        trend: Trend | None,
+        rejection: str,
+    ) -> TriageState:
+        """The state after an estimate; one that was rejected, and why, makes the next window estimated too.
 
-    def learn(self, message: WindowMessage, estimate: GapEstimate, trend: Trend | None, why_not: str) -> None:
-        """Note an estimate, and why it does not count, where it does not: then the next window is estimated too.
-
-        What a glance at its own window says is what later ones are compared with.
+        The glance at the estimate's own window is what later ones are compared with.
         """
-        if why_not:
-            whose = {"boot": message.boot, "version": message.parameter_version}
-            self.watch = msgspec.structs.replace(
-                self.watch, doubt=why_not, glances=0, vain=self.watch.vain + 1, **whose
-            )
-            return
-        window, before = decode_window(message), self.watch.misfit
-        seen = quick_fit(window, self.servo, estimate.gap, _offset(trend))
+        if rejection or window is None:
+            boot, version = message.boot, message.parameter_version
+            return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
+        found = quick_fit(window, self.servo, estimate.gap, _offset(trend))
         bias, bias_std = quick_bias(window, self.servo)
-        self.watch = Watch(
-            self._misled(seen, estimate),
-            message.boot,
-            message.parameter_version,
-            estimate.time,
-            estimate.gap,
-            estimate.std,
-            bias,
-            bias_std,
-            seen.misfit if math.isnan(before) else max(_FADES * before, seen.misfit),
+        return TriageState(
+            doubt=self._misled(found, estimate),
+            boot=message.boot,
+            version=message.parameter_version,
+            time=estimate.time,
+            gap=estimate.gap,
+            std=estimate.std,
+            bias=bias,
+            bias_std=bias_std,
+            misfit=found.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, found.misfit),
         )
 
-    def _misled(self, seen: QuickFit, estimate: GapEstimate) -> str:
-        """By how much a glance was wrong, in words; empty where it was not."""
-        off = abs(seen.gap - estimate.gap)
-        if off <= allowed(math.hypot(seen.std, estimate.std), self.settings):
+    def _misled(self, found: QuickFit, estimate: GapEstimate) -> str:
+        """The error of a glance, in words; empty where it is small enough."""
+        off = abs(found.gap - estimate.gap)
+        if off <= allowed(math.hypot(found.std, estimate.std), self.settings):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
-
-
-def _glanced(watch: Watch, seen: Glance) -> Watch:
-    """After a window of which a glance was enough."""
-    usual = watch.misfit if math.isnan(seen.misfit) else max(_FADES * watch.misfit, seen.misfit)
-    return msgspec.structs.replace(watch, misfit=usual, glances=watch.glances + 1)
 
 
 def _offset(trend: Trend | None) -> tuple[float, float] | None:

@@ -1,21 +1,45 @@
-"""Which parameters the edge runs, which are on their way, and what may be sent next."""
+"""Versions of the edge's parameters as the twin knows them: in force, pending, and what each one set. Pure."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
-import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
 
-from servotwin.messages import Reason, Receipt, Update, Window
+from servotwin.messages import Reason, Receipt, Setting, Update, WindowMessage
 
-EARLIER = 1000
-"""Boots that a twin remembers, so that what it remembers is bounded."""
+MAX_ENDED_BOOTS = 1000
+"""Boots that a twin remembers, so that its state is bounded."""
+MAX_SETTINGS = 16
+"""Versions whose setting is remembered, beside the first one and the one in force."""
 
 
-@dataclass
-class Versions:
-    """The twin's view of one edge's parameter versions.
+class Attempts(Struct, frozen=True):
+    """Sendings of one message.
+
+    Attributes
+    ----------
+    sent_at : float
+        s, of the last one.
+    count : int
+    """
+
+    sent_at: float = -math.inf
+    count: int = 0
+
+    def another(self, now: float) -> Attempts:
+        """After one more at `now`, s."""
+        return Attempts(now, self.count + 1)
+
+    def not_after(self, now: float) -> Attempts:
+        """The same on a clock that was put back to `now` (s): nothing waits longer than from now on."""
+        return self if self.sent_at <= now else Attempts(now, self.count)
+
+
+class Versions(Struct, frozen=True):
+    """Parameter versions of one edge.
 
     Version numbers only rise. The edge swaps a version only for one that names it as its base; when the twin's view
     was out of date, the receipt says what is in force and the same parameters go out again on that base. Within a boot
@@ -24,17 +48,17 @@ class Versions:
     Attributes
     ----------
     boot : str or None
-        The edge's current boot; None: nothing was heard yet.
+        The edge's current boot; None: no message has come yet.
     in_force : int
         Newest version known to run at the edge.
     issued : int
         Highest version ever given out.
     pending : Update or None
         The newest update, while no receipt for it has come.
-    newest : float
-        Data time of the newest update of this boot, s.
-    earlier : list of str
-        Boots that are over, the last `EARLIER` of them.
+    data_time : float
+        Of the newest update of this boot, s.
+    ended_boots : tuple of str
+        The last `MAX_ENDED_BOOTS` of them.
     root : int
         First of the updates that follow on one another, the pending one last: it stands on what was in force.
     """
@@ -43,75 +67,94 @@ class Versions:
     in_force: int = 0
     issued: int = 0
     pending: Update | None = None
-    newest: float = -math.inf
-    earlier: list[str] = field(default_factory=list)
+    data_time: float = -math.inf
+    ended_boots: tuple[str, ...] = ()
     root: int = 0
 
-    def hear(self, boot: str, in_force: int) -> bool:
-        """Note what a message says about its boot; False when that boot is over."""
-        if boot in self.earlier:
-            return False
-        if boot != self.boot:
-            self._begin(boot, in_force)
-        self.in_force = max(self.in_force, in_force)
-        self.issued = max(self.issued, self.in_force)
-        return True
+    def has_ended(self, boot: str) -> bool:
+        """True for a boot that is over."""
+        return boot in self.ended_boots
 
-    def admits(self, window: Window) -> bool:
-        """Whether parameters that stand on this window would be newer than all before."""
-        return window.boot == self.boot and window.start > self.newest
+    def noted(self, boot: str, in_force: int) -> Versions:
+        """After a message from a boot that names the version in force; unchanged where that boot is over."""
+        if self.has_ended(boot):
+            return self
+        now = self if boot == self.boot else self._rebooted(boot, in_force)
+        in_force = max(now.in_force, in_force)
+        return replace(now, in_force=in_force, issued=max(now.issued, in_force))
 
-    def issue(self, update: Update) -> Update:
-        """The update under the next version, on the version that the edge will run when it arrives."""
-        return self._anew(update) if self.pending is None else self._number(update, self.pending.version)
+    def admits(self, window: WindowMessage) -> bool:
+        """True where parameters that stand on this window would be newer than all before."""
+        return window.boot == self.boot and window.start > self.data_time
 
-    def settle(self, receipt: Receipt) -> Update | None:
-        """Note a receipt; the update to send instead when the pending one was refused for its base or number, or will
-        be, as one that it follows on was refused."""
-        if not self.hear(receipt.boot, receipt.parameter_version) or self.pending is None:
-            return None
-        if self._breaks(receipt):
-            return self._anew(self.pending)
-        if receipt.version != self.pending.version or receipt.reason is Reason.TOO_SOON:
-            return None
-        refused, self.pending = self.pending, None
-        if receipt.reason is Reason.BASE_MISMATCH or self.in_force > refused.version:
-            return self._anew(refused)
-        return None
+    def with_update(self, update: Update) -> Versions:
+        """With an update pending under the next version, on the version that the edge will run when it arrives."""
+        return self._rebased(update) if self.pending is None else self._numbered(update, self.pending.version)
+
+    def after_receipt(self, receipt: Receipt) -> tuple[Versions, Update | None]:
+        """The versions after a receipt, and the update to send instead of the pending one.
+
+        That is needed when the pending one was refused for its base or number, or will be, as one that it follows on
+        was refused.
+        """
+        now = self.noted(receipt.boot, receipt.parameter_version)
+        pending = now.pending
+        if self.has_ended(receipt.boot) or pending is None:
+            return now, None
+        if now._breaks(receipt, pending):
+            again = now._rebased(pending)
+            return again, again.pending
+        if receipt.version != pending.version or receipt.reason is Reason.TOO_SOON:
+            return now, None
+        if receipt.reason is Reason.BASE_MISMATCH or now.in_force > pending.version:
+            again = now._rebased(pending)
+            return again, again.pending
+        return now.without_pending(), None
 
     @property
-    def running(self) -> tuple[int, ...]:
-        """What is in force, and what is on its way."""
+    def current(self) -> tuple[int, ...]:
+        """The version in force, and the one that is pending."""
         return self.in_force, *(() if self.pending is None else (self.pending.version,))
 
-    def give_up(self) -> None:
-        """Stop waiting for a receipt."""
-        self.pending = None
+    def without_pending(self) -> Versions:
+        """No longer waiting for a receipt."""
+        return replace(self, pending=None)
 
-    def _begin(self, boot: str, in_force: int) -> None:
-        if self.boot is not None:
-            self.earlier = [*self.earlier, self.boot][-EARLIER:]
-        self.boot, self.in_force = boot, in_force
-        self.pending, self.newest = None, -math.inf
+    def _rebooted(self, boot: str, in_force: int) -> Versions:
+        ended = self.ended_boots if self.boot is None else (*self.ended_boots, self.boot)[-MAX_ENDED_BOOTS:]
+        return replace(self, boot=boot, in_force=in_force, pending=None, data_time=-math.inf, ended_boots=ended)
 
-    def _breaks(self, receipt: Receipt) -> bool:
-        """Whether the pending update stands on one that will never be in force.
+    def _breaks(self, receipt: Receipt, pending: Update) -> bool:
+        """True where the pending update stands on one that will never be in force.
 
         A twin that is behind issues one update after the other before it reads the first receipt: were only the last
         one's receipt to count, the edge would refuse all of them until the twin has caught up.
         """
-        assert self.pending is not None
-        follows = self.root <= receipt.version < self.pending.version and self.in_force < self.pending.base_version
+        follows = self.root <= receipt.version < pending.version and self.in_force < pending.base_version
         return follows and not receipt.applied and receipt.reason is not Reason.SUPERSEDED
 
-    def _anew(self, update: Update) -> Update:
-        """On what is in force."""
-        found = self._number(update, self.in_force)
-        self.root = found.version
-        return found
+    def _rebased(self, update: Update) -> Versions:
+        """With the update pending on what is in force."""
+        return replace(self._numbered(update, self.in_force), root=self.issued + 1)
 
-    def _number(self, update: Update, base: int) -> Update:
-        self.issued += 1
-        self.newest = update.data_time
-        self.pending = msgspec.structs.replace(update, version=self.issued, base_version=base)
-        return self.pending
+    def _numbered(self, update: Update, base: int) -> Versions:
+        version = self.issued + 1
+        pending = replace(update, version=version, base_version=base)
+        return replace(self, issued=version, data_time=update.data_time, pending=pending)
+
+
+Settings = Mapping[int, Setting]
+"""Setting of each version, as far as it is known."""
+
+
+def noted_setting(known: Settings, version: int, setting: Setting, base: int, in_force: int = 0) -> dict[int, Setting]:
+    """The known settings with one more; without gains it has those of its base version.
+
+    The oldest are forgotten, but never the first one and the one in force.
+    """
+    before = known.get(base)
+    if setting.gains is None and before is not None:
+        setting = replace(setting, gains=before.gains)
+    after = {**known, version: setting}
+    keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
+    return {number: each for number, each in sorted(after.items()) if number in keep}

@@ -1,9 +1,13 @@
-"""What a twin knows of its servo's wear from window to window, on the edge's clock of sample time."""
+"""Wear of one servo from window to window, on the edge's clock of sample time. Pure."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
 
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend, TrendSettings
@@ -11,7 +15,7 @@ from servotwin.estimation.trend import Trend, TrendSettings
 
 @dataclass(frozen=True)
 class Expectation:
-    """What is known before a window is looked at.
+    """Knowledge about the gap before a window is estimated.
 
     Attributes
     ----------
@@ -26,7 +30,7 @@ class Expectation:
 
     @property
     def prior(self) -> float | GapEstimate:
-        """Where an estimator may start: the prediction, or the previous gap while there is none."""
+        """Start of an estimator: the prediction, or the previous gap while there is none."""
         return self.previous if self.trend is None else self.trend.as_estimate()
 
     @property
@@ -43,11 +47,11 @@ class Expectation:
 
     @property
     def widest(self) -> float:
-        """rad: the gap is no wider; inf where nothing is known."""
+        """Upper bound of the gap, rad; inf where nothing is known."""
         return math.inf if self.trend is None else self.trend.gap_interval[1]
 
     def gap_rate(self, settings: TrendSettings) -> float:
-        """rad/s: root mean square of the growth to reckon with inside the window.
+        """Root mean square of the growth to reckon with inside the window, rad/s.
 
         Without it a growing gap is taken for a wrong model, and its value is that of whenever the screw crossed it: of
         Fig 16's windows one in three was refused, and in the calm loop estimates were off by up to 0.04 deg.
@@ -56,59 +60,97 @@ class Expectation:
         return math.hypot(rate, std)
 
 
-class Wear:
+class TrendState(Struct, frozen=True):
+    """A `Trend` as plain numbers, without its settings; `covariance` row by row."""
+
+    time: float
+    mean: Annotated[tuple[float, ...], Meta(min_length=3, max_length=3)]
+    covariance: Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
+    updates: int
+    refused: int
+    reasons: tuple[str, ...]
+    rival: TrendState | None
+
+    @classmethod
+    def of(cls, trend: Trend) -> TrendState:
+        """The numbers of a trend."""
+        return cls(
+            time=float(trend.time),
+            mean=tuple(trend.mean.tolist()),
+            covariance=tuple(trend.covariance.ravel().tolist()),
+            updates=trend.updates,
+            refused=trend.refused,
+            reasons=trend.reasons,
+            rival=None if trend.rival is None else cls.of(trend.rival),
+        )
+
+    def trend(self, settings: TrendSettings) -> Trend:
+        """The trend, bit for bit."""
+        return Trend(
+            time=self.time,
+            mean=np.array(self.mean),
+            covariance=np.array(self.covariance).reshape(3, 3),
+            settings=settings,
+            updates=self.updates,
+            refused=self.refused,
+            reasons=self.reasons,
+            rival=None if self.rival is None else self.rival.trend(settings),
+        )
+
+
+class Wear(Struct, frozen=True):
     """The trend of one servo, moved by accepted estimates in the order of their windows.
 
-    Sample time begins anew with each boot of the edge. What passed meanwhile is taken from the twin's own clock. What
-    was known of the encoder's offset is forgotten then, as the encoder may be homed elsewhere.
+    Sample time begins anew with each boot of the edge. The time between two boots is taken from the twin's own clock.
+    The encoder's offset is forgotten then, as the encoder may be homed elsewhere.
 
-    Parameters
+    Attributes
     ----------
-    initial_gap : float
-        rad, believed before the first estimate.
-    settings : TrendSettings
+    previous : float
+        rad, gap of the last accepted estimate; before, the gap believed at the start.
+    boot, arrived : str, float
+        Of the last window that moved the trend; s, on the twin's clock.
+    state : TrendState or None
+        None before the first estimate.
     """
 
-    def __init__(self, initial_gap: float, settings: TrendSettings) -> None:
-        self.settings = settings
-        self.trend: Trend | None = None
-        self.previous = initial_gap
-        self.boot, self.heard = "", 0.0
+    previous: float
+    boot: str = ""
+    arrived: float = 0.0
+    state: TrendState | None = None
 
-    def expect(self, boot: str, time: float, now: float) -> Expectation:
-        """What is known before a window of `boot` with its middle at `time` (s) that arrived at `now`.
+    def trend(self, settings: TrendSettings) -> Trend | None:
+        """The trend as the last estimate left it."""
+        return None if self.state is None else self.state.trend(settings)
 
-        For a window older than the trend, what is known is the trend as it stands.
+    def expect(self, settings: TrendSettings, boot: str, time: float, now: float) -> Expectation:
+        """Expectation of a window of `boot` with its middle at `time` (s) that arrived at `now`.
+
+        For a window older than the trend, it is the trend as it stands.
         """
-        trend = self._on_clock(boot, time, now)
+        trend = self._on_clock(settings, boot, time, now)
         return Expectation(self.previous, trend and trend.predict(max(time, trend.time)))
 
-    def learn(self, boot: str, estimate: GapEstimate, now: float) -> bool:
-        """Take an estimate; whether it counts.
+    def update(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
+        """The wear after an estimate, and why no parameters may stand on that; empty where they may.
 
-        One that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the reason
-        in the trend's `reasons`, until others agree with it.
+        An estimate that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the
+        reason in the trend's `reasons`, until others agree with it.
         """
-        trend = self._on_clock(boot, estimate.time, now)
-        if not estimate.ok or (trend is not None and estimate.time <= trend.time):
-            return False
-        self.trend = (trend or Trend.start(estimate.time, self.settings)).update(estimate)
-        self.boot, self.heard = boot, now
-        counts = self.trend.refused == 0
-        if counts:
-            self.previous = estimate.gap
-        return counts
-
-    def refusal(self, boot: str, estimate: GapEstimate, now: float) -> str:
-        """Why no parameters may stand on an estimate; empty where they may, and this has learnt from it."""
         if not estimate.ok:
-            return f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
-        if self.learn(boot, estimate, now):
-            return ""
-        return "; ".join(self.trend.reasons if self.trend else ()) or "the window is older than the trend"
+            return self, f"the estimate is {estimate.status.value}: {'; '.join(estimate.reasons) or 'no reason given'}"
+        trend = self._on_clock(settings, boot, estimate.time, now)
+        if self.state is not None and trend is not None and estimate.time <= trend.time:
+            return self, "; ".join(self.state.reasons) or "the window is older than the trend"
+        after = (trend or Trend.start(estimate.time, settings)).update(estimate)
+        counts = after.refused == 0
+        previous = float(estimate.gap) if counts else self.previous
+        rejection = "" if counts else "; ".join(after.reasons) or "the window is older than the trend"
+        return Wear(previous, boot, now, TrendState.of(after)), rejection
 
-    def _on_clock(self, boot: str, time: float, now: float) -> Trend | None:
+    def _on_clock(self, settings: TrendSettings, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
-        if self.trend is None or boot == self.boot:
-            return self.trend
-        return self.trend.without_offset().on_clock(time - max(0.0, now - self.heard))
+        trend = self.trend(settings)
+        if trend is None or boot == self.boot:
+            return trend
+        return trend.without_offset().on_clock(time - max(0.0, now - self.arrived))

@@ -20,7 +20,7 @@ from servotwin.store.group_commit import CommitLimits, GroupCommit
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
@@ -230,7 +230,7 @@ def _log_failure(task: asyncio.Task[None]) -> None:
         log.error("a task of the service ended", exc_info=error)
 
 
-def servo_test(fleet: Fleet) -> Callable[[str], bool]:
+def servo_test(fleet: ModelRegistry) -> Callable[[str], bool]:
     """Test whether a fleet has a servo of a name; invalid names, however long, are not cached."""
 
     @lru_cache(maxsize=MAX_SERVOS)

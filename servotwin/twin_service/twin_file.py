@@ -7,7 +7,7 @@ from pathlib import Path
 
 from servotwin.config.table import read_inner, read_toml
 from servotwin.errors import InvalidInput
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 from servotwin.twin_service.config import ServiceConfig, read_service
 from servotwin.twin_service.worker import WorkerStart
 
@@ -20,14 +20,14 @@ class TwinFile:
     ----------
     path : Path
     service : ServiceConfig
-    fleet : Fleet
+    fleet : ModelRegistry
     text : str
         Of the file: workers read it once more.
     """
 
     path: Path
     service: ServiceConfig
-    fleet: Fleet
+    fleet: ModelRegistry
     text: str
 
     @property
@@ -47,7 +47,7 @@ def read_twin(path: Path) -> TwinFile:
     table = read_toml(path)
     text, folder = path.read_text(encoding="utf-8"), path.parent
     config = read_inner(table, "service", lambda inner: read_service(inner, folder))
-    fleet = Fleet.read(table, folder)
+    fleet = ModelRegistry.read(table, folder)
     table.done()
     return TwinFile(path, config, fleet, text)
 

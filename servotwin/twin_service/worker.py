@@ -101,12 +101,12 @@ def _attempt(work: Work, lease: Lease, now: float) -> LeaseResult:
 
 
 def _load_work(start: bytes) -> Work:
-    from servotwin.twin.fleet import Fleet
+    from servotwin.twin.models import ModelRegistry
     from servotwin.twin.work import work
 
     given = _decode_start(start)
-    fleet = Fleet.loads(given.text, given.source, Path(given.folder))
-    return lambda lease, now: work(fleet, lease, now)
+    registry = ModelRegistry.loads(given.text, given.source, Path(given.folder))
+    return lambda lease, now: work(registry, lease, now)
 
 
 if __name__ == "__main__":

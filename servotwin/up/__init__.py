@@ -1,1 +1,1 @@
-"""`servotwin up`: twin, edges and simulated machines as real processes on this machine, started, watched and ended."""
+"""`servotwin up`: runs twin, edges and simulated machines as real processes on this machine."""

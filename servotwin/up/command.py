@@ -1,4 +1,4 @@
-"""`servotwin up`: the loop that watches, paces, shows and ends it all."""
+"""`servotwin up`: the loop that watches the processes, adapts the speed, shows the status and ends it all."""
 
 from __future__ import annotations
 
@@ -15,24 +15,22 @@ from rich.live import Live
 
 from servotwin.drives.simulated.diary import read_speed, write_speed
 from servotwin.errors import InvalidInput
-from servotwin.up import display, pacing, usage
-from servotwin.up.display import Picture, clock
+from servotwin.up import display
+from servotwin.up.display import Snapshot, clock
 from servotwin.up.folder import Folder, opened
 from servotwin.up.outages import Outages
-from servotwin.up.paced import Mark, Paced
 from servotwin.up.plan import SERVOS
-from servotwin.up.reading import Reader
-from servotwin.up.site import Site, Stopped
-from servotwin.up.twin_watch import Twin, TwinWatch
+from servotwin.up.site import Site, StartInterrupted
+from servotwin.up.speed import CORES, FASTEST, SLOWEST, MachineTime, SpeedMeter, next_speed, processor_times
+from servotwin.up.status import ServoReader, TwinPoller, TwinStatus
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-PIECE_S, SHOW_S, SAY_S, ADAPT_S = 0.1, 0.5, 5.0, 3.0
-NEWS_S = 30.0
-SPEED, CAUTION = "speed", 0.7
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_TICK_S, _TABLE_S, _LINE_S, _ADAPT_S, _NEWS_S = 0.1, 0.5, 5.0, 3.0, 30.0
+_SPEED_FILE, _CAUTION = "speed", 0.7
 
 
 def up(path: Path, speed: float | None = None, seconds: float | None = None, console: Console | None = None) -> None:
-    """Run everything until a signal comes, or for a while.
+    """Run twin, edges and machines until a signal comes, or for a while.
 
     Parameters
     ----------
@@ -41,7 +39,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     speed : float, optional
         Machine time per time; None: as fast as the processor's share allows.
     seconds : float, optional
-        End after so long; None: when a signal comes.
+        End after so many s; None: when a signal comes.
     console : Console, optional
 
     Raises
@@ -49,121 +47,126 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     InvalidInput
         The folder is another's or in use, a speed or time is not allowed, a process does not start or keeps ending.
     """
-    _check("--speed", speed, pacing.FASTEST)
-    _check("--for", seconds, 1e9)
+    _check_positive("--speed", speed, FASTEST)
+    _check_positive("--for", seconds, 1e9)
     console = console or Console()
-    with opened(path) as folder, _stopping() as stop:
-        greet(folder, console)
-        site = Site(folder, Outages(), stop)
-        show = Show(folder, site, speed, console)
+    with opened(path) as folder, _counted_signals() as signals:
+        _greet(folder, console)
+        site = Site(folder, Outages(), signals)
+        monitor = Monitor(folder, site, speed, console)
         try:
-            site.begin()
-            show.run(stop, seconds)
-        except Stopped:
+            site.start()
+            monitor.run(signals, seconds)
+        except StartInterrupted:
             console.print("ended before everything ran")
         finally:
             try:
-                show.end()
+                monitor.stop()
             finally:
-                site.end()
-        show.conclude()
+                site.stop()
+        monitor.print_summary()
 
 
-def greet(folder: Folder, console: Console) -> None:
-    """Say where it is and what is gone on with."""
+def _greet(folder: Folder, console: Console) -> None:
     if folder.new:
         console.print(f"made: {folder.path}: a twin and three servos", soft_wrap=True, highlight=False)
     for servo in SERVOS:
         state = folder.machine(servo)
         if state is not None:
-            told = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
-            console.print(f"going on with {told}", soft_wrap=True, highlight=False)
+            described = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
+            console.print(f"going on with {described}", soft_wrap=True, highlight=False)
     console.print("starting (the very first time, code is compiled for a minute or two) ...", highlight=False)
 
 
-def first_speed(folder: Folder) -> float:
-    """A little below the last one, which another machine or another load may not hold."""
-    last = [read_speed(folder.servo(servo) / SPEED) or 0.0 for servo in SERVOS]
-    return max(pacing.SLOWEST, CAUTION * min(last))
+def _initial_speed(folder: Folder) -> float:
+    """A little below the last speed, which another machine or another load may not hold."""
+    last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in SERVOS]
+    return max(SLOWEST, _CAUTION * min(last))
 
 
-class Stop:
-    """Counts signals."""
+class SignalCounter:
+    """Counts signals; called, it returns their number."""
 
     def __init__(self) -> None:
-        self.count = 0
+        self._count = 0
 
     def __call__(self) -> int:
-        return self.count
+        return self._count
 
-    def heard(self, _number: int, _frame: FrameType | None) -> None:
-        """One more."""
-        self.count += 1
+    def handle(self, _number: int, _frame: FrameType | None) -> None:
+        """Handle a signal."""
+        self._count += 1
 
 
-class Show:
-    """Watches, paces and shows what runs.
+class Monitor:
+    """Watches what runs, adapts its speed and shows its status.
 
     Parameters
     ----------
     folder : Folder
     site : Site
     speed : float, optional
-        That stays.
+        Fixed speed; None: adapted.
     console : Console
     """
 
     def __init__(self, folder: Folder, site: Site, speed: float | None, console: Console) -> None:
         self._folder, self._site, self._console = folder, site, console
-        self._fixed, self._speed = speed is not None, speed or first_speed(folder)
-        self._readers = {servo.name: Reader(servo, folder.servo(servo)) for servo in SERVOS}
-        self._watch: TwinWatch | None = None
-        self._pace = Paced()
+        self._fixed, self._speed = speed is not None, speed or _initial_speed(folder)
+        self._readers = {servo.name: ServoReader(servo, folder.servo(servo)) for servo in SERVOS}
+        self._poller: TwinPoller | None = None
+        self._meter = SpeedMeter()
         self._news, self._news_until = "", 0.0
         self._begun = time.monotonic()
         self._ended = 0.0
-        self._twin: Twin | None = None
-        self._tell_speed()
+        self._last_twin: TwinStatus | None = None
+        self._write_speed()
 
-    def run(self, stop: Stop, seconds: float | None) -> None:
-        """Until it is time to end."""
+    def run(self, signals: SignalCounter, seconds: float | None) -> None:
+        """Run until a signal comes or `seconds` have passed."""
         self._begun = time.monotonic()
         names = [servo.name for servo in SERVOS]
-        self._watch = TwinWatch(self._site.url, self._folder.operator(), names)
-        self._watch.begin()
+        self._poller = TwinPoller(self._site.url, self._folder.operator(), names)
+        self._poller.start()
         with self._live() as live:
+            if live is None:
+                # No table on a pipe or in a file: the address is printed at once, and a line every 5 s.
+                self._print(f"twin: listening on {self._site.url}")
+                self._print(f"logs: {self._folder.path}/*.log")
             shown = adapted = self._begun
-            while not stop() and not (seconds is not None and time.monotonic() - self._begun >= seconds):
-                time.sleep(PIECE_S)
+            while not signals() and not (seconds is not None and time.monotonic() - self._begun >= seconds):
+                time.sleep(_TICK_S)
                 now = time.monotonic()
-                self._tend(now)
-                if now >= adapted + ADAPT_S:
+                self._restart_ended(now)
+                if now >= adapted + _ADAPT_S:
                     adapted = now
                     self._adapt(now)
-                if now >= shown + (SAY_S if live is None else SHOW_S):
+                if now >= shown + (_LINE_S if live is None else _TABLE_S):
                     shown = now
                     self._show(live, now)
 
-    def end(self) -> None:
-        """Ask the twin no more, after a last look."""
-        if self._watch is not None:
+    def stop(self) -> None:
+        """Stop polling the twin; keep its last status."""
+        if self._poller is not None:
             self._ended = time.monotonic()
-            self._twin = self._watch.twin
-            self._watch.end()
+            self._last_twin = self._poller.twin
+            self._poller.stop()
             self._console.print("ending: edges, machines, twin ...", highlight=False)
 
-    def conclude(self) -> None:
-        """The last words, when all have written theirs."""
-        if self._watch is None:
+    def print_summary(self) -> None:
+        """Print the final status, once all processes have written theirs."""
+        if self._poller is None:
             return
-        picture = self._picture(self._ended, self._twin)
-        for line in display.summary(picture):
-            self._console.print(line, soft_wrap=True, highlight=False)
-        pace = self._pace
-        told = f"{pace.mean_speed:.1f} times real time, {pace.told_share}, for {clock(picture.seconds)}"
-        self._console.print(
-            f"in the mean {told}; all has ended, and goes on from here", soft_wrap=True, highlight=False
-        )
+        snapshot = self._snapshot(self._ended, self._last_twin)
+        for line in display.summary(snapshot):
+            self._print(line)
+        share = self._meter.mean_share
+        use = "an unknown share of the processor" if share is None else f"{100 * share:.0f} % of {CORES} cores"
+        mean = f"{self._meter.mean_speed:.1f} times real time, {use}, for {clock(snapshot.seconds)}"
+        self._print(f"in the mean {mean}; all has ended, and goes on from here")
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True, highlight=False, markup=False)
 
     @contextmanager
     def _live(self) -> Iterator[Live | None]:
@@ -174,57 +177,66 @@ class Show:
             yield live
 
     def _show(self, live: Live | None, now: float) -> None:
-        picture = self._picture(now, None if self._watch is None else self._watch.twin)
+        snapshot = self._snapshot(now, None if self._poller is None else self._poller.twin)
         if live is None:
-            self._console.print(display.line(picture), soft_wrap=True, highlight=False, markup=False)
+            self._print(display.line(snapshot))
         else:
-            live.update(display.rendered(picture), refresh=True)
+            live.update(display.table(snapshot), refresh=True)
 
-    def _tend(self, now: float) -> None:
-        for news in self._site.tend(now):
-            self._news, self._news_until = news, now + NEWS_S
+    def _restart_ended(self, now: float) -> None:
+        for news in self._site.restart_ended(now):
+            self._news, self._news_until = news, now + _NEWS_S
             if not self._console.is_terminal:
-                self._console.print(news, soft_wrap=True, highlight=False, markup=False)
+                self._print(news)
 
     def _adapt(self, now: float) -> None:
         states = {servo.name: self._readers[servo.name].machine() for servo in SERVOS}
-        marks = {name: Mark(state.time_s, state.written) for name, state in states.items() if state is not None}
-        self._pace.look(usage.times(self._site.groups, {os.getpid()}), marks, now)
-        twin = None if self._watch is None else self._watch.twin
+        times = {name: MachineTime(state.time_s, state.written) for name, state in states.items() if state is not None}
+        self._meter.measure(processor_times(self._site.groups, {os.getpid()}), times, now)
+        twin = None if self._poller is None else self._poller.twin
         waiting = 0 if twin is None else twin.waiting
-        if not self._fixed and self._pace.settled:
-            self._speed = pacing.next_speed(self._speed, self._pace.seen(waiting))
-            self._tell_speed()
+        if not self._fixed and self._meter.started:
+            self._speed = next_speed(self._speed, self._meter.sample(waiting))
+            self._write_speed()
 
-    def _tell_speed(self) -> None:
+    def _write_speed(self) -> None:
         with suppress(OSError):
             for servo in SERVOS:
-                write_speed(self._folder.servo(servo) / SPEED, self._speed)
+                write_speed(self._folder.servo(servo) / _SPEED_FILE, self._speed)
 
-    def _picture(self, now: float, twin: Twin | None) -> Picture:
+    def _snapshot(self, now: float, twin: TwinStatus | None) -> Snapshot:
         left = 0.0 if self._site.forwarder is None else self._site.forwarder.left
-        views = []
+        servos = []
         for servo in SERVOS:
-            told = None if self._watch is None else self._watch.estimates.get(servo.name)
+            estimate = None if self._poller is None else self._poller.estimates.get(servo.name)
             restarts = self._site.machines[servo.name].restarts + self._site.edges[servo.name].restarts
-            views.append(self._readers[servo.name].view(told, left if servo.outages else 0.0, restarts))
-        pace, news = self._pace, self._news if now < self._news_until else ""
-        where = self._site.url, str(self._folder.path), news
-        return Picture(tuple(views), twin, now - self._begun, self._speed, pace.reached, pace.cores, pace.share, *where)
+            servos.append(self._readers[servo.name].read(estimate, left if servo.outages else 0.0, restarts))
+        return Snapshot(
+            servos=tuple(servos),
+            twin=twin,
+            seconds=now - self._begun,
+            speed=self._speed,
+            reached=self._meter.reached,
+            cores=self._meter.cores,
+            share=self._meter.share,
+            url=self._site.url,
+            folder=str(self._folder.path),
+            news=self._news if now < self._news_until else "",
+        )
 
 
 @contextmanager
-def _stopping() -> Iterator[Stop]:
-    """Signals counted, not obeyed; a terminal's Ctrl-C comes here only, as children are in sessions of their own."""
-    stop = Stop()
-    before = [signal.signal(number, stop.heard) for number in SIGNALS]
+def _counted_signals() -> Iterator[SignalCounter]:
+    """Count signals instead of ending; Ctrl-C comes only here, as children are in sessions of their own."""
+    counter = SignalCounter()
+    before = [signal.signal(number, counter.handle) for number in _SIGNALS]
     try:
-        yield stop
+        yield counter
     finally:
-        for number, handler in zip(SIGNALS, before, strict=True):
+        for number, handler in zip(_SIGNALS, before, strict=True):
             signal.signal(number, handler)
 
 
-def _check(option: str, value: float | None, most: float) -> None:
-    if value is not None and not 0.0 < value <= most:
-        raise InvalidInput(f"{option} {value:g}: must be greater than 0 and at most {most:g}")
+def _check_positive(option: str, value: float | None, maximum: float) -> None:
+    if value is not None and not 0.0 < value <= maximum:
+        raise InvalidInput(f"{option} {value:g}: must be greater than 0 and at most {maximum:g}")

@@ -1,4 +1,4 @@
-"""The folder of `servotwin up`: made whole or not at all, used by one at a time, gone on with at the next start."""
+"""Folder of `servotwin up`: created atomically, locked by one process, resumed at the next start."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from servotwin.runtime.locks import locked
 from servotwin.runtime.retry import Retry
 from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.up import enrolment
-from servotwin.up.pacing import FASTEST
 from servotwin.up.plan import PRE_TRIGGER_S, RATE, SERVOS, WINDOW_S, ServoPlan, machine_toml, twin_toml
+from servotwin.up.speed import FASTEST
 
 MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operator.token"
 EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
@@ -35,14 +35,14 @@ _RETRY = Retry(0.5, 2.0, 2.0)
 
 
 class Marker(msgspec.Struct, frozen=True, tag="servotwin-up/1", tag_field="schema"):
-    """That a folder is one of these; servos by name."""
+    """Marks a folder as made by `servotwin up`; names of its servos."""
 
     servos: list[str]
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder that is in order, and locked.
+    """A complete, locked folder.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Folder:
     lock : int
         Descriptor of the lock, which every process that works in the folder keeps open.
     new : bool
-        Whether it was made by this start.
+        True: it was made by this start.
     """
 
     path: Path
@@ -59,28 +59,28 @@ class Folder:
     new: bool
 
     def servo(self, servo: ServoPlan) -> Path:
-        """A servo's own."""
+        """Folder of a servo."""
         return self.path / servo.name
 
     def machine(self, servo: ServoPlan) -> MachineState | None:
-        """Where a machine was last; None: it is new."""
+        """Last state of a machine; None: it is new."""
         return read_state(self.servo(servo) / "state.json")
 
     def connect(self, servo: ServoPlan, url: str) -> None:
-        """Tell a servo's edge where the twin is."""
+        """Write the twin's URL to the file of a servo's edge."""
         file = self.servo(servo) / EDGE
         config = load(file)
         if config.twin is not None and config.twin.url != url:
             write_text(file, edge_toml(replace(config, twin=replace(config.twin, url=url))))
 
     def operator(self) -> str:
-        """The token with which the twin is asked."""
+        """Operator's token."""
         return (self.path / OPERATOR).read_text(encoding="utf-8").strip()
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Folder]:
-    """The folder, made at the first start, and nobody else's meanwhile.
+    """Open the folder, made at the first start, and lock it for this process.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def _check(path: Path) -> None:
 
 
 def _make(path: Path) -> None:
-    """All in a folder beside it, which then takes its name."""
+    """Make everything in a folder beside it, then rename that."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     try:

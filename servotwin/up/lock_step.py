@@ -1,8 +1,8 @@
-"""Lock-step: the deployed twin, and the machine as a process of its own, under the co-simulation's clock.
+"""Lock-step: the deployed twin, and the machine as a separate process, under the co-simulation's clock.
 
-Sample time drives the link: delays, losses and duplicates are those of the scenario, drawn alike, and each message goes
-to the real service by HTTP, is committed, worked on in its pool, committed again and answered before time moves on. So
-estimates and versions are the co-simulation's, bit for bit, or something is wrong with one of them.
+Sample time drives the link: delays, losses and duplicates are those of the scenario. Each message goes to the real
+service over HTTP and is committed, processed in its pool, committed again and answered before time advances. So
+estimates and versions equal the co-simulation's bit for bit; a difference is a defect of one of them.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear
-from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, Window, decode, encode
+from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, WindowMessage, decode, encode
 from servotwin.plant.signals import PiecewiseCubic
 
-TIMEOUT = 300.0
-"""s for one answer: a proof may be part of it."""
+_TIMEOUT_S = 300.0
+"""s for one response, which may include a verification."""
 
 
-class Answered(msgspec.Struct, frozen=True):
-    """What the service says in lock-step.
+class LockstepResponse(msgspec.Struct, frozen=True):
+    """Response of the service in lock-step.
 
     Attributes
     ----------
     messages : list of bytes
     wake : float or None
-        Sample time at which the twin wants to be woken.
+        Sample time at which the twin is to be woken.
     """
 
     messages: list[bytes]
     wake: float | None
 
 
-_answered = msgspec.msgpack.Decoder(Answered)
+_response = msgspec.msgpack.Decoder(LockstepResponse)
 
 
 class HttpTwin:
-    """A twin in another process that keeps to sample time: a service whose file says `lockstep = true`.
+    """Client of a twin in lock-step: a service whose file has `lockstep = true`.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class HttpTwin:
         http://127.0.0.1:8765
     servo : str
     token : str
-        Empty: the service asks for none.
+        Empty: the service needs none.
     context : ssl.SSLContext, optional
         For https.
     """
@@ -68,35 +68,35 @@ class HttpTwin:
             raise InvalidInput(f"twin url = {url!r}: must be http://HOST:PORT or https://HOST:PORT")
         if token and in_clear(url):
             raise InvalidInput(f"twin url = {url!r}: would send the token in clear to another machine; give https://")
-        place: Any = {"host": parts.hostname, "port": parts.port, "timeout": TIMEOUT}
+        place: Any = {"host": parts.hostname, "port": parts.port, "timeout": _TIMEOUT_S}
         self._line = HTTPConnection(**place) if parts.scheme == "http" else HTTPSConnection(**place, context=context)
         self._path = f"/v1/servos/{servo}/lockstep"
         self._headers = {"authorization": f"Bearer {token}"} if token else {}
         self._wake: float | None = None
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """What it sends after a message that arrived at `now` (s)."""
-        return self._ask("receive", now, encode(message))
+        """Messages that it sends after a message that arrived at `now` (s)."""
+        return self._request("receive", now, encode(message))
 
     def wake(self, now: float) -> list[Message]:
-        """What it sends without having been asked."""
-        return self._ask("wake", now, b"")
+        """Messages that it sends by itself at `now` (s)."""
+        return self._request("wake", now, b"")
 
     def next_wake(self) -> float | None:
-        """When it wants to be woken, s, as it last said."""
+        """Time at which it is to be woken, s, as of its last response."""
         return self._wake
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._line.close()
 
-    def _ask(self, what: str, now: float, body: bytes) -> list[Message]:
+    def _request(self, what: str, now: float, body: bytes) -> list[Message]:
         self._line.request("POST", f"{self._path}/{what}?now={now!r}", body, self._headers)
         response = self._line.getresponse()
         data = response.read()
         if response.status != 200:
             raise InvalidInput(f"twin {self._path}/{what} at {now:g} s: {response.status} {data[:500].decode()}")
-        found = _answered.decode(data)
+        found = _response.decode(data)
         self._wake = found.wake
         return [decode(each) for each in found.messages]
 
@@ -109,7 +109,7 @@ class DrivenMachine:
     drive : SupervisedDrive
         Connected, at its first sample.
     scenario : Scenario
-        How long it runs.
+        Gives the number of samples.
     """
 
     def __init__(self, drive: SupervisedDrive, scenario: Scenario) -> None:
@@ -119,19 +119,19 @@ class DrivenMachine:
 
     @property
     def index(self) -> int:
-        """The present sample."""
+        """Present sample."""
         return self._index
 
     def advance(self, index: int) -> None:
-        """Go on to a sample."""
+        """Advance to a sample."""
         while self._index < index:
             block = self._drive.read(index - self._index)
             if block is None or block.first != self._index:
                 raise DriveLost(f"the machine did not give sample {self._index}")
-            self._keep(block)
+            self._append(block)
 
     def measured(self, name: str, first: int, last: int) -> Floats:
-        """A channel at samples first .. last - 1."""
+        """Samples first to last - 1 of a channel."""
         return self._signals[name][first:last]
 
     def set_tolerance(self, tolerance: float) -> None:
@@ -143,7 +143,7 @@ class DrivenMachine:
         self._write(tolerance, gains_of(controller))
 
     def set_reference(self, _reference: PiecewiseCubic) -> None:
-        """Not in lock-step.
+        """Lock-step has no excitation.
 
         Raises
         ------
@@ -155,24 +155,24 @@ class DrivenMachine:
         self._version += 1
         self._drive.write(Parameters(self._version, Setting(tolerance, gains)))
 
-    def _keep(self, block: Block) -> None:
+    def _append(self, block: Block) -> None:
         for name in CHANNELS:
             self._signals[name].extend(getattr(block, name))
         self._index = block.last
 
 
 class LockStep(msgspec.Struct, frozen=True):
-    """What crossed the link in lock-step, each once, in the order in which it was sent.
+    """Messages that crossed the link in lock-step, each once, in the order of sending.
 
     Attributes
     ----------
     windows, receipts, fallbacks : tuple
-        Of the edge.
+        From the edge.
     sent : tuple of Message
-        Of the twin: acknowledgements, updates, requests.
+        From the twin: acknowledgements, updates, requests.
     """
 
-    windows: tuple[Window, ...]
+    windows: tuple[WindowMessage, ...]
     receipts: tuple[Receipt, ...]
     fallbacks: tuple[Fallback, ...]
     sent: tuple[Message, ...]
@@ -184,12 +184,12 @@ def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress
     Parameters
     ----------
     scenario : Scenario
-        As the machine and the twin were told.
+        The one that machine and twin run.
     twin : Remote
         `HttpTwin`, or any other.
     drive : SupervisedDrive
     progress : callable, optional
-        Called with the share done.
+        Called with the completed share.
     """
     run = Cosimulation(scenario, DrivenMachine(drive, scenario), twin=twin)
     while not run.done:
@@ -198,5 +198,5 @@ def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress
             progress(run.share)
     up = {record.serial: decode(record.data) for record in run.link.up.records}
     down = {record.serial: decode(record.data) for record in run.link.down.records}
-    windows = {each.identity: each for each in up.values() if isinstance(each, Window)}
+    windows = {each.identity: each for each in up.values() if isinstance(each, WindowMessage)}
     return LockStep(tuple(windows.values()), tuple(run.receipts), tuple(run.fallbacks), tuple(down.values()))

@@ -1,4 +1,4 @@
-"""A link with outages: connections are passed on to the twin, and cut on a schedule."""
+"""Link with outages: connections are forwarded to the twin, and cut on a schedule."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
 
-LOOK_S = 0.1
-_PIECE = 65536
+_CHECK_S = 0.1
+_CHUNK = 65536
 
 
 class Outages(NamedTuple):
-    """When the link is cut, s since it began.
+    """Schedule of the outages, s since the start.
 
     Attributes
     ----------
     first, lasting, every : float
-        The first outage, how long each lasts, and from one to the next.
+        Start of the first outage, duration of each, period.
     """
 
     first: float = 6.0
@@ -27,24 +27,24 @@ class Outages(NamedTuple):
     every: float = 40.0
 
     def left(self, time: float) -> float:
-        """s until the present outage is over; 0: there is none."""
+        """s until the present outage ends; 0: there is none."""
         since = time - self.first
         return max(0.0, self.lasting - since % self.every) if since >= 0.0 else 0.0
 
 
 class Forwarder:
-    """Listens on a port of its own and passes connections on, but in outages.
+    """Forwards connections from a port of its own, except in outages.
 
     Parameters
     ----------
     target : int
-        Port of this machine, where connections go.
+        Local port that connections are forwarded to.
     outages : Outages
 
     Attributes
     ----------
     port : int
-        Where it listens.
+        Port that it listens on.
     """
 
     def __init__(self, target: int, outages: Outages) -> None:
@@ -54,49 +54,49 @@ class Forwarder:
         self._ready = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._main()), name="forwarder", daemon=True)
 
-    def begin(self) -> None:
-        """Listen; returns when it does.
+    def start(self) -> None:
+        """Start to listen; returns when it does.
 
         Raises
         ------
         InvalidInput
-            The system gives no port.
+            No port is available.
         """
         self._thread.start()
         while not self._ready.wait(0.1):
             if not self._thread.is_alive():
                 raise InvalidInput("the link with outages cannot listen on 127.0.0.1")
 
-    def end(self) -> None:
-        """Cut everything, and stop listening."""
+    def stop(self) -> None:
+        """Cut all connections and stop listening."""
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
+            self._loop.call_soon_threadsafe(self._stopping.set)
             self._thread.join()
 
     @property
     def left(self) -> float:
-        """s until the present outage is over; 0: there is none."""
+        """s until the present outage ends; 0: there is none."""
         return self._outages.left(self._loop.time() - self._zero)
 
     async def _main(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
         self._zero = self._loop.time()
-        server = await asyncio.start_server(self._pass_on, "127.0.0.1", 0)
+        server = await asyncio.start_server(self._forward, "127.0.0.1", 0)
         self.port = server.sockets[0].getsockname()[1]
         self._ready.set()
         async with server:
-            while not self._stop.is_set():
+            while not self._stopping.is_set():
                 if self.left:
                     self._cut()
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._stop.wait(), LOOK_S)
+                    await asyncio.wait_for(self._stopping.wait(), _CHECK_S)
             self._cut()
 
     def _cut(self) -> None:
         for writer in self._writers:
             writer.transport.abort()
 
-    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self.left:
             writer.transport.abort()
             return
@@ -105,19 +105,19 @@ class Forwarder:
         except OSError:
             writer.transport.abort()
             return
-        mine = {writer, onward[1]}
-        self._writers |= mine
+        writers = {writer, onward[1]}
+        self._writers |= writers
         try:
             await asyncio.gather(_pump(reader, onward[1]), _pump(onward[0], writer))
         finally:
-            self._writers -= mine
-            for each in mine:
+            self._writers -= writers
+            for each in writers:
                 each.transport.abort()
 
 
 async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     with suppress(OSError):
-        while data := await reader.read(_PIECE):
+        while data := await reader.read(_CHUNK):
             writer.write(data)
             await writer.drain()
         writer.write_eof()

@@ -1,19 +1,19 @@
-"""What runs: three servos that wear at different rates, and what is written of them at the first start."""
+"""Plan of `servotwin up`: three servos that wear at different rates, and the files of their first start."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 RATE = 1000.0
-"""Hz. It gives gaps to a thousandth of a degree, and each tick costs the same, however many there are in a second."""
+"""Hz. It resolves gaps to a thousandth of a degree; the cost grows with the number of ticks."""
 WINDOW_S, PRE_TRIGGER_S = 4.0, 0.3
-"""A calm loop turns the screw back late: windows of 2 s show one side only of gaps from 26 deg on, those of 3 s both
-sides of 40."""
+"""s. A slow loop reverses late: windows of 2 s show only one side of gaps from 26 deg on, windows of 3 s both sides of
+40 deg."""
 NEW_GAP, WORN_GAP = 0.0, 40.0
 """deg"""
 HOUR = 3600.0
 POLICIES = {"certified": "certified", "dead-zone": "hysteresis"}
-"""Of each model."""
+"""Policy of each model."""
 
 
 class ServoPlan(NamedTuple):
@@ -23,20 +23,20 @@ class ServoPlan(NamedTuple):
     ----------
     name : str
     trait : str
-        What is special about it.
+        Its special feature, for the display.
     role : str
-        "control": the edge ticks the law at every sample, which costs most of the processor's time, so that one does.
-        "supervise": the machine has a controller of its own, and its samples come in blocks.
+        "control": the edge runs the law at every sample, which costs most processor time: only one servo does.
+        "supervise": the machine has its own controller, and its samples come in blocks.
     model : str
         One of `POLICIES`.
     wears_h, age_h : float
-        h of machine time from new to worn out, and how many of them have passed at the first start.
+        h of machine time from new to worn out, and h that have passed at the first start.
     noise_mm : float
         rms, of the position's encoder.
     bias_v : float
         On the motor's input, as of an amplifier.
     outages : bool
-        Whether its link is cut now and then.
+        Its link has outages.
     """
 
     name: str
@@ -58,13 +58,13 @@ SERVOS = (
 
 
 def twin_toml(servos: tuple[ServoPlan, ...], most_speed: float) -> str:
-    """The twin's file."""
+    """Text of the twin's file."""
     named = "".join(f'"{servo.name}" = "{servo.model}"\n' for servo in servos)
     return _SERVICE.format(speed=most_speed) + "".join(map(_model, POLICIES)) + f"\n[servos]\n{named}"
 
 
 def machine_toml(servo: ServoPlan) -> str:
-    """The machine's file."""
+    """Text of a machine's file."""
     values = {**servo._asdict(), "rate": RATE, "new": NEW_GAP, "worn": WORN_GAP, "over": servo.wears_h * HOUR}
     noise = f"\n[scenario.noise]\nstd_mm = {servo.noise_mm}\n" if servo.noise_mm else ""
     return _MACHINE.format(**values, begin=-servo.age_h * HOUR) + noise

@@ -1,25 +1,25 @@
-"""All processes together: started in order, kept running, ended in order."""
+"""Processes of `servotwin up`: started in order, restarted when they end, stopped in order."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 
 from servotwin.runtime.child_process import Child
 from servotwin.up.folder import EDGE, MACHINE, TWIN, Folder
 from servotwin.up.outages import Forwarder, Outages
 from servotwin.up.plan import SERVOS
 
-LISTENING = "servotwin twin: listening on "
-READY_S, END_S, PIECE_S = 600.0, 20.0, 0.05
-"""Compiling at the very first start takes its time."""
+_LISTENING = "servotwin twin: listening on "
+_READY_S, _STOP_S, _POLL_S = 600.0, 20.0, 0.05
+"""The very first start compiles, which takes minutes."""
 
-Stopping = Callable[[], int]
-"""How often somebody has asked to stop: at the second time nothing is waited for."""
+Signals = Callable[[], int]
+"""Number of signals so far; after the second one processes are killed."""
 
 
-class Stopped(Exception):
-    """Somebody asked to stop before everything ran."""
+class StartInterrupted(Exception):
+    """A signal came before everything ran."""
 
 
 class Site:
@@ -29,11 +29,11 @@ class Site:
     ----------
     folder : Folder
     outages : Outages
-    stopping : Stopping
+    signals : Signals
     """
 
-    def __init__(self, folder: Folder, outages: Outages, stopping: Stopping) -> None:
-        self._folder, self._outages, self._stopping = folder, outages, stopping
+    def __init__(self, folder: Folder, outages: Outages, signals: Signals) -> None:
+        self._folder, self._outages, self._signals = folder, outages, signals
         self.twin = self._child("twin", ("servotwin", "twin", "--config", str(folder.path / TWIN), "--port", "0"))
         self.machines = {servo.name: self._machine(servo.name) for servo in SERVOS}
         self.edges = {servo.name: self._edge(servo.name) for servo in SERVOS}
@@ -41,27 +41,27 @@ class Site:
 
     @property
     def url(self) -> str:
-        """Of the twin."""
+        """URL of the twin."""
         return self.twin.address or ""
 
     @property
     def children(self) -> list[Child]:
-        """Every process."""
+        """All processes."""
         return [self.twin, *self.machines.values(), *self.edges.values()]
 
     @property
     def groups(self) -> set[int]:
-        """Their process groups."""
+        """Ids of their process groups."""
         return {child.pid for child in self.children if child.pid is not None}
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Start twin and machines, then the edges.
 
         Raises
         ------
         InvalidInput
-            One does not start.
-        Stopped
+            A process does not start.
+        StartInterrupted
         """
         first = [self.twin, *self.machines.values()]
         for child in first:
@@ -70,20 +70,20 @@ class Site:
         port = self.url.rpartition(":")[2]
         self.twin.command = (*self.twin.command[:-1], port)
         self.forwarder = Forwarder(int(port), self._outages)
-        self.forwarder.begin()
+        self.forwarder.start()
         for servo in SERVOS:
             through = f"http://127.0.0.1:{self.forwarder.port}" if servo.outages else self.url
             self._folder.connect(servo, through)
         for child in self.edges.values():
             child.start()
 
-    def tend(self, now: float) -> list[str]:
-        """Start again what has ended by itself; returns what did.
+    def restart_ended(self, now: float) -> list[str]:
+        """Restart processes that ended by themselves; returns a message for each.
 
         Raises
         ------
         InvalidInput
-            Something ends again and again.
+            A process keeps ending.
         """
         ended = []
         for child in self.children:
@@ -93,15 +93,15 @@ class Site:
                 child.restart(now)
         return ended
 
-    def end(self) -> None:
-        """End edges, then machines, then the twin."""
-        self._end(self.edges.values())
-        self._end(self.machines.values())
+    def stop(self) -> None:
+        """Stop edges, then machines, then the twin."""
+        self._stop(self.edges.values())
+        self._stop(self.machines.values())
         if self.forwarder is not None:
-            self.forwarder.end()
-        self._end([self.twin])
+            self.forwarder.stop()
+        self._stop([self.twin])
 
-    def _child(self, name: str, command: tuple[str, ...], ready: str = LISTENING) -> Child:
+    def _child(self, name: str, command: tuple[str, ...], ready: str = _LISTENING) -> Child:
         log = self._folder.path / f"{name.replace(' ', '-')}.log"
         return Child(name, command, log, ready, self._folder.lock)
 
@@ -113,27 +113,26 @@ class Site:
         return self._child(f"edge {servo}", ("servotwin.edge_process", str(self._folder.path / servo / EDGE)), "")
 
     def _await(self, children: list[Child]) -> None:
-        end = time.monotonic() + READY_S
+        end = time.monotonic() + _READY_S
         while any(child.address is None for child in children):
             for child in children:
                 child.read_output()
                 if child.address is None and child.code is not None:
                     raise child.failure(f"does not start (code {child.code})")
                 if time.monotonic() > end:
-                    raise child.failure(f"is not ready after {READY_S:.0f} s")
-            if self._stopping():
-                raise Stopped
-            time.sleep(PIECE_S)
+                    raise child.failure(f"is not ready after {_READY_S:.0f} s")
+            if self._signals():
+                raise StartInterrupted
+            time.sleep(_POLL_S)
 
-    def _end(self, children: Iterable[Child]) -> None:
-        asked = list(children)
-        for child in asked:
+    def _stop(self, children: Collection[Child]) -> None:
+        for child in children:
             child.terminate()
-        end = time.monotonic() + END_S
-        while any(child.pid is not None and child.code is None for child in asked):
-            if time.monotonic() > end or self._stopping() > 1:
-                for child in asked:
+        end = time.monotonic() + _STOP_S
+        while any(child.pid is not None and child.code is None for child in children):
+            if time.monotonic() > end or self._signals() > 1:
+                for child in children:
                     child.kill()
-            time.sleep(PIECE_S)
-        for child in asked:
+            time.sleep(_POLL_S)
+        for child in children:
             child.release()

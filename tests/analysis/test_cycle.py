@@ -179,9 +179,11 @@ def test_random_servos_against_a_long_run(n, seed, gap_deg, share):
     if found.orbit is None:
         assert np.ptp(position[-50_000:]) < 1e-3 * servo.p * gap
     elif np.abs(found.orbit.multipliers[0]) < 0.8:
-        assert 0.5 * np.ptp(position[-50_000:]) == pytest.approx(found.orbit.amplitude, rel=1e-6)
+        # The run comes closer to the orbit by its largest multiplier in every period.
+        left = 10.0 * np.abs(found.orbit.multipliers[0]) ** (70.0 / found.orbit.period)
+        assert 0.5 * np.ptp(position[-50_000:]) == pytest.approx(found.orbit.amplitude, rel=1e-6 + left)
         period = np.array(releases) - releases[-1] + found.orbit.period
-        assert np.min(np.abs(period)) < 1e-9 * found.orbit.period
+        assert np.min(np.abs(period)) < (1e-9 + left) * found.orbit.period
 
 
 def test_an_elastic_screw_has_no_shift_and_a_rigid_one_has():

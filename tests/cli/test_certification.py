@@ -14,7 +14,7 @@ from servotwin.cli.app import app
 from servotwin.cli.certify import certify, grid_of
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.lookup import Grid
-from servotwin.twin.fleet import Fleet
+from servotwin.twin.models import ModelRegistry
 
 COARSE = Grid(math.radians(60.0), (1e-2,), (0.0,))
 MODEL = """
@@ -39,12 +39,14 @@ def quiet() -> Console:
 def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path: Path) -> None:
     path = twin_file(tmp_path, ("one", "one.table"), ("other", ""))
     with pytest.raises(InvalidInput, match=r"one\.table: cannot be read .*`servotwin certify` makes tables"):
-        Fleet.loads(path.read_text(), "twin.toml", tmp_path)
+        ModelRegistry.loads(path.read_text(), "twin.toml", tmp_path)
     console = quiet()
     (table,) = certify(path, grid=COARSE, console=console)
     assert "1 of 1 cells of gaps from 0 to 60 deg are proved" in console.file.getvalue()
     assert len(table.cells) == 1
-    assert Fleet.loads(path.read_text(), "twin.toml", tmp_path).models[0].settings.table == str(tmp_path / "one.table")
+    assert ModelRegistry.loads(path.read_text(), "twin.toml", tmp_path).models[0].settings.table == str(
+        tmp_path / "one.table"
+    )
 
 
 def test_one_model_may_be_named_and_its_file(tmp_path: Path) -> None:

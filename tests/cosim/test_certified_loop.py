@@ -10,9 +10,9 @@ from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.estimation.estimate import GapStatus
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.twin.policies import certified
-from servotwin.twin.proof import verification_of
+from servotwin.redesign.registry import certified_policy
 from servotwin.twin.settings import TwinSettings
+from servotwin.twin.step import verification_of
 
 LEARNT = 20.0  # s, the second step begins
 
@@ -81,7 +81,7 @@ def test_the_same_scenario_gives_the_same_bytes():
 def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
     scenario = Scenario.preset("certified")
     alone = cosimulate(scenario.replace(duration=60.0, twin=scenario.twin.replace(enabled=False)))
-    proved = certified(scenario.model, scenario.twin).fallback()
+    proved = certified_policy(scenario.model, scenario.twin).fallback()
     assert not alone.fallbacks
     error = np.abs(alone.run.reference - alone.run.position)
     settled = slice(round(55.0 * alone.run.sample_rate), -1)

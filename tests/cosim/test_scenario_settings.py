@@ -10,8 +10,8 @@ from servotwin.config.keys import items_of
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.estimation import paper, whitened
 from servotwin.messages import Band, Gains, Setting

@@ -21,7 +21,7 @@ from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.client import SimulatedControl, SimulatedSupervised
 from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
 from servotwin.drives.simulated.settings import MachineSettings
-from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, Sample, SupervisedDrive
+from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, DriveSample, SupervisedDrive
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Setting
@@ -291,7 +291,7 @@ def test_what_is_wrong_in_a_machines_file_is_said_in_one_sentence(
     assert str(path) in str(error.value)
 
 
-def _ticked(drive: ControlDrive) -> Sample:
+def _ticked(drive: ControlDrive) -> DriveSample:
     sample = drive.read()
     assert sample is not None
     drive.write(0.0)

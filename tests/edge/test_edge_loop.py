@@ -6,13 +6,13 @@ from functools import partial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink
-from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.runtime.clock import VirtualClock
 from servotwin.runtime.retry import Retry
 
@@ -20,7 +20,7 @@ RATE, STEPS, HOSTILE_S, TAIL_S = 10.0, 10, 20.0, 40.0
 """Tiny windows of four samples, a reference step every two seconds, then a clean link to settle on."""
 
 
-def make_update(version: int, base: int, window: Window, lifetime_s: float) -> Update:
+def make_update(version: int, base: int, window: WindowMessage, lifetime_s: float) -> Update:
     """An update whose tolerance tells its window."""
     known, start = (None, None, (None, None)), window.start
     tolerance = 1e-5 * (1 + window.sequence)
@@ -35,12 +35,12 @@ class StubTwin:
     lifetime_s: float
     version: int = 0
     base: int = 0
-    newest: Window | None = None
+    newest: WindowMessage | None = None
     pending: Update | None = None
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
-        if isinstance(message, Window):
+        if isinstance(message, WindowMessage):
             return self._window(message)
         if isinstance(message, Receipt) and self.pending and message.version == self.pending.version:
             return self._receipt(message)
@@ -49,7 +49,7 @@ class StubTwin:
     def repeat(self) -> list[Message]:
         return [self.pending] if self.pending else []
 
-    def _window(self, window: Window) -> list[Message]:
+    def _window(self, window: WindowMessage) -> list[Message]:
         self.seen.add(window.sequence)
         answer: list[Message] = [Acknowledge(window.servo, window.boot, window.sequence)]
         if self.newest is None or window.start > self.newest.start:
@@ -62,7 +62,7 @@ class StubTwin:
         refused = receipt.reason in (Reason.BASE_MISMATCH, Reason.OLD_VERSION)
         return self._issue(self.newest) if refused and self.newest else []
 
-    def _issue(self, window: Window) -> list[Message]:
+    def _issue(self, window: WindowMessage) -> list[Message]:
         self.version = max(self.version, self.base) + 1
         self.pending = make_update(self.version, self.base, window, self.lifetime_s)
         return [self.pending]
@@ -77,20 +77,20 @@ class CarelessTwin:
 
     lifetime_s: float
     version: int = 1
-    said: list[Message] = field(default_factory=list)
+    updates: list[Message] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
-        if not isinstance(message, Window):
+        if not isinstance(message, WindowMessage):
             return []
         self.seen.add(message.sequence)
         self.version += message.sequence % 3 != 0
         base = max(0, self.version - 1 - message.sequence % 2)
-        self.said.append(make_update(self.version, base, message, self.lifetime_s))
-        return [Acknowledge(message.servo, message.boot, message.sequence), self.said[-1]]
+        self.updates.append(make_update(self.version, base, message, self.lifetime_s))
+        return [Acknowledge(message.servo, message.boot, message.sequence), self.updates[-1]]
 
     def repeat(self) -> list[Message]:
-        return self.said[-6:]
+        return self.updates[-6:]
 
 
 class Loop:
@@ -130,7 +130,7 @@ class Loop:
             self.history.append(self.agent.parameters)
             self.swaps.append((message.base_version, before.version))
 
-    def _up(self, sent: list[Outgoing]) -> None:
+    def _up(self, sent: list[OutgoingMessage]) -> None:
         for out in sent:
             if isinstance(out.message, Receipt):
                 self.receipts.append(out.message)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.supervisor import Supervisor
@@ -24,7 +24,7 @@ from servotwin.messages import (
     Probe,
     Request,
     Setting,
-    Window,
+    WindowMessage,
     unpack_channel,
 )
 from servotwin.runtime.retry import Retry
@@ -46,7 +46,7 @@ def request(serial: int = 1, ask: Any = MOVE, **changes: Any) -> Request:
 
 def feed(agent: Agent, wanted: list[float]) -> list[Message]:
     """As whoever ticks the law does: wanted position plus the agent's offset, one sample after the other."""
-    sent = list[Outgoing]()
+    sent = list[OutgoingMessage]()
     for value in wanted:
         k = float(agent.samples)
         sent += agent.absorb(value + agent.offset, 0.1 * k, 1e-3 * k, -k)
@@ -59,14 +59,14 @@ def answer(agent: Agent, message: Request) -> Answer:
     return said.message
 
 
-def references(window: Window) -> list[float]:
+def references(window: WindowMessage) -> list[float]:
     channel = window.channel("reference")
     assert channel is not None
     return [round(1e6 * x) / 1e6 for x in unpack_channel(channel)]
 
 
-def windows(sent: list[Message]) -> list[Window]:
-    return [message for message in sent if isinstance(message, Window)]
+def windows(sent: list[Message]) -> list[WindowMessage]:
+    return [message for message in sent if isinstance(message, WindowMessage)]
 
 
 def test_a_longer_window_counts_from_the_next_change_on() -> None:
@@ -113,7 +113,7 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
     feed(agent, [0.0] * 30)
     assert answer(agent, request()).taken
     fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
-    monkeypatch.setattr(Supervisor, "look", lambda self: (fallback,) if self._recorder.samples == 34 else ())
+    monkeypatch.setattr(Supervisor, "check", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
     assert fallback in sent
     assert windows(sent) == []
@@ -155,9 +155,9 @@ def test_without_permission_no_move() -> None:
 def test_what_is_refused_and_why(message: Request, outcome: Outcome) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
-    before = agent._granted
+    before = agent._requests
     assert answer(agent, message).outcome is outcome
-    assert (replace(agent._granted, answer=None) == before) == (outcome is not Outcome.TAKEN)
+    assert (replace(agent._requests, answer=None) == before) == (outcome is not Outcome.TAKEN)
 
 
 def test_a_request_counts_once_and_is_answered_again() -> None:
@@ -201,7 +201,7 @@ def test_blocks_equal_single_samples(wanted: list[tuple[float, int]], requests: 
     """Blocks end where requests come and, during a move, with the sample at which the wanted position changes."""
     reference = [value for value, count in wanted for _ in range(count)]
     single, blocks = Agent(settings()), Agent(settings())
-    one, other = list[Outgoing](), list[Outgoing]()
+    one, other = list[OutgoingMessage](), list[OutgoingMessage]()
     serial, done = 0, 0
     while done < len(reference):
         if done in requests:

@@ -24,7 +24,7 @@ UPDATE = Update("axis-1", 3, 2, ("b0", 1), 20.0, 0.1, 0.01, (0.08, 0.12), "OK", 
 def decide(update: Update, current: Parameters, limits: Limits, here: Instant) -> tuple[Parameters, Receipt]:
     """What is in force after the update, and the receipt, where nothing has to wait."""
     step = offer(Switch(current), update, Rules(limits), here, None)
-    (receipt,) = step.said
+    (receipt,) = step.messages
     assert isinstance(receipt, Receipt)
     return step.state.current, receipt
 

@@ -5,7 +5,7 @@ from collections import deque
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.edge.moves import Moves
+from servotwin.edge.watch import ReferenceMoves
 
 VALUES = st.sampled_from([0.0, 1.0, 2.0, 3.0])
 STEPS = st.lists(st.tuples(st.integers(0, 3), st.integers(-4, 12), VALUES, VALUES), max_size=40)
@@ -13,7 +13,7 @@ STEPS = st.lists(st.tuples(st.integers(0, 3), st.integers(-4, 12), VALUES, VALUE
 
 @given(STEPS)
 def test_it_is_the_extremes_of_the_moves_that_count(steps: list[tuple[int, int, float, float]]) -> None:
-    moves, every, sample = Moves(), deque[tuple[int, float, float]](), 0
+    moves, every, sample = ReferenceMoves(), deque[tuple[int, float, float]](), 0
     for ahead, lasting, a, b in steps:
         sample += ahead
         every.append((sample + lasting, min(a, b), max(a, b)))

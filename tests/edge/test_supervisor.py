@@ -10,15 +10,15 @@ from msgspec.structs import replace
 
 from servotwin.control import Controller
 from servotwin.control.gains import gains_of
-from servotwin.edge.agent import Agent, Outgoing
+from servotwin.edge.agent import Agent, OutgoingMessage
 from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.store import MemoryParameterStore
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Setting, Update, Window
+from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage
 
 RATE = 200.0
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=RATE)
@@ -41,7 +41,7 @@ def update(version: int, base: int, data_time: float, tolerance: float = 1e-4) -
     )
 
 
-def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float = 1.5) -> list[Outgoing]:
+def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float = 1.5) -> list[OutgoingMessage]:
     """Samples of a loop whose error swings, its reference 1 mm."""
     count = round(seconds * RATE)
     times = [(agent.samples + k) / RATE for k in range(count)]
@@ -50,7 +50,7 @@ def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float 
     return agent.absorb_block([1e-3] * count, rest, position, rest)
 
 
-def fallbacks(sent: list[Outgoing]) -> list[Fallback]:
+def fallbacks(sent: list[OutgoingMessage]) -> list[Fallback]:
     return [out.message for out in sent if isinstance(out.message, Fallback)]
 
 
@@ -99,7 +99,7 @@ def test_after_a_fallback_a_good_update_counts_again() -> None:
 def test_a_silent_twin_is_borne_for_a_while(answers: bool) -> None:
     agent = Agent(agent_settings(silence_s=6.0, watch=None))
     sent = feed(agent, 2.0)
-    (window,) = [out.message for out in sent if isinstance(out.message, Window)]
+    (window,) = [out.message for out in sent if isinstance(out.message, WindowMessage)]
     if answers:
         agent.receive(Acknowledge("axis-1", "b0", window.sequence))
     found = fallbacks(feed(agent, 20.0))
@@ -149,7 +149,7 @@ STEPS = st.lists(st.tuples(st.integers(1, 400), st.sampled_from([0.0, 2e-5, 1.5e
 @given(steps=STEPS)
 def test_blocks_and_single_samples_decide_the_same(steps: list[tuple[int, float, bool]]) -> None:
     agents = [Agent(agent_settings(3.0, 0.5)) for _ in range(2)]
-    sent: list[list[Outgoing]] = [[], []]
+    sent: list[list[OutgoingMessage]] = [[], []]
     version = 0
     for samples, amplitude, offered in steps:
         times = [(agents[0].samples + k) / RATE for k in range(samples)]

@@ -12,9 +12,9 @@ from servotwin.control import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
-from servotwin.edge.switch import Rules, Switch, Waiting, fall_back, is_safe, offer, settle
-from servotwin.edge.verdict import FallbackSet, Verdict
+from servotwin.edge.parameters import FallbackSet, Parameters
+from servotwin.edge.switch import PendingUpdate, Rules, Switch, apply_pending, fall_back, is_safe, offer
+from servotwin.edge.watch import Violation
 from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
@@ -47,27 +47,27 @@ def test_a_safe_instant_is_used_at_once(error: float | None) -> None:
 def test_between_the_thresholds_it_waits_and_the_receipt_tells_the_sample(error: float) -> None:
     state, said = offer(START, UPDATE, RULES, at(22.0), error)
     assert (said, state.current) == ((), START.current)
-    assert settle(state, RULES, at(22.5), error) == (state, ())
-    state, said = settle(state, RULES, at(22.6), 2.1e-4)
+    assert apply_pending(state, RULES, at(22.5), error) == (state, ())
+    state, said = apply_pending(state, RULES, at(22.6), 2.1e-4)
     assert isinstance(said[0], Receipt)
     assert (said[0].applied, said[0].sample) == (True, 113_000)
     assert state.current.sample == 113_000
-    assert state.waiting is None
+    assert state.pending is None
 
 
 def test_patience_ends_and_the_update_is_applied() -> None:
     state, _ = offer(START, UPDATE, RULES, at(22.0), 1.5e-4)
-    assert settle(state, RULES, at(23.9998), 1.5e-4).state.current is START.current
-    assert reasons(settle(state, RULES, at(24.0), 1.5e-4).said) == [(1, Reason.APPLIED)]
+    assert apply_pending(state, RULES, at(23.9998), 1.5e-4).state.current is START.current
+    assert reasons(apply_pending(state, RULES, at(24.0), 1.5e-4).messages) == [(1, Reason.APPLIED)]
 
 
 def test_without_patience_nothing_waits() -> None:
-    assert reasons(offer(START, UPDATE, Rules(Limits(), PAPER), at(22.0), 1.5e-4).said) == [(1, Reason.APPLIED)]
+    assert reasons(offer(START, UPDATE, Rules(Limits(), PAPER), at(22.0), 1.5e-4).messages) == [(1, Reason.APPLIED)]
 
 
 def test_what_expires_while_it_waits_is_refused() -> None:
     state, _ = offer(START, replace(UPDATE, not_after=23.0), RULES, at(22.0), 1.5e-4)
-    state, said = settle(state, RULES, at(23.0), 0.0)
+    state, said = apply_pending(state, RULES, at(23.0), 0.0)
     assert reasons(said) == [(1, Reason.EXPIRED)]
     assert state == START
 
@@ -82,10 +82,10 @@ def test_a_newer_update_takes_the_place_of_what_waits() -> None:
     newer = replace(UPDATE, version=2, window=("b0", 1), data_time=21.0)
     state, said = offer(state, newer, RULES, at(22.5), 1.5e-4)
     assert reasons(said) == [(1, Reason.SUPERSEDED)]
-    assert state.waiting == Waiting(newer, at(22.5).sample)
+    assert state.pending == PendingUpdate(newer, at(22.5).sample)
     older = replace(newer, version=3, data_time=20.5)
-    assert reasons(offer(state, older, RULES, at(22.6), 0.0).said) == [(3, Reason.OLD_DATA)]
-    assert reasons(offer(state, UPDATE, RULES, at(22.6), 0.0).said) == [(1, Reason.OLD_VERSION)]
+    assert reasons(offer(state, older, RULES, at(22.6), 0.0).messages) == [(3, Reason.OLD_DATA)]
+    assert reasons(offer(state, UPDATE, RULES, at(22.6), 0.0).messages) == [(1, Reason.OLD_VERSION)]
 
 
 @pytest.mark.parametrize(
@@ -109,8 +109,8 @@ def test_every_threshold_counts(old: float, new: float, error: float, safe: bool
 
 def test_without_a_controller_gains_are_refused() -> None:
     rules = Rules(Limits())
-    assert reasons(offer(START, UPDATE, rules, at(22.0), 0.0).said) == [(1, Reason.NO_GAINS)]
-    assert reasons(offer(START, replace(UPDATE, setting=Setting(2e-4, None, BAND)), rules, at(22.0), 0.0).said) == [
+    assert reasons(offer(START, UPDATE, rules, at(22.0), 0.0).messages) == [(1, Reason.NO_GAINS)]
+    assert reasons(offer(START, replace(UPDATE, setting=Setting(2e-4, None, BAND)), rules, at(22.0), 0.0).messages) == [
         (1, Reason.APPLIED)
     ]
 
@@ -122,7 +122,7 @@ def test_an_update_without_gains_leaves_them() -> None:
     assert (state.current.setting.gains, state.current.setting.band) == (CALM, None)
 
 
-VERDICT = Verdict(Cause.LIMIT_CYCLE, 2e-4, 5e-5)
+VERDICT = Violation(Cause.LIMIT_CYCLE, 2e-4, 5e-5)
 SET = FallbackSet(Setting(0.0, CALM, BAND), refuse_s=10.0)
 
 
@@ -151,7 +151,7 @@ def test_after_a_fallback_only_news_counts_and_not_at_once(
     changes: dict[str, Any], seconds: float, reason: Reason
 ) -> None:
     state, _ = fall_back(Switch(Parameters(4, Setting(1e-4), 20.0)), SET, VERDICT, at(23.0))
-    (receipt,) = offer(state, replace(UPDATE, **changes), RULES, at(seconds), 1e-3).said
+    (receipt,) = offer(state, replace(UPDATE, **changes), RULES, at(seconds), 1e-3).messages
     assert isinstance(receipt, Receipt)
     assert (receipt.reason, receipt.version) == (reason, changes["version"])
 
@@ -178,7 +178,7 @@ def test_every_update_is_answered_at_most_once_and_versions_only_rise(steps: lis
             state, said = fall_back(state, FallbackSet(Setting(0.0, CALM), refuse_s=0.0), VERDICT, at(second))
             number = count(state.current.version + 1)
         else:
-            state, said = settle(state, RULES, at(second), error)
+            state, said = apply_pending(state, RULES, at(second), error)
         answered += [receipt.version for receipt in said if isinstance(receipt, Receipt)]
         assert state.current.version > before.version or state.current is before
         assert state.current.data_time >= before.data_time

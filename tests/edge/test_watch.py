@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-from servotwin.edge.turns import Turns
-from servotwin.edge.verdict import Verdict
-from servotwin.edge.watch import Watch, WatchSettings
+from servotwin.edge.watch import TurningPoints, Violation, Watch, WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Cause
 
@@ -20,7 +18,7 @@ Signal = Callable[[float], float]
 
 def watched(
     error: Signal, voltage: Signal = lambda _: 0.0, seconds: float = 20.0, band: Band | None = BAND, **settings: Any
-) -> tuple[float, Verdict] | None:
+) -> tuple[float, Violation] | None:
     """Time of the first verdict, and the verdict; the reference steps once, at 1 s."""
     watch = Watch(WatchSettings(**settings), RATE)
     watch.restart(band, 0)
@@ -28,7 +26,7 @@ def watched(
         times = [k / RATE for k in range(first, first + BLOCK)]
         reference = [1e-3 if t >= 1.0 else 0.0 for t in times]
         position = [r - error(t) for r, t in zip(reference, times, strict=True)]
-        verdict = watch.see(first, reference, position, [voltage(t) for t in times])
+        verdict = watch.update(first, reference, position, [voltage(t) for t in times])
         if verdict is not None:
             return (first + BLOCK) / RATE, verdict
     return None
@@ -89,7 +87,7 @@ def test_an_error_outside_the_band(error: float, found: bool) -> None:
     result = watched(lambda _: error, band=band)
     assert (result is not None) is found
     if result is not None:
-        assert result[1] == Verdict(Cause.ERROR, pytest.approx(1.3e-4), pytest.approx(1.25e-4))
+        assert result[1] == Violation(Cause.ERROR, pytest.approx(1.3e-4), pytest.approx(1.25e-4))
         assert result[0] == pytest.approx(3.05, abs=0.051)
 
 
@@ -100,7 +98,7 @@ def test_a_short_blow_is_forgiven() -> None:
 def test_error_energy_outside_the_band() -> None:
     result = watched(lambda t: 9e-5 * (-1) ** int(t * RATE), band=BAND)  # too quick for the slots' mean
     assert result is not None
-    assert result[1] == Verdict(Cause.ERROR_ENERGY, pytest.approx(9e-5), pytest.approx(1.25 * 3e-5))
+    assert result[1] == Violation(Cause.ERROR_ENERGY, pytest.approx(9e-5), pytest.approx(1.25 * 3e-5))
     assert result[0] == pytest.approx(3.0 + WatchSettings().window_s, abs=0.06)
 
 
@@ -120,8 +118,8 @@ def test_a_moving_reference_is_never_judged() -> None:
     for first in range(0, 20_000, BLOCK):
         reference = [math.sin((first + k) / RATE) for k in range(BLOCK)]
         position = [0.7 * math.sin((first + k) / RATE - 0.9) for k in range(BLOCK)]
-        assert watch.see(first, reference, position, [9.0] * BLOCK) is None
-    assert not watch.proven
+        assert watch.update(first, reference, position, [9.0] * BLOCK) is None
+    assert not watch.verified
 
 
 def test_a_loop_that_runs_away_is_stopped_before_it_should_have_settled() -> None:
@@ -133,7 +131,7 @@ def test_a_loop_that_runs_away_is_stopped_before_it_should_have_settled() -> Non
         times = [(first + k) / RATE for k in range(BLOCK)]
         reference = [1e-3 * (t >= 1.0) for t in times]
         position = [(t >= 1.0) * (1e-3 - 1e-3 * math.exp(5.0 * (t - 1.0))) for t in times]
-        verdicts.append(watch.see(first, reference, position, [0.0] * BLOCK))
+        verdicts.append(watch.update(first, reference, position, [0.0] * BLOCK))
     caught = next(k for k, verdict in enumerate(verdicts) if verdict is not None)
     verdict = verdicts[caught]
     assert verdict is not None
@@ -145,12 +143,12 @@ def test_new_parameters_are_held_to_what_is_certified_until_they_must_do_what_is
     watch = Watch(WatchSettings(), RATE, 0.0, BAND)
     calm = [0.0] * BLOCK
     for first in range(0, 5000, BLOCK):
-        watch.see(first, calm, calm, calm)
+        watch.update(first, calm, calm, calm)
     watch.restart(Band(1e-5, 1.0, 1.0, 1.0), 5000)
-    verdicts = [watch.see(first, calm, [-1.1e-4] * BLOCK, calm) for first in range(5000, 7000, BLOCK)]
+    verdicts = [watch.update(first, calm, [-1.1e-4] * BLOCK, calm) for first in range(5000, 7000, BLOCK)]
     assert next(k for k, verdict in enumerate(verdicts) if verdict) == 20
     watch.restart(Band(1e-5, 1.0, 1.0, 1.0), 7000)
-    assert watch.see(7000, calm, [-1.3e-4] * BLOCK, calm) == Verdict(
+    assert watch.update(7000, calm, [-1.3e-4] * BLOCK, calm) == Violation(
         Cause.ERROR, pytest.approx(1.3e-4), pytest.approx(1.25e-4)
     )
 
@@ -160,11 +158,11 @@ def test_new_parameters_are_judged_by_their_own_evidence() -> None:
     watch.restart(Band(1.0, 1.0, 1.0, 0.0), 0)
     calm = [0.0] * BLOCK
     for first in range(0, 5000, BLOCK):
-        assert watch.see(first, calm, calm, calm) is None
-    assert watch.proven
+        assert watch.update(first, calm, calm, calm) is None
+    assert watch.verified
     watch.restart(Band(1e-4, 1.0, 1.0, 1.0), 5000)
-    assert not watch.proven
-    verdicts = [watch.see(first, calm, [9e-4] * BLOCK, calm) for first in range(5000, 7000, BLOCK)]
+    assert not watch.verified
+    verdicts = [watch.update(first, calm, [9e-4] * BLOCK, calm) for first in range(5000, 7000, BLOCK)]
     assert [verdict is None for verdict in verdicts[:20]] == [True] * 20
     assert verdicts[20] is not None
 
@@ -180,5 +178,5 @@ def test_bad_settings_are_refused(values: dict[str, Any]) -> None:
 
 
 def test_turns_need_more_than_the_reversal() -> None:
-    turns = Turns(1.0, 2)
+    turns = TurningPoints(1.0, 2)
     assert [turns.add(value) for value in (0.0, 5.0, 4.5, 5.2, 4.1, 0.0, 3.0)] == [False] * 4 + [True, False, True]

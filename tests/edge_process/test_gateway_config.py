@@ -13,10 +13,9 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.limits import Limits
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.verdict import FallbackSet
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
 from servotwin.edge_process.config_file import edge_toml, load, read_config

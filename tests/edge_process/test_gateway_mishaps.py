@@ -12,12 +12,12 @@ import pytest
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
-from servotwin.edge.cut import Cut
 from servotwin.edge.drive import DriveLost
 from servotwin.edge.limits import Limits
 from servotwin.edge.outlet import UNFILTERED
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
+from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process import frame_handler, frames, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.control.law import start, tick
-from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
+from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
 from servotwin.edge_process.config import EdgeConfig
@@ -74,7 +74,7 @@ class ScriptedDrive:
 
     machine, lag, can_move, patient, rate = "m", 0.0, True, False, RATE
 
-    def __init__(self, given: list[Sample | Block | Exception | None]) -> None:
+    def __init__(self, given: list[DriveSample | Block | Exception | None]) -> None:
         self.given, self.voltages, self.log = given, [], []
         self.connects = 0
         self.refuse = False
@@ -85,7 +85,7 @@ class ScriptedDrive:
     def close(self) -> None:
         """Nothing is open."""
 
-    def read(self, most: int = 0) -> Sample | Block | None:
+    def read(self, most: int = 0) -> DriveSample | Block | None:
         self.log.append(most)
         found = self.given.pop(0)
         if isinstance(found, Exception):
@@ -125,8 +125,8 @@ def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> EdgeRuntime:
     return EdgeRuntime(config, "b0", box, NoChild(), None, clock, clock.pause)
 
 
-def samples(first: int, count: int, reference: float = 1e-3) -> list[Sample]:
-    return [Sample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
+def samples(first: int, count: int, reference: float = 1e-3) -> list[DriveSample]:
+    return [DriveSample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
 
 
 def letters(far: Far, kind: type | tuple[type, ...]) -> list[object]:
@@ -176,8 +176,8 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
     assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
 
 
-@pytest.mark.parametrize("then", [samples(1000, 3), [Sample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])
-def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far: Far, then: list[Sample]) -> None:
+@pytest.mark.parametrize("then", [samples(1000, 3), [DriveSample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])
+def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far: Far, then: list[DriveSample]) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box)

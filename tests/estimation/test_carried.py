@@ -19,8 +19,8 @@ from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
-from servotwin.twin.decode import decode_window
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.estimating import decode_window
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 
 DEG = math.radians(1.0)
@@ -63,13 +63,13 @@ def test_one_contact_is_enough_after_a_window_with_two():
 
 def replay(changed_boot: bool) -> GapEstimate:
     """What the twin says of the first window that can hardly stand alone, in the boot of those before it or another."""
-    scenario, store = loop().scenario, MemoryStore()
-    twin = Twin.of(scenario.name, scenario.servo, store, scenario.twin)
+    scenario = loop().scenario
+    twin = Twin(scenario.name, TwinModel.of(scenario.servo, scenario.twin))
     last = one_sided()[1]
     for message in loop().windows[: last + 1]:
         new = changed_boot and message is loop().windows[last]
         twin.receive(msgspec.structs.replace(message, boot="new") if new else message, message.start + 2.0)
-    return list(store.estimates.values())[-1]
+    return list(twin.log.estimates.values())[-1]
 
 
 def test_a_new_boot_forgets_the_offset():

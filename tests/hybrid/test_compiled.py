@@ -90,26 +90,34 @@ def test_a_cache_that_has_no_place_is_a_sentence(monkeypatch):
         compiled(lambda x: x)
 
 
-PAIR = """
+RENAMED = """
 from typing import NamedTuple
+
+import numpy as np
+
 from servotwin.hybrid.compiled import compiled
 
+
 class {name}(NamedTuple):
-    a: float
-    b: float
+    values: np.ndarray
+
 
 @compiled
-def total(pair):
-    return pair.a + pair.b
+def first(pair):
+    return pair.values[0]
 
-print(total({name}(1.0, 2.0)))
+
+print(first({name}(np.array([2.5]))))
 """
 
 
-def test_a_cache_of_the_version_before_may_name_types_that_are_gone(tmp_path) -> None:
-    for name in ("Pair", "Couple"):
-        (tmp_path / "pairs.py").write_text(PAIR.format(name=name))
-        paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-        env = os.environ | {"PYTHONPATH": paths, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
-        done = subprocess.run([sys.executable, "-c", "import pairs"], env=env, capture_output=True, text=True)
-        assert (done.returncode, done.stdout) == (0, "3.0\n"), done.stderr
+def test_a_cache_that_names_a_renamed_type_is_compiled_anew(tmp_path):
+    """As after an update of servotwin: the old cache lies beside the new code."""
+    outputs = []
+    for name in ("Before", "After", "After"):
+        (tmp_path / "renamed.py").write_text(RENAMED.format(name=name))
+        run = [sys.executable, "-c", "import renamed"]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+        outputs.append(subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout)
+    assert outputs == ["2.5\n"] * 3
+    assert list((tmp_path / "__pycache__").glob("renamed.first-*.nbi"))

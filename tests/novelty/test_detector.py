@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.config.table import parse_toml
 from servotwin.config.toml import read, values_of
-from servotwin.edge.cut import Cut
+from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
 from servotwin.novelty.detector import (
     CUSUM,

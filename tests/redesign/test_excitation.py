@@ -15,29 +15,33 @@ from servotwin.redesign.excitation import (
     Decision,
     ExcitationPolicy,
     ExcitationSettings,
-    Memory,
-    Seen,
+    ExcitationState,
     Stage,
+    WindowSummary,
     long_enough,
 )
 
 PITCH = 1e-3 / math.pi
 DEG = math.pi / 180.0
 ALLOWED = ExcitationSettings(probe=2e-4)
-SHORT = Seen(0.0, GapStatus.UNIDENTIFIABLE, long=False, upper=20.0 * DEG)
+SHORT = WindowSummary(0.0, GapStatus.UNIDENTIFIABLE, long=False, upper=20.0 * DEG)
 LONG = replace(SHORT, long=True)
 
 
-def run(settings: ExcitationSettings, seen: list[Seen], memory: Memory | None = None) -> list[Decision]:
-    policy, memory, found = ExcitationPolicy(PITCH, settings), memory or Memory(), list[Decision]()
+def run(
+    settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None
+) -> list[Decision]:
+    policy, state, found = ExcitationPolicy(PITCH, settings), state or ExcitationState(), list[Decision]()
     for each in seen:
-        found.append(policy.look(memory, each))
-        memory = found[-1].memory
+        found.append(policy.decide(state, each))
+        state = found[-1].state
     return found
 
 
-def asks(settings: ExcitationSettings, seen: list[Seen], memory: Memory | None = None) -> list[Ask | None]:
-    return [decision.ask for decision in run(settings, seen, memory)]
+def asks(
+    settings: ExcitationSettings, seen: list[WindowSummary], state: ExcitationState | None = None
+) -> list[Ask | None]:
+    return [decision.ask for decision in run(settings, seen, state)]
 
 
 def test_a_longer_window_is_asked_for_first() -> None:
@@ -55,7 +59,7 @@ def test_what_is_known_and_what_no_motion_cures_begin_the_count_anew(status: Gap
 
 
 def test_a_probe_comes_only_after_long_windows_have_failed_as_often() -> None:
-    taken = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), Outcome.TAKEN)
+    taken = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), Outcome.TAKEN)
     found = asks(ALLOWED, [SHORT, LONG, LONG], taken)
     assert found[:2] == [None, None]
     assert found[2] == Probe(PITCH * 25.0 * DEG, 0.85, 1)
@@ -66,12 +70,12 @@ def test_where_windows_are_long_already_nothing_else_is_asked_for_first() -> Non
 
 
 def test_where_long_windows_are_refused_the_probe_is_what_is_left() -> None:
-    refused = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), Outcome.TOO_LARGE)
+    refused = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), Outcome.TOO_LARGE)
     assert isinstance(asks(ALLOWED, [SHORT, SHORT], refused)[-1], Probe)
 
 
 def test_a_request_that_was_lost_is_made_again() -> None:
-    lost = run(ALLOWED, [SHORT, SHORT])[-1].memory.answered(LongerWindow(2.0, 0.3), None)
+    lost = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), None)
     assert asks(ALLOWED, [SHORT, SHORT], lost) == [None, LongerWindow(2.0, 0.3)]
 
 
@@ -105,15 +109,15 @@ def test_what_is_not_bounded_is_not_probed(change: dict[str, float]) -> None:
 @pytest.mark.parametrize("outcome", [Outcome.NOT_ALLOWED, Outcome.TOO_LARGE])
 def test_an_edge_that_refuses_is_not_asked_again_before_it_boots(outcome: Outcome) -> None:
     late = replace(LONG, time=1e6)
-    refused = run(ALLOWED, [LONG, LONG])[-1].memory.answered(Probe(1e-4, 0.85), outcome)
+    refused = run(ALLOWED, [LONG, LONG])[-1].state.answered(Probe(1e-4, 0.85), outcome)
     assert asks(ALLOWED, [late] * 5, refused) == [None] * 5
     assert run(ALLOWED, [late] * 5, refused)[-1].reason.endswith("this edge refuses probing moves")
     assert isinstance(asks(ALLOWED, [late] * 2, refused.rebooted())[-1], Probe)
 
 
 def test_a_boot_forgets_the_windows_and_not_when_the_last_probe_was() -> None:
-    memory = Memory(3, Stage.TAKEN, Stage.REFUSED, 12.0)
-    assert memory.rebooted() == Memory(probed=12.0)
+    state = ExcitationState(3, Stage.TAKEN, Stage.REFUSED, 12.0)
+    assert state.rebooted() == ExcitationState(probed=12.0)
 
 
 @given(
@@ -137,10 +141,10 @@ def test_a_probe_crosses_gap_and_dead_zone_and_keeps_to_the_limit(
 @given(st.lists(st.tuples(st.sampled_from(GapStatus), st.booleans(), st.floats(0.0, 30.0)), max_size=60))
 def test_whatever_comes_probes_keep_distance_and_come_last(history: list[tuple[GapStatus, bool, float]]) -> None:
     """Every stretch of statuses: at least `after` misses before each ask, no probe within the interval."""
-    time, seen = 0.0, list[Seen]()
+    time, seen = 0.0, list[WindowSummary]()
     for status, long, pause in history:
         time += pause
-        seen.append(Seen(time, status, long, 10.0 * DEG))
+        seen.append(WindowSummary(time, status, long, 10.0 * DEG))
     found = run(ALLOWED, seen)
     assert all(decision.reason for decision in found)
     probed = [each.time for each, decision in zip(seen, found, strict=True) if isinstance(decision.ask, Probe)]

@@ -33,7 +33,7 @@ from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
-from servotwin.twin.policies import policy_of
+from servotwin.redesign.registry import policy_of
 from servotwin.twin.settings import TwinSettings
 
 DEG = math.pi / 180.0

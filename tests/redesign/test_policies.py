@@ -16,7 +16,7 @@ from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy
-from servotwin.twin.policies import certified, policy_of
+from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.settings import TwinSettings
 
 PAPER = Servo.preset("paper")
@@ -71,7 +71,7 @@ def test_each_policy_gets_what_is_set_of_it():
 def test_certified_designs_for_the_controller_that_runs():
     """Loop filter and limits count, the sample rate stays; no more is fed forward than may be needed."""
     scenario = Scenario.preset("fig16").replace(twin=TwinSettings())
-    policy = certified(scenario.model, scenario.twin)
+    policy = certified_policy(scenario.model, scenario.twin)
     law = policy.fallback().setting.controller
     assert (law.loop_filter_hz, law.sample_rate) == (20.0, 5000.0)
     assert policy.feedforward_limit == 0.1
@@ -135,7 +135,7 @@ def test_margin_has_no_map_for_a_limited_voltage():
 
 def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path):
     scenario = load(tmp_path, "")
-    proved = certified(scenario.model, scenario.twin).fallback()
+    proved = certified_policy(scenario.model, scenario.twin).fallback()
     agent = scenario.agent_settings()
     fallback = agent.supervision.fallback
     assert proved.gap == scenario.twin.uncertainty.gap
@@ -143,7 +143,7 @@ def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path)
     assert fallback.setting.band == agent.parameters.setting.band == band_of(proved)
     assert agent.parameters.fallback
     assert scenario.start_law == proved.setting.controller
-    assert fallback.silence_s == certified(scenario.model, scenario.twin).horizon
+    assert fallback.silence_s == certified_policy(scenario.model, scenario.twin).horizon
 
 
 @pytest.mark.parametrize("text", ["[controller]\nki_v_per_m_s = 100.0\n", "[edge]\nwatched = true\n"])
@@ -162,7 +162,7 @@ def test_a_sample_rate_says_nothing_of_gains(tmp_path):
 
 def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
-    agent, policy = scenario.agent_settings(), certified(scenario.model, scenario.twin)
+    agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
     laws = [s.controller for s in candidates_of(policy.servo, Demands(), math.radians(5.0), True, True)]
     for law in laws:

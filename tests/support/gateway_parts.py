@@ -4,10 +4,10 @@ import socket
 from array import array
 
 from servotwin.control.controller import Controller
-from servotwin.edge.cut import Cut
 from servotwin.edge.limits import Limits
 from servotwin.edge.packing import CHANNELS
 from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process import frames
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig

@@ -14,7 +14,7 @@ from servotwin.messages import (
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 
@@ -26,7 +26,7 @@ def window_message(sequence=0, start=0.0, boot="boot-1", servo="axis", version=0
     channels = channels or tuple(
         pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
     )
-    return messages.Window(
+    return messages.WindowMessage(
         servo, boot, sequence, start, 100.0, channels, (), version, "model", "test", messages.checksum(channels)
     )
 
@@ -55,8 +55,12 @@ def eq_21() -> Rule:
 
 
 def make(estimator=known_gap, **settings):
-    store = MemoryStore()
-    return Twin("axis", estimator, eq_21(), store, TwinSettings(**settings)), store
+    twin = twin_of(estimator, eq_21(), TwinSettings(**settings))
+    return twin, twin.log
+
+
+def twin_of(estimator, policy, settings: TwinSettings | None = None, **parts) -> Twin:
+    return Twin("axis", TwinModel(estimator, policy, settings or TwinSettings(), **parts))
 
 
 def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):

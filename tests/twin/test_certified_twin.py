@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from twin_messages import twin_of
 
 from servotwin import messages
 from servotwin.control.gains import gains_of
@@ -15,11 +16,9 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
-from servotwin.twin.policies import certified, policy_of
-from servotwin.twin.proof import verification_of
+from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
-from servotwin.twin.twin import Twin
+from servotwin.twin.step import verification_of
 
 PAPER = Servo.preset("paper")
 FEW = Demands(plants=4, screened=2, scales=(0.7, 1.0))
@@ -37,7 +36,7 @@ def window(sequence=0, start=20.0):
         pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
     )
     crc = messages.checksum(channels)
-    return messages.Window("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
+    return messages.WindowMessage("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
 
 
 def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK):
@@ -48,13 +47,12 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK
     def estimator(_window, _expected):
         return GapEstimate(middle, 0.0, 0.0, (low, high), status, 21.0)
 
-    store = MemoryStore()
     policy = policy_of(PAPER, settings)
     start = Setting(0.0, gains_of(PAPER.controller))
-    twin = Twin("axis", estimator, policy, store, settings, lambda _window: told or disturbed(0.05), start)
+    twin = twin_of(estimator, policy, settings, observer=lambda _window: told or disturbed(0.05), start=start)
     acknowledge, *sent = twin.receive(window(), 0.0)
     assert isinstance(acknowledge, Acknowledge)
-    return sent, store.redesigns["axis", "boot-1", 0]
+    return sent, twin.log.redesigns["axis", "boot-1", 0]
 
 
 def test_what_is_proved_is_sent_with_its_proof_and_band():
@@ -95,7 +93,7 @@ def test_where_nothing_is_proved_the_fallback_set_is_sent_and_it_is_said():
     """A bias beyond what may be fed forward leaves more error than the fallback set's band has room for."""
     settings = SETTINGS.replace(demands=replace(FEW, integral=(0.0,)))
     (update,), redesign = answer(settings=settings, told=disturbed(0.4))
-    proved = certified(PAPER, settings).fallback()
+    proved = certified_policy(PAPER, settings).fallback()
     assert "is verified: the best is off by" in redesign.reason
     assert redesign.reason.endswith("; the fallback set is sent")
     assert update.setting.gains == gains_of(proved.setting.controller.replace(feedforward=-0.1))
@@ -113,7 +111,7 @@ def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
     for gap in (2.0, 10.0, 40.0):
         noisy = disturbed(0.0, 2e-4)
         sent, redesign = answer((gap - 0.1, gap + 0.1), told=noisy)
-        proved = certified(PAPER, SETTINGS).fallback()
+        proved = certified_policy(PAPER, SETTINGS).fallback()
         assert sent
         assert isinstance(sent[0].setting.gains, Gains)
         assert redesign.certificate.tail <= proved.tail

@@ -25,7 +25,7 @@ from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.evidence import plain
-from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin.models import ModelRegistry, ServoModel
 from servotwin.twin.replay import replay
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.work import work
@@ -34,11 +34,13 @@ NAMES = ("fig15", "fig16", "calm")
 
 
 @cache
-def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], Model]:
+def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], ServoModel]:
     """(window, evidence, context) of each estimate that a scenario led to."""
     scenario = Scenario.preset(name).replace(duration=65.0)
-    model = Model("m", scenario.model, scenario.twin, Setting(scenario.start_tolerance, gains_of(scenario.start_law)))
-    fleet, state, found = Fleet((model,), (("*", "m"),)), b"", []
+    model = ServoModel(
+        "m", scenario.model, scenario.twin, Setting(scenario.start_tolerance, gains_of(scenario.start_law))
+    )
+    fleet, state, found = ModelRegistry((model,), (("*", "m"),)), b"", []
     for each in (m for m in cosimulate(scenario).messages if m.direction == "up"):
         stored = StoredMessage(1, MessageKind.WINDOW, each.data, "", each.arrival)
         outcome = work(fleet, Lease(scenario.name, state, 0, (stored,)), each.arrival)
@@ -89,7 +91,7 @@ def test_the_prior_counts():
 def test_another_model_is_named_with_both_values():
     window, body, context = estimated("calm")[0][-1]
     model = estimated("calm")[1]
-    stiffer = Model("m", model.servo.replace(k=11e3), model.settings, model.start)
+    stiffer = ServoModel("m", model.servo.replace(k=11e3), model.settings, model.start)
     again = replay(window, body, context, stiffer)
     assert (again.same, again.differs) == (False, ("model.k 10000.0 then, 11000.0 now",))
     assert {"gap", "model_version"} <= set(again.changed)
@@ -98,11 +100,11 @@ def test_another_model_is_named_with_both_values():
 def test_a_setting_that_does_not_matter_is_named_all_the_same():
     window, body, context = estimated("calm")[0][-1]
     model = estimated("calm")[1]
-    other = Model("m", model.servo, model.settings.replace(validity=61.0), model.start)
+    other = ServoModel("m", model.servo, model.settings.replace(validity=61.0), model.start)
     assert replay(window, body, context, other)[1:] == (True, ("settings.validity 60.0 then, 61.0 now",), ())
 
 
-@pytest.mark.parametrize("part", ["numpy", "scipy", "numba", "python", "servotwin", "source identify", "processor"])
+@pytest.mark.parametrize("part", ["numpy", "scipy", "numba", "python", "servotwin", "source estimation", "processor"])
 def test_another_version_is_named(part):
     window, body, context = estimated("fig15")[0][0]
     then = {**parts_of(context), part: "0.0.1"}
@@ -130,7 +132,7 @@ def test_a_window_that_no_estimator_took_is_the_same_again():
     channels = tuple(channel for channel in window.channels if channel.name != "position")
     blind = msgspec.structs.replace(window, channels=channels, crc=checksum(channels))
     model = estimated("fig15")[1]
-    fleet = Fleet((model,), (("*", "m"),))
+    fleet = ModelRegistry((model,), (("*", "m"),))
     outcome = work(
         fleet, Lease(window.servo, b"", 0, (StoredMessage(1, MessageKind.WINDOW, encode(blind), "", 0.0),)), 0.0
     )

@@ -12,9 +12,8 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin.models import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
 
 TEXT = """
 [models.plain]
@@ -37,8 +36,8 @@ policy = "certified"
 """
 
 
-def read(text: str = TEXT, folder: Path = Path(), servo: str = "paper") -> Fleet:
-    return Fleet.loads(text.replace("{servo}", servo), "twin.toml", folder)
+def read(text: str = TEXT, folder: Path = Path(), servo: str = "paper") -> ModelRegistry:
+    return ModelRegistry.loads(text.replace("{servo}", servo), "twin.toml", folder)
 
 
 @pytest.mark.parametrize(
@@ -59,23 +58,23 @@ def test_models_carry_settings_controller_and_start():
     wanted = TwinSettings(policy="paper", initial_gap=math.radians(1.0))
     assert plain.settings.replace(estimator=None) == wanted
     assert plain.servo == Servo.preset("paper")
-    assert plain.begins == Setting(
+    assert plain.first_setting == Setting(
         plain.servo.tolerance_for(plain.settings.initial_gap), gains_of(plain.servo.controller)
     )
     assert calm.servo == Servo.preset("paper").replace(Ki=0.0)
-    assert calm.begins == Setting(0.0, gains_of(calm.servo.controller))
+    assert calm.first_setting == Setting(0.0, gains_of(calm.servo.controller))
 
 
 def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
     scenario = Scenario.preset("certified")
-    model = Model("axis", scenario.model, scenario.twin)
-    assert model.begins == Setting(scenario.start_tolerance, gains_of(scenario.start_law))
-    assert model.begins.gains != gains_of(scenario.law)
+    model = ServoModel("axis", scenario.model, scenario.twin)
+    assert model.first_setting == Setting(scenario.start_tolerance, gains_of(scenario.start_law))
+    assert model.first_setting.gains != gains_of(scenario.law)
 
 
 def test_where_nothing_is_proved_nothing_is_known_of_the_start():
     settings = TwinSettings(uncertainty=TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0)))
-    assert Model("axis", Servo.preset("paper"), settings).begins is None
+    assert ServoModel("axis", Servo.preset("paper"), settings).first_setting is None
 
 
 def test_a_servos_file_lies_beside_the_fleets(tmp_path):
@@ -87,15 +86,15 @@ def test_a_servos_file_lies_beside_the_fleets(tmp_path):
 
 def test_a_fleet_survives_the_way_to_a_worker():
     fleet = read()
-    fleet.model_of("line-1").twin("line-1", MemoryStore())
+    fleet.model_of("line-1").twin(restored=False)
     again = pickle.loads(pickle.dumps(fleet))
     assert again == fleet
-    assert again.model_of("line-1").twin("line-1", MemoryStore()).state()
+    assert again.model_of("line-1").twin(restored=False).initial_state("line-1")
 
 
 def test_other_tables_are_left_to_others():
     table = parse_toml(TEXT.replace("{servo}", "paper") + "[service]\nport = 1\n", "twin.toml")
-    Fleet.read(table, Path())
+    ModelRegistry.read(table, Path())
     with pytest.raises(InvalidInput, match="unknown key 'service'"):
         table.done()
     table.table("service")
@@ -140,6 +139,6 @@ def test_a_policy_that_cannot_design_for_the_controller_is_refused_at_the_start(
 
 @pytest.mark.parametrize(("models", "servos"), [(0, 1), (2, 1), (1, 0)])
 def test_a_fleet_has_models_with_names_of_their_own_and_servos(models, servos):
-    model = Model("axis", Servo.preset("paper"), TwinSettings())
+    model = ServoModel("axis", Servo.preset("paper"), TwinSettings())
     with pytest.raises(InvalidInput):
-        Fleet((model,) * models, (("*", "axis"),) * servos)
+        ModelRegistry((model,) * models, (("*", "axis"),) * servos)

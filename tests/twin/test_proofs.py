@@ -13,15 +13,15 @@ import pytest
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
-from servotwin.twin.fleet import Fleet, Model
-from servotwin.twin.lookups import Question, decode_question
-from servotwin.twin.policies import certified
+from servotwin.twin.lookups import VerificationRequest, decode_request
+from servotwin.twin.models import ModelRegistry, ServoModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
@@ -33,31 +33,31 @@ SERVO = SCENARIO.model
 
 
 @cache
-def windows() -> tuple[Window, ...]:
+def windows() -> tuple[WindowMessage, ...]:
     return cosimulate(SCENARIO).windows
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tables") / "axis.table"
-    for _ in build(path, certified(SERVO, SETTINGS), GRID):
+    for _ in build(path, certified_policy(SERVO, SETTINGS), GRID):
         pass
     return path
 
 
 @pytest.fixture(scope="module")
-def fleet(file: Path) -> Fleet:
+def fleet(file: Path) -> ModelRegistry:
     start = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
-    return Fleet((Model("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
+    return ModelRegistry((ServoModel("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
 
 
 class Queue:
     """What the store does between outcomes, without a store."""
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: ModelRegistry) -> None:
         self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
 
-    def give(self, message: Window | Receipt | Fallback | Incoming) -> WorkResult:
+    def give(self, message: WindowMessage | Receipt | Fallback | Incoming) -> WorkResult:
         body, kind = (
             (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), MessageKind.WINDOW)
         )
@@ -96,7 +96,7 @@ def failing(monkeypatch) -> None:
     monkeypatch.setattr(CertifiedPolicy, "confirm", refuted)
 
 
-def begun(fleet: Fleet) -> tuple[Queue, Update, Incoming]:
+def begun(fleet: ModelRegistry) -> tuple[Queue, Update, Incoming]:
     """After the first window: what was sent, and what is to be proved."""
     queue = Queue(fleet)
     outcome = queue.window(0)
@@ -106,9 +106,9 @@ def begun(fleet: Fleet) -> tuple[Queue, Update, Incoming]:
     return queue, update, asked
 
 
-def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: Fleet) -> None:
+def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: ModelRegistry) -> None:
     _, update, asked = begun(fleet)
-    question = decode_question(asked.body)
+    question = decode_request(asked.body)
     assert (asked.servo, asked.kind, asked.encoding) == ("axis", MessageKind.VERIFICATION, "")
     assert (question.version, question.window) == (update.version, update.window)
     assert gains_of(question.setting.controller) == update.setting.gains
@@ -116,7 +116,7 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: F
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
 
-def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: Fleet) -> None:
+def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: ModelRegistry) -> None:
     queue, update, asked = begun(fleet)
     before = queue.state
     outcome = queue.give(asked)
@@ -124,41 +124,41 @@ def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: Fleet) -> None:
     (row,) = outcome.evidence
     assert (row.version, row.status, row.window) == (update.version, "", "{}/{}".format(*update.window))
     body = msgspec.msgpack.decode(row.body)
-    assert body["certificate"]["gap"] == list(decode_question(asked.body).region.gap)
+    assert body["certificate"]["gap"] == list(decode_request(asked.body).region.gap)
     assert body["certificate"]["settled"] >= 0.99
     assert queue.state == before
     assert not outcome.outgoing
 
 
-def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: Fleet) -> None:
+def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: ModelRegistry) -> None:
     one, other = begun(fleet), begun(fleet)
     assert one[2] == other[2]
     assert one[0].give(one[2]) == other[0].give(other[2])
 
 
-def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: Fleet, monkeypatch) -> None:
+def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, asked = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
         outcome = queue.give(asked)
     assert kinds(outcome) == ["proof", "withdrawn"]
     assert "settles on 3.0 %" in outcome.evidence[0].status
-    assert f"the proof of version {update.version} failed" in outcome.evidence[1].status
+    assert f"the verification of version {update.version} failed" in outcome.evidence[1].status
     assert not outcome.outgoing  # the edge takes nothing that stands on no newer window
     following = queue.window(1, update.version)
     back = sent(following)
-    proved = certified(SERVO, fleet.models[0].settings).fallback()
+    proved = certified_policy(SERVO, fleet.models[0].settings).fallback()
     assert back.base_version == update.version
     assert back.data_time > update.data_time
     law = proved.setting.controller.replace(feedforward=back.setting.gains.feedforward)
     assert back.setting.gains == gains_of(law)
     assert not following.enqueue
     said = {row.kind: row.status for row in following.evidence}
-    assert "the proof of version" in said["glance"]
+    assert "the verification of version" in said["glance"]
     assert said["redesign"].endswith("are asked; the fallback set is sent")
 
 
-def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet, monkeypatch) -> None:
+def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, asked = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
@@ -175,20 +175,20 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: Fleet,
     assert not outcome.enqueue
 
 
-def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: Fleet, monkeypatch) -> None:
+def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry, monkeypatch) -> None:
     queue, _, asked = begun(fleet)
-    question = decode_question(asked.body)
+    question = decode_request(asked.body)
     law = question.setting.controller.replace(Kp=2.0 * question.setting.controller.Kp)
     other = msgspec.structs.replace(question, setting=replace(question.setting, controller=law))
     failing(monkeypatch)
     before = queue.state
     outcome = queue.give(asked._replace(body=msgspec.msgpack.encode(other)))
     assert kinds(outcome) == ["proof"]
-    assert outcome.evidence[0].status == "not proved: another setting is in force by now"
+    assert outcome.evidence[0].status == "not verified: another setting is in force by now"
     assert queue.state == before
 
 
-def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> None:
+def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegistry) -> None:
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
     assert kinds(quiet) == ["glance"]
@@ -201,7 +201,7 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: Fleet) -> N
     assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
 
 
-def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Fleet, monkeypatch) -> None:
+def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: ModelRegistry, monkeypatch) -> None:
     queue = Queue(fleet)
     outcome = queue.window(0)
     assert outcome.wake is not None
@@ -211,25 +211,25 @@ def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Fle
     assert after.wake is None
 
 
-def test_what_is_no_question_fails_alone(fleet: Fleet) -> None:
+def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, asked = begun(fleet)
     before = queue.state
     outcome = queue.give(asked._replace(body=b"\x93"))
-    assert outcome.evidence[0].status.startswith("failed: InvalidInput: the proof that is asked for is not understood")
+    assert outcome.evidence[0].status.startswith("failed: InvalidInput: the verification request is not understood")
     assert queue.state == before
 
 
-def test_without_a_table_a_question_fails_alone(fleet: Fleet) -> None:
+def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, asked = begun(fleet)
     model = replace(fleet.models[0], settings=SETTINGS)
     queue.fleet = replace(fleet, models=(model,))
     assert "no table is used any more" in queue.give(asked).evidence[0].status
 
 
-def test_a_question_comes_back_from_its_bytes(fleet: Fleet) -> None:
+def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:
     _, _, asked = begun(fleet)
-    question = decode_question(asked.body)
-    assert isinstance(question, Question)
+    question = decode_request(asked.body)
+    assert isinstance(question, VerificationRequest)
     assert msgspec.msgpack.encode(question) == asked.body
-    policy = certified(SERVO, fleet.models[0].settings)
+    policy = certified_policy(SERVO, fleet.models[0].settings)
     assert isinstance(policy.confirm(question.region, question.setting), Certificate)

@@ -22,20 +22,18 @@ from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance, quick_bias
-from servotwin.estimation.trend import TrendSettings
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.twin.decode import decode_window
-from servotwin.twin.estimating import estimator_of
-from servotwin.twin.glance import Glance, Watch, due, glance
+from servotwin.twin.estimating import decode_window, estimator_of
+from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
-from servotwin.twin.store import MemoryStore
-from servotwin.twin.triage import Triage
+from servotwin.twin.step import TwinModel
+from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import Wear
+from servotwin.twin.wear import Expectation
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
@@ -53,20 +51,20 @@ def cases(noisy: bool) -> tuple[Case, ...]:
 
 
 @cache
-def calm_windows() -> tuple[messages.Window, ...]:
+def calm_windows() -> tuple[messages.WindowMessage, ...]:
     """Of a deployed loop: at rest between steps, 2 s with a bias of 50 mV; only the first few show both contacts."""
     scenario = Scenario.preset("certified").replace(gap=25.0 * DEG, duration=165.0)
     return cosimulate(scenario).windows
 
 
-def message_of(window: Window, sequence: int = 1, **changes) -> messages.Window:
+def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
     channels = []
     for name, samples in window.channels.items():
         unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
         packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
         channels += packed
     told = {"version": 0, "reason": "reference", "boot": "b", **changes}
-    return messages.Window(
+    return messages.WindowMessage(
         "axis",
         told["boot"],
         sequence,
@@ -81,10 +79,10 @@ def message_of(window: Window, sequence: int = 1, **changes) -> messages.Window:
     )
 
 
-def watch_of(gap: float, misfit: float = 5e-5, **changes) -> Watch:
+def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
     """Of a servo whose gap was estimated well."""
     return msgspec.structs.replace(
-        Watch(doubt="", boot="b", time=0.0, gap=gap, std=0.005 * DEG, misfit=misfit), **changes
+        TriageState(doubt="", boot="b", time=0.0, gap=gap, std=0.005 * DEG, misfit=misfit), **changes
     )
 
 
@@ -222,14 +220,14 @@ def test_what_is_estimated_whatever_it_shows(changes: dict, watch: dict, why: st
 # --- a twin with triage
 
 
-def triaged(windows, settings: TwinSettings | None = None, gap: float = 25.0) -> tuple[Twin, MemoryStore]:
+def triaged(windows, settings: TwinSettings | None = None, gap: float = 25.0) -> tuple[Twin, EvidenceLog]:
     """A twin that leaves everything as it is."""
-    store = MemoryStore()
     settings = settings or TwinSettings(triage=SETTINGS, policy="paper")
-    twin = Twin("servo", estimator_of(SERVO, settings), eq_21(), store, settings, triage=Triage(SERVO, SETTINGS))
+    model = TwinModel(estimator_of(SERVO, settings), eq_21(), settings, triage=Triage(SERVO, SETTINGS))
+    twin = Twin("servo", model)
     for message in windows:
         twin.receive(msgspec.structs.replace(message, servo="servo"), message.start + 3.0)
-    return twin, store
+    return twin, twin.log
 
 
 def test_a_glance_is_all_there_is_of_a_window_that_says_nothing_new() -> None:
@@ -247,15 +245,7 @@ def test_what_triage_remembers_is_part_of_the_state() -> None:
     windows = [msgspec.structs.replace(one, servo="servo") for one in calm_windows()]
     whole, kept = triaged(windows)
     twin, store = triaged(windows[:5])
-    reborn = Twin(
-        "servo",
-        estimator_of(SERVO, twin.settings),
-        eq_21(),
-        store,
-        twin.settings,
-        triage=Triage(SERVO, SETTINGS),
-    )
-    reborn.restore(twin.state())
+    reborn = Twin("servo", twin.model, store, twin.state())
     for message in windows[5:]:
         reborn.receive(message, message.start + 3.0)
     assert reborn.state() == whole.state()
@@ -263,8 +253,8 @@ def test_what_triage_remembers_is_part_of_the_state() -> None:
 
 
 def test_a_twin_without_triage_estimates_every_window() -> None:
-    store = MemoryStore()
-    twin = Twin.of("servo", SERVO, store, TwinSettings(policy="paper"))
+    twin = Twin("servo", TwinModel.of(SERVO, TwinSettings(policy="paper")))
+    store = twin.log
     for message in calm_windows()[:4]:
         twin.receive(msgspec.structs.replace(message, servo="servo"), message.start + 3.0)
     assert not store.glances
@@ -276,7 +266,7 @@ def test_wear_is_followed_as_closely_as_without_triage() -> None:
     scenario = Scenario.preset("calm").replace(duration=100.0)
     with_triage = scenario.replace(twin=scenario.twin.replace(triage=SETTINGS))
     plain, loop = cosimulate(scenario), cosimulate(with_triage)
-    assert [one.tolerance for one in loop.updates] == [one.tolerance for one in plain.updates]
+    assert [one.setting for one in loop.updates] == [one.setting for one in plain.updates]
     assert [one.gap for one in loop.estimates] == [one.gap for one in plain.estimates]
 
 
@@ -295,15 +285,13 @@ def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
 
 def test_a_servo_on_which_glances_mislead_gets_none() -> None:
     message = msgspec.structs.replace(calm_windows()[1], servo="servo")
-    triage, estimate = (
-        Triage(SERVO, SETTINGS),
-        estimator_of(SERVO, TwinSettings())(decode_window(message), Wear(0.0, TrendSettings()).expect("b", 1.0, 1.0)),
-    )
+    triage, window = Triage(SERVO, SETTINGS), decode_window(message)
+    estimate = estimator_of(SERVO, TwinSettings())(window, Expectation(0.0))
     assert estimate.ok
-    triage.learn(message, replace(estimate, gap=estimate.gap + 1.0 * DEG), None, "")
-    assert "a glance misled by 1 deg" in triage.watch.doubt
-    triage.learn(message, estimate, None, "")
-    assert triage.watch.doubt == ""
+    wrong = replace(estimate, gap=estimate.gap + 1.0 * DEG)
+    state = triage.estimated(TriageState(), message, window, wrong, None, "")
+    assert "a glance misled by 1 deg" in state.doubt
+    assert triage.estimated(state, message, window, estimate, None, "").doubt == ""
 
 
 def test_estimates_in_vain_become_rare_until_something_changes() -> None:

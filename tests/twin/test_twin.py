@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from twin_messages import PITCH, eq_21, known_gap, make, receipt, window_message
+from twin_messages import PITCH, eq_21, known_gap, make, receipt, twin_of, window_message
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
@@ -20,9 +20,10 @@ from servotwin.messages import (
     Setting,
     pack_channel,
 )
-from servotwin.twin.decode import decode_channel, decode_window
+from servotwin.twin.estimating import decode_channel, decode_window
+from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 
@@ -54,11 +55,11 @@ def test_a_duplicate_is_acknowledged_again_but_not_estimated_again():
 
 
 def test_the_window_is_safe_before_it_is_acknowledged():
-    class Broken(MemoryStore):
+    class Broken(EvidenceLog):
         def add_window(self, _):
             raise OSError("disk full")
 
-    twin = Twin("axis", known_gap, eq_21(), Broken())
+    twin = Twin("axis", TwinModel(known_gap, eq_21(), TwinSettings()), Broken())
     with pytest.raises(OSError, match="disk full"):
         twin.receive(window_message(), 0.0)
 
@@ -103,11 +104,10 @@ def measured(gaps: dict[float, float]):
 
 def fed(gaps: dict[float, float]):
     """The updates that a twin sends for windows with these gaps, by their window's start, and its store."""
-    store = MemoryStore()
     slow = TwinSettings(trend=TrendSettings.for_wear(0.1, 1000.0))
-    twin = Twin("axis", measured(gaps), eq_21(), store, slow)
+    twin = twin_of(measured(gaps), eq_21(), slow)
     answers = {start: twin.receive(window_message(k, start), start)[1:] for k, start in enumerate(gaps)}
-    return {start: update.gap for start, answer in answers.items() for update in answer}, store
+    return {start: update.gap for start, answer in answers.items() for update in answer}, twin.log
 
 
 def test_an_outlier_does_not_reach_the_controller_however_sure_the_estimate_is():

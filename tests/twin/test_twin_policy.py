@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from twin_messages import PITCH, Rule, eq_21, known_gap, make, receipt, window_message
+from twin_messages import PITCH, Rule, eq_21, known_gap, make, receipt, twin_of, window_message
 
 from servotwin import messages
 from servotwin.control.gains import gains_of
@@ -24,20 +24,21 @@ from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.simulation import simulate
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
+from servotwin.twin.wear import TrendState
 
 
 def test_the_policy_smooths_from_the_gap_it_last_tuned_for():
     servo = Servo.preset("paper")
-    twin = Twin("axis", known_gap, PaperPolicy(servo, smoothing=0.5), MemoryStore())
+    twin = twin_of(known_gap, PaperPolicy(servo, smoothing=0.5))
     updates = [twin.receive(window_message(k, 10.0 * k), 0.0)[1] for k in (1, 2, 3)]
     assert [update.setting.tolerance / servo.p for update in updates] == pytest.approx([0.1, 0.15, 0.225])
     assert [update.gap for update in updates] == pytest.approx([0.1, 0.2, 0.3])
 
 
 def test_a_policy_may_leave_the_controller_alone():
-    twin = Twin("axis", known_gap, Rule(lambda _: Redesign(None, math.nan, "quiet")), MemoryStore())
+    twin = twin_of(known_gap, Rule(lambda _: Redesign(None, math.nan, "quiet")))
     assert len(twin.receive(window_message(1, 10.0), 0.0)) == 1
 
 
@@ -47,8 +48,9 @@ CALM = OWN.replace(Ki=0.0, feedforward=-0.02, sample_rate=5000.0, voltage_limit=
 
 
 def with_policy(rule: Rule, **changes):
-    store, start = MemoryStore(), Setting(1e-4, gains_of(OWN))
-    return Twin("axis", known_gap, rule, store, observer=lambda _: DISTURBED, start=start, **changes), store
+    start = Setting(1e-4, gains_of(OWN))
+    twin = twin_of(known_gap, rule, observer=lambda _: DISTURBED, start=start, **changes)
+    return twin, twin.log
 
 
 def test_a_policy_sees_the_evidence():
@@ -58,7 +60,7 @@ def test_a_policy_sees_the_evidence():
     evidence = rule.asked[0]
     assert evidence.estimate.gap == 0.1
     assert evidence.disturbance == DISTURBED == store.disturbances["axis", "boot-1", 1]
-    assert evidence.trend is twin.trend
+    assert TrendState.of(evidence.trend) == TrendState.of(twin.trend)
     assert evidence.setting == Setting(1e-4, gains_of(OWN))
     assert evidence.tuned_for is None
     twin.receive(receipt(update), 1.0)
@@ -127,13 +129,14 @@ def test_a_policy_that_finds_nothing_sends_nothing_and_is_quoted():
 
 def test_the_packaged_twin_looks_for_the_bias():
     """20 mV before a step; a window without voltage says so."""
-    servo, store = Servo.preset("paper").replace(Ki=0.0), MemoryStore()
+    servo = Servo.preset("paper").replace(Ki=0.0)
     run = simulate(servo, 12.0, reference=SquareWave(1e-3, 20.0), gap=0.1, input_bias=0.02)
     names = (("position", "m"), ("theta_m", "rad"), ("voltage", "V"), ("reference", "m"))
     part = slice(48_500, 58_500)
     channels = [pack for name, unit in names for pack in messages.pack_finely(name, unit, run.measured(name)[part])]
     message = msgspec.structs.replace(window_message(1, 9.7, channels=tuple(channels)), rate=5000.0)
-    twin = Twin.of("axis", servo, store, TwinSettings())
+    twin = Twin("axis", TwinModel.of(servo, TwinSettings()))
+    store = twin.log
     twin.receive(message, 0.0)
     assert store.disturbances["axis", "boot-1", 1].bias == pytest.approx(0.02, abs=1e-3)
     twin.receive(window_message(2, 20.0), 0.0)

@@ -11,8 +11,9 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, n
 from servotwin.messages import Answer, LongerWindow, Outcome, Probe, Setting, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
+from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 
 SERVO = Servo.preset("paper")
@@ -25,7 +26,7 @@ def window(sequence: int, boot: str = "b0", length: int = 100, change: float = 0
     channels = tuple(pack_channel(name, unit, [0.0] * length) for name, unit in (("position", "m"), ("theta_m", "rad")))
     changes = ((start + change, 1e-3),)
     crc = messages.checksum(channels)
-    return messages.Window("axis", boot, sequence, start, 100.0, channels, changes, 0, "model", reason, crc)
+    return messages.WindowMessage("axis", boot, sequence, start, 100.0, channels, changes, 0, "model", reason, crc)
 
 
 def long(sequence: int, **changes):
@@ -49,10 +50,11 @@ START = Setting(0.0, gains_of(LAW))
 LATE = gains_of(LAW.replace(leave=1.5))
 
 
-def make(says: Says | None = None, runs: Setting | None = START, **settings) -> tuple[Twin, MemoryStore]:
-    store, excitation = MemoryStore(), ExcitationSettings(probe=1e-2, interval=15.0)
+def make(says: Says | None = None, runs: Setting | None = START, **settings) -> tuple[Twin, EvidenceLog]:
+    excitation = ExcitationSettings(probe=1e-2, interval=15.0)
     told = TwinSettings(policy="paper", excitation=excitation, retry=2.0, attempts=3, **settings)
-    return Twin.of("axis", SERVO, store, told, says or Says(), runs), store
+    twin = Twin("axis", TwinModel.of(SERVO, told, runs, says or Says()))
+    return twin, twin.log
 
 
 def requests(sent) -> list[messages.Request]:
@@ -177,8 +179,8 @@ def test_what_no_estimator_takes_is_no_reason_to_move_the_machine() -> None:
 
 
 def test_without_settings_answers_are_kept_and_nothing_is_asked() -> None:
-    store = MemoryStore()
-    twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), Says(), Setting(0.0, gains_of(LAW)))
+    twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), START, Says()))
+    store = twin.log
     assert asked(twin, window(0), window(1), window(2)) == []
     late = Answer("axis", "b0", 1, 0, Outcome.TAKEN, 1)
     assert twin.receive(late, 50.0) == []

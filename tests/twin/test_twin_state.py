@@ -4,13 +4,14 @@ import math
 import struct
 from dataclasses import astuple
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from twin_messages import eq_21, known_gap, make, window_message
+from twin_messages import known_gap, make, window_message
 
 from servotwin.control.gains import gains_of
 from servotwin.cosim import Cosimulation, Loop, simulation_of
@@ -18,6 +19,7 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.agent import Agent
 from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.messages import (
     Acknowledge,
@@ -29,18 +31,21 @@ from servotwin.messages import (
     Reason,
     Receipt,
     Setting,
+    Update,
     decode,
     encode,
 )
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.in_force import NEWEST
-from servotwin.twin.settings import TwinSettings
-from servotwin.twin.state import TrendState, restored_trend, trend_state
-from servotwin.twin.store import MemoryStore
+from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.lookups import LookupState
+from servotwin.twin.settings import TriageSettings, TwinSettings
+from servotwin.twin.state import decode_state, encode_state
+from servotwin.twin.step import TwinModel, WindowArrival, step
 from servotwin.twin.twin import Twin
-from servotwin.twin.versions import EARLIER, Versions
+from servotwin.twin.versions import MAX_ENDED_BOOTS, MAX_SETTINGS, Versions
+from servotwin.twin.wear import TrendState
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
@@ -50,12 +55,12 @@ class Reborn:
     """A twin that dies after every call; what is left of it is its state."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.store, self.state, self.deaths = scenario, MemoryStore(), b"", 0
+        self.scenario, self.store, self.state, self.deaths = scenario, EvidenceLog(), b"", 0
 
     def twin(self) -> Twin:
         s = self.scenario
         start = Setting(s.start_tolerance, gains_of(s.start_law))
-        return Twin.of(s.name, s.model, self.store, s.twin, start=start, state=self.state)
+        return Twin(s.name, TwinModel.of(s.model, s.twin, start), self.store, self.state)
 
     def receive(self, message, now):
         return self._leaving(self.twin(), lambda twin: twin.receive(message, now))
@@ -124,7 +129,7 @@ def test_and_finds_the_same(name):
         of_living, of_reborn = (repr([astuple(one) for one in getattr(loop, part)]) for loop in (living, reborn))
         assert of_living == of_reborn
     states = [
-        [trend and msgspec.msgpack.encode(trend_state(trend)) for trend in loop.trends] for loop in both(name)[:2]
+        [trend and msgspec.msgpack.encode(TrendState.of(trend)) for trend in loop.trends] for loop in both(name)[:2]
     ]
     assert states[0] == states[1]
     for one, other in zip(living.redesigns, reborn.redesigns, strict=True):
@@ -166,8 +171,8 @@ def bits(trend: Trend | None):
 @given(trends())
 def test_a_trend_keeps_every_bit(trend):
     """NaN, infinities and the sign of zero too, in the rival of its rival as well."""
-    carried = msgspec.msgpack.decode(msgspec.msgpack.encode(trend_state(trend)), type=TrendState)
-    assert bits(restored_trend(carried, TrendSettings())) == bits(trend)
+    carried = msgspec.msgpack.decode(msgspec.msgpack.encode(TrendState.of(trend)), type=TrendState)
+    assert bits(carried.trend(TrendSettings())) == bits(trend)
 
 
 @given(
@@ -197,9 +202,7 @@ def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
         assert said[0] == said[1]
         state = dies.state()
         assert state == lives.state()
-        fresh = make()[0]
-        fresh._store = dies._store
-        fresh.restore(state)
+        fresh = Twin("axis", dies.model, dies.log, state)
         assert fresh.state() == state
         assert fresh.next_wake() == lives.next_wake()
         dies = fresh
@@ -230,9 +233,50 @@ def test_a_later_schema_and_another_servos_state_are_refused():
     later = twin.state().replace(b"twin-state/2", b"twin-state/3")
     with pytest.raises(InvalidInput, match="not understood"):
         twin.restore(later)
-    other = Twin("other", known_gap, eq_21(), MemoryStore())
+    other = Twin("other", twin.model)
     with pytest.raises(InvalidInput, match=r"the state of servo 'other' is that of 'axis'"):
         other.restore(twin.state())
+
+
+OLD = msgspec.msgpack.decode((Path(__file__).parents[1] / "data" / "twin_state_v1.msgpack").read_bytes())
+"""A state of the version before, made by it, and what its twin then sent for two windows and two wake-ups."""
+
+
+def old_twin(state: bytes, *gaps: float) -> Twin:
+    gaps = list(gaps)
+
+    def estimate(window, _expected):
+        gap = gaps.pop(0)
+        return GapEstimate(gap, 1e-4, 1e-3, interval_95(gap, 1e-3), GapStatus.OK, window.mid_time, method="test")
+
+    excitation = ExcitationSettings(probe=1e-2, interval=15.0)
+    settings = TwinSettings(policy="paper", excitation=excitation, triage=TriageSettings(), retry=2.0, attempts=3)
+    return Twin("axis", TwinModel.of(SERVO, settings, estimator=estimate), state=state)
+
+
+def test_a_state_of_the_version_before_goes_on_where_that_one_was():
+    twin = old_twin(OLD["state"], *OLD["gaps"])
+    sent = [twin.receive(decode(window), now) for window, now in zip(OLD["windows"], OLD["arrivals"], strict=True)] + [
+        twin.wake(now) for now in OLD["wakes"]
+    ]
+    assert sent == [[decode(message) for message in messages] for messages in OLD["sent"]]
+    assert any(isinstance(message, Update) for message in sent[0])
+    assert twin.next_wake() == OLD["next_wake"]
+
+
+def test_a_state_of_the_version_before_keeps_all_that_it_knew():
+    state, late = (decode_state("axis", OLD[name]) for name in ("state", "late"))
+    raw = msgspec.msgpack.decode(OLD["state"])
+    assert state.lookups == LookupState("version 3 failed", misled=True)
+    assert state.known[0] == Setting(1e-4, gains_of(SERVO.controller))
+    assert state.known[3] == Setting(2e-4, Gains(1.0, 2.0, 3.0, 0.1, 0.5, 1.5, -0.01))
+    assert state.known[6] == Setting(3e-4, Gains(9.0, 0.0, 3.0, 0.1))
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(state.wear.state)) == raw["wear"]["trend"]
+    assert state.wear.state.rival is not None
+    assert state.requests.pending is not None
+    assert state.triage.vain == 3
+    assert isinstance(late.versions.pending, Update)
+    assert repr(decode_state("axis", encode_state(state))) == repr(state)
 
 
 def test_settings_are_no_part_of_it():
@@ -246,7 +290,7 @@ def test_settings_are_no_part_of_it():
 def test_requests_come_and_go_with_the_settings():
     asking = TwinSettings(policy="paper", excitation=ExcitationSettings())
     quiet = asking.replace(excitation=None)
-    one, other = (Twin.of("axis", SERVO, MemoryStore(), each) for each in (asking, quiet))
+    one, other = (Twin("axis", TwinModel.of(SERVO, each)) for each in (asking, quiet))
     with_requests, without = one.state(), other.state()
     other.restore(with_requests)
     assert other.state() == without
@@ -260,33 +304,33 @@ def test_what_is_remembered_is_bounded():
     size = 0
     for k in range(300):
         twin.receive(window_message(k, 1.0 + k), 2.0 + k)
-        size = size or (len(twin.state()) if k == NEWEST + 2 else 0)
+        size = size or (len(twin.state()) if k == MAX_SETTINGS + 2 else 0)
     assert len(twin.state()) < 1.1 * size
     versions = Versions()
-    for k in range(EARLIER + 10):
-        versions.hear(f"boot-{k}", 0)
-    assert len(versions.earlier) == EARLIER
-    assert not versions.hear(f"boot-{EARLIER}", 0)
+    for k in range(MAX_ENDED_BOOTS + 10):
+        versions = versions.noted(f"boot-{k}", 0)
+    assert len(versions.ended_boots) == MAX_ENDED_BOOTS
+    assert versions.has_ended(f"boot-{MAX_ENDED_BOOTS}")
+    assert versions.noted(f"boot-{MAX_ENDED_BOOTS}", 7) is versions
 
 
 def test_what_runs_is_remembered_however_many_updates_follow():
     twin, _ = make()
     twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 3, Setting(1e-5), "m"), 0.0)
-    for k in range(3 * NEWEST):
+    for k in range(3 * MAX_SETTINGS):
         twin.receive(window_message(k, 1.0 + k, version=3), 2.0 + k)
-    assert twin._known.of(3) == Setting(1e-5)
+    assert decode_state("axis", twin.state()).known[3] == Setting(1e-5)
 
 
 @pytest.mark.parametrize("told", [True, False])
 def test_a_hello_tells_what_a_new_boot_runs(told):
     """After a restart from what was proved last, under a version of which this twin never heard."""
-    store = MemoryStore()
-    twin = Twin.of("axis", SERVO, store, TwinSettings(policy="paper"), known_gap)
+    twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), estimator=known_gap))
     law = SERVO.controller.replace(Kp=1234.0)
     hello = Hello("axis", "boot-2", 0.0, 100.0, 17, Setting(3e-5, gains_of(law) if told else None), "m")
     assert twin.receive(hello, 5.0) == []
-    assert store.hellos == [hello]
-    assert twin._known.of(17) == Setting(3e-5, gains_of(law) if told else None)
+    assert twin.log.hellos == [hello]
+    assert decode_state("axis", twin.state()).known[17] == Setting(3e-5, gains_of(law) if told else None)
 
 
 def test_a_hello_of_an_earlier_boot_tells_nothing():
@@ -309,10 +353,10 @@ def test_an_edge_says_which_gains_are_in_force():
 
 
 def test_a_window_that_is_safe_is_learnt_from_without_an_acknowledgement():
-    (one, _), (other, store) = make(), make()
+    one, _ = make()
+    fresh = one.model.initial_state("axis")
     acknowledge, *rest = one.receive(window_message(3, 20.0), 22.0)
     assert isinstance(acknowledge, Acknowledge)
-    assert other.learn(window_message(3, 20.0), 22.0) == rest
-    assert store.windows == {}
+    assert list(step(one.model, fresh, WindowArrival(window_message(3, 20.0), 22.0), 22.0).messages) == rest
     with pytest.raises(InvalidMessage, match="came to the twin of"):
-        other.learn(window_message(3, 20.0, servo="mill"), 22.0)
+        step(one.model, fresh, WindowArrival(window_message(3, 20.0, servo="mill"), 22.0), 22.0)

@@ -13,13 +13,31 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.trend import TrendSettings
-from servotwin.twin.decode import decode_window
+from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.twin.estimating import decode_window
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.wear import Wear
+from servotwin.twin.wear import Expectation, Wear
 
 STD = math.radians(0.02)
 SETTINGS = TrendSettings.for_wear(math.radians(20.0), 200.0)
+
+
+class Wearing:
+    """A wear that is moved in place, under the settings above."""
+
+    def __init__(self, gap: float) -> None:
+        self.wear = Wear(gap)
+
+    @property
+    def trend(self) -> Trend | None:
+        return self.wear.trend(SETTINGS)
+
+    def expect(self, boot: str, time: float, now: float) -> Expectation:
+        return self.wear.expect(SETTINGS, boot, time, now)
+
+    def learn(self, boot: str, estimate: GapEstimate, now: float) -> bool:
+        self.wear, rejection = self.wear.update(SETTINGS, boot, estimate, now)
+        return not rejection
 
 
 def seen(gap_deg: float, time: float, status: GapStatus = GapStatus.OK) -> GapEstimate:
@@ -27,16 +45,16 @@ def seen(gap_deg: float, time: float, status: GapStatus = GapStatus.OK) -> GapEs
     return GapEstimate(gap, STD, STD, (gap - 2 * STD, gap + 2 * STD), status, time)
 
 
-def worn(rate_deg: float = 0.1, windows: int = 6) -> Wear:
+def worn(rate_deg: float = 0.1, windows: int = 6) -> Wearing:
     """After windows every 20 s of a gap that grows steadily from 1 deg on."""
-    wear = Wear(0.0, SETTINGS)
+    wear = Wearing(0.0)
     for time in 20.0 * np.arange(windows):
         wear.learn("boot-1", seen(1.0 + rate_deg * time, time), time + 2.0)
     return wear
 
 
 def test_before_the_first_estimate_there_is_only_what_is_believed():
-    expected = Wear(0.3, SETTINGS).expect("boot-1", 10.0, 12.0)
+    expected = Wearing(0.3).expect("boot-1", 10.0, 12.0)
     assert (expected.prior, expected.trend) == (0.3, None)
     assert expected.gap_rate(SETTINGS) == SETTINGS.rate_std_rad_per_s
 
@@ -52,17 +70,17 @@ def test_it_predicts_the_next_window():
 @pytest.mark.parametrize("status", [s for s in GapStatus if s is not GapStatus.OK])
 def test_nothing_but_a_good_estimate_moves_it(status):
     wear = worn()
-    before = wear.trend
+    before = wear.wear
     wear.learn("boot-1", seen(40.0, 120.0, status), 122.0)
-    assert wear.trend is before
+    assert wear.wear is before
 
 
 def test_an_older_window_moves_nothing_and_is_expected_as_things_stand():
     wear = worn()
-    before = wear.trend
+    before = wear.wear
     wear.learn("boot-1", seen(3.0, 50.0), 130.0)
-    assert wear.trend is before
-    assert wear.expect("boot-1", 50.0, 130.0).trend.time == before.time == 100.0
+    assert wear.wear is before
+    assert wear.expect("boot-1", 50.0, 130.0).trend.time == before.state.time == 100.0
 
 
 def test_a_reboot_starts_the_edges_clock_anew_but_not_the_wear():
@@ -78,7 +96,7 @@ def test_a_reboot_starts_the_edges_clock_anew_but_not_the_wear():
 def test_a_prior_must_not_be_counted_twice():
     with pytest.raises(InvalidInput, match="combine"):
         TwinSettings(estimator=whitened.WhitenedSettings(combine=True))
-    with pytest.raises(InvalidInput, match=r"identify\.paper|identify\.settings"):
+    with pytest.raises(InvalidInput, match=r"estimation\.paper|estimation\.settings"):
         TwinSettings(method="paper", estimator=whitened.WhitenedSettings())
     with pytest.raises(InvalidInput, match="'best' does not exist"):
         TwinSettings(method="best")

@@ -18,15 +18,16 @@ from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.messages.compression import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
-from servotwin.twin import twin as twinmodule
-from servotwin.twin.evidence import LONGEST_STATUS, plain, tail_of
-from servotwin.twin.fleet import Fleet, Model
+from servotwin.twin import step as stepping
+from servotwin.twin.estimating import DecodedWindow
+from servotwin.twin.evidence import MAX_STATUS, plain
+from servotwin.twin.models import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.state import trend_state
+from servotwin.twin.wear import TrendState
 from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=65.0, name="axis")
@@ -34,8 +35,8 @@ START = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
 QUICK = SCENARIO.twin.replace(method="whitened", estimator=None, retry=5.0, attempts=3)
 
 
-def fleet(**changes) -> Fleet:
-    return Fleet((Model("m", SCENARIO.model, QUICK.replace(**changes), START),), (("axis", "m"),))
+def fleet(**changes) -> ModelRegistry:
+    return ModelRegistry((ServoModel("m", SCENARIO.model, QUICK.replace(**changes), START),), (("axis", "m"),))
 
 
 @cache
@@ -43,7 +44,7 @@ def loop() -> Loop:
     return cosimulate(SCENARIO.replace(twin=QUICK))
 
 
-def windows() -> tuple[Window, ...]:
+def windows() -> tuple[WindowMessage, ...]:
     return loop().windows
 
 
@@ -91,7 +92,7 @@ def test_bodies_keep_every_bit_of_what_the_twin_of_the_simulation_found():
     estimates = [msgspec.msgpack.decode(row.body)["estimate"] for row in outcome.evidence if row.kind == "estimate"]
     assert [plain(each) for each in estimates] == [plain(each) for each in loop().estimates]
     trends = [row.body for row in outcome.evidence if row.kind == "trend"]
-    assert trends == [plain(trend_state(trend)) for trend in loop().trends if trend is not None]
+    assert trends == [plain(TrendState.of(trend)) for trend in loop().trends if trend is not None]
     disturbances = [row.body for row in outcome.evidence if row.kind == "disturbance"]
     assert disturbances == [plain(each) for each in loop().disturbances]
     updates = [decode(row.body) for row in outcome.evidence if row.kind == "update"]
@@ -188,19 +189,19 @@ def test_no_bytes_make_it_fail(body, encoding):
 
 
 def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkeypatch):
-    good, right = twinmodule.draft, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
+    good, right = stepping._draft, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
 
     def breaks(message, *others):
         if message.sequence == windows()[1].sequence:
             raise ZeroDivisionError("float division by zero\0" + 1000 * "!")
         return good(message, *others)
 
-    monkeypatch.setattr(twinmodule, "draft", breaks)
+    monkeypatch.setattr(stepping, "_draft", breaks)
     outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.5, 1.0]), 0.0)
     assert kinds(outcome, 2) == ["estimate"]
     status = statuses(outcome)[1]
     assert status.startswith("failed: ZeroDivisionError: float division by zero!!!")
-    assert len(status) == LONGEST_STATUS
+    assert len(status) == MAX_STATUS
     assert (outcome.state, outcome.outgoing) == (right.state, right.outgoing)
 
 
@@ -319,11 +320,11 @@ def test_the_tail_is_the_largest_error_in_the_last_tenth():
     first = round(window.start * window.rate)
     part = slice(first + window.samples - window.samples // 10, first + window.samples)
     expected = np.abs(run.reference[part] - run.measured("position")[part]).max()
-    assert tail_of(window) == pytest.approx(expected, abs=2.0 * window.channel("position").scale)
+    assert DecodedWindow.of(window).tail == pytest.approx(expected, abs=2.0 * window.channel("position").scale)
     outcome = work(fleet(), claim(window), 0.0)
-    assert [row.tail for row in outcome.evidence if row.kind == "estimate"] == [tail_of(window)]
+    assert [row.tail for row in outcome.evidence if row.kind == "estimate"] == [DecodedWindow.of(window).tail]
     alone = msgspec.structs.replace(window, channels=window.channels[1:])
-    assert tail_of(alone) is None
+    assert DecodedWindow.of(alone).tail is None
 
 
 @pytest.mark.parametrize("name", ["certified", "calm"])
@@ -332,7 +333,7 @@ def test_it_says_what_the_twin_of_the_simulation_says(name):
     scenario = Scenario.preset(name).replace(duration=45.0)
     lived = cosimulate(scenario)
     start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
-    mine = Fleet((Model("m", scenario.model, scenario.twin, start),), (("*", "m"),))
+    mine = ModelRegistry((ServoModel("m", scenario.model, scenario.twin, start),), (("*", "m"),))
     state, sent = b"", []
     for each in (m for m in lived.messages if m.direction == "up"):
         stored = StoredMessage(1, MessageKind.LETTER, each.data, "", each.arrival)

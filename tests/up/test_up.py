@@ -94,6 +94,8 @@ def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path
         lines = told(first, "all has ended")
         assert first.wait(PATIENCE_S) == 0
     assert "made: " in lines[0]
+    [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
+    assert lines.index(address) < min(i for i, line in enumerate(lines) if RUNNING in line)
     assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == len(SERVOS)
     assert not left_behind(path)
     before = times(path)

@@ -16,13 +16,23 @@ from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import PiecewiseCubic, SCurve
-from servotwin.up import display, pacing, usage
+from servotwin.up import display
 from servotwin.up.outages import Forwarder, Outages
-from servotwin.up.paced import Mark, Paced
-from servotwin.up.pacing import FASTEST, LIMIT, SLOWEST, Seen, next_speed
 from servotwin.up.plan import SERVOS, machine_toml
-from servotwin.up.reading import Judged, View
-from servotwin.up.twin_watch import Estimated, Twin, counted, newest_estimate
+from servotwin.up.speed import (
+    FASTEST,
+    LIMIT,
+    SLOWEST,
+    TARGET,
+    CoreUsage,
+    MachineTime,
+    SpeedMeter,
+    SpeedSample,
+    next_speed,
+    processor_times,
+    share_of,
+)
+from servotwin.up.status import EstimateError, ServoEstimate, ServoStatus, TwinStatus, newest_estimate, read_metrics
 
 SPEEDS = some.floats(SLOWEST, FASTEST)
 
@@ -31,29 +41,29 @@ SPEEDS = some.floats(SLOWEST, FASTEST)
 def test_more_than_the_limit_is_slowed_down_but_not_below_the_slowest(
     speed: float, share: float, reached: float, waiting: int
 ) -> None:
-    chosen = next_speed(speed, Seen(share, reached, waiting))
+    chosen = next_speed(speed, SpeedSample(share, reached, waiting))
     assert SLOWEST <= chosen <= max(SLOWEST, 0.9 * speed)
 
 
 @given(some.floats(SLOWEST, 90.0), some.floats(1e-3, 1.0))
 def test_a_share_in_proportion_to_speed_settles_below_the_limit(speed: float, share_of_one: float) -> None:
     for _ in range(60):
-        speed = next_speed(speed, Seen(share_of_one * speed, speed, 0))
+        speed = next_speed(speed, SpeedSample(share_of_one * speed, speed, 0))
     assert share_of_one * speed <= LIMIT or speed == SLOWEST
-    assert share_of_one * speed >= 0.85 * pacing.WANTED or speed == FASTEST
+    assert share_of_one * speed >= 0.85 * TARGET or speed == FASTEST
 
 
 def test_a_machine_that_is_late_or_a_twin_that_is_behind_is_not_driven_faster() -> None:
-    assert next_speed(20.0, Seen(0.2, 10.0, 0)) == 10.0
-    assert next_speed(20.0, Seen(0.2, 20.0, 50)) == 16.0
-    assert next_speed(20.0, Seen(None, 20.0, 0)) == 20.0
-    assert next_speed(20.0, Seen(0.5, 20.0, 0)) == 20.0
+    assert next_speed(20.0, SpeedSample(0.2, 10.0, 0)) == 10.0
+    assert next_speed(20.0, SpeedSample(0.2, 20.0, 50)) == 16.0
+    assert next_speed(20.0, SpeedSample(None, 20.0, 0)) == 20.0
+    assert next_speed(20.0, SpeedSample(0.5, 20.0, 0)) == 20.0
 
 
 def test_a_machine_with_one_core_is_measured_by_that_one() -> None:
-    assert pacing.share_of(0.5, 1) == 0.5
-    assert pacing.share_of(0.5, 64) == 0.25
-    assert pacing.share_of(None, 2) is None
+    assert share_of(0.5, 1) == 0.5
+    assert share_of(0.5, 64) == 0.25
+    assert share_of(None, 2) is None
 
 
 def process(root: Path, pid: int, group: int, ticks: int, name: str = "python") -> None:
@@ -67,31 +77,31 @@ def test_processor_time_of_groups_whatever_the_programs_are_called(tmp_path: Pat
     process(tmp_path, 12, 99, 500)
     process(tmp_path, 13, 98, 500)
     (tmp_path / "14").mkdir()
-    found = usage.times({10}, {13}, tmp_path)
+    found = processor_times({10}, {13}, tmp_path)
     assert found is not None
     assert set(found) == {10, 11, 13}
     assert found[10] / found[11] == pytest.approx(1.5)
-    assert usage.times({10}, set(), tmp_path / "nowhere") is None
+    assert processor_times({10}, set(), tmp_path / "nowhere") is None
 
 
 def test_cores_in_use_are_those_since_the_last_look() -> None:
-    use = usage.Usage()
-    assert use.look({1: 5.0}, 100.0) is None
-    assert use.look({1: 6.0, 2: 0.5}, 102.0) == pytest.approx(0.75)
-    assert use.look({2: 1.5}, 104.0) == pytest.approx(0.5)
-    assert use.look(None, 106.0) is None
+    use = CoreUsage()
+    assert use.measure({1: 5.0}, 100.0) is None
+    assert use.measure({1: 6.0, 2: 0.5}, 102.0) == pytest.approx(0.75)
+    assert use.measure({2: 1.5}, 104.0) == pytest.approx(0.5)
+    assert use.measure(None, 106.0) is None
 
 
 def test_speed_is_that_of_the_slowest_machine() -> None:
-    pace = Paced()
-    pace.look({1: 0.0}, {"a": Mark(0.0, 0.0), "b": Mark(7.0, 0.5)}, 0.0)
-    assert not pace.settled
-    pace.look({1: 1.0}, {"a": Mark(20.0, 2.0), "b": Mark(37.0, 2.5)}, 2.0)
-    pace.look({1: 2.0}, {"a": Mark(50.0, 4.0), "b": Mark(77.0, 4.5)}, 4.0)
-    assert pace.settled
-    assert pace.reached == 15.0
-    assert pace.mean_speed == 12.5
-    assert pace.cores == pytest.approx(0.5)
+    meter = SpeedMeter()
+    meter.measure({1: 0.0}, {"a": MachineTime(0.0, 0.0), "b": MachineTime(7.0, 0.5)}, 0.0)
+    assert not meter.started
+    meter.measure({1: 1.0}, {"a": MachineTime(20.0, 2.0), "b": MachineTime(37.0, 2.5)}, 2.0)
+    meter.measure({1: 2.0}, {"a": MachineTime(50.0, 4.0), "b": MachineTime(77.0, 4.5)}, 4.0)
+    assert meter.started
+    assert meter.reached == 15.0
+    assert meter.mean_speed == 12.5
+    assert meter.cores == pytest.approx(0.5)
 
 
 @given(some.floats(0.0, 1e4))
@@ -107,7 +117,7 @@ def test_outages_come_again_and_end(time: float) -> None:
 def test_a_link_passes_on_what_comes_but_in_outages(outages: Outages, answer: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as target:
         forwarder = Forwarder(target.getsockname()[1], outages)
-        forwarder.begin()
+        forwarder.start()
         try:
             with socket.create_connection(("127.0.0.1", forwarder.port), 10.0) as line:
                 line.settimeout(10.0)
@@ -122,7 +132,7 @@ def test_a_link_passes_on_what_comes_but_in_outages(outages: Outages, answer: by
                     with pytest.raises(ConnectionError):
                         _receive_nothing(line)
         finally:
-            forwarder.end()
+            forwarder.stop()
 
 
 def _receive_nothing(line: socket.socket) -> None:
@@ -197,7 +207,7 @@ def test_the_newest_good_estimate_and_the_newest_verdict() -> None:
     failed = {"window": {"boot": "b2"}, "found": [none]}
     links = [glanced, failed, link("b2", "lower bound", 9.0), link("b1", "ok", 0.2), link("b1", "ok", 0.1)]
     found = newest_estimate(links)
-    assert found == Estimated(
+    assert found == ServoEstimate(
         "b1", 42.0, 0.2, (0.19, 0.21000000000000002), "failed: no", 1e-5, pytest.approx(1.96e-6, rel=1e-3)
     )
     assert newest_estimate([glanced, failed]) is None
@@ -209,22 +219,22 @@ def test_metrics_are_read_by_name() -> None:
         'servotwin_messages_total{kind="window",put="new"} 12\nservotwin_messages_total{kind="window",put="known"} 3\n'
         'servotwin_refused_total{code="future"} 2\nservotwin_refused_total{code="rate"} 3\n'
     )
-    assert counted(text) == {"windows": 12, "estimates": 0, "updates": 0, "workers lost": 0, "refused": 5}
+    assert read_metrics(text) == {"windows": 12, "estimates": 0, "updates": 0, "workers lost": 0, "refused": 5}
 
 
-def picture(view: View, twin: Twin | None) -> display.Picture:
-    return display.Picture((view,) * 3, twin, 75.0, 12.0, 11.9, 1.1, 0.55, "http://127.0.0.1:1", "up", "news [x]")
+def picture(view: ServoStatus, twin: TwinStatus | None) -> display.Snapshot:
+    return display.Snapshot((view,) * 3, twin, 75.0, 12.0, 11.9, 1.1, 0.55, "http://127.0.0.1:1", "up", "news [x]")
 
 
-def text_of(shown: display.Picture, width: int = 80) -> str:
+def text_of(shown: display.Snapshot, width: int = 80) -> str:
     console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    console.print(display.rendered(shown))
+    console.print(display.table(shown))
     console.file.close()
     return console.export_text()
 
 
 def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
-    shown = picture(View(SERVOS[0], None, {}, None, 0, 0.0, 0), None)
+    shown = picture(ServoStatus(SERVOS[0], None, {}, None, 0, 0.0, 0), None)
     text = text_of(shown)
     assert "true gap, deg" in text
     assert "no answer" in text
@@ -234,14 +244,14 @@ def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
 
 def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_terminal() -> None:
     state = MachineState(time_s=3723.0, gap_deg=9.131, speed=12.0, begun_s=0.0, written=0.0)
-    told = Estimated("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
+    told = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
     edge = {
         "version": 7, "fallback": True, "tolerance_m": 3.16e-5, "kp_v_per_m": 1377.7, "ki_v_per_m_s": 18907.6,
         "kd_v_s_per_m": -135.1, "feedforward_v": -0.05, "up": {"windows": 41, "trouble": ""}, "down": {"trouble": ""},
         "windows": {"waiting": 3, "dropped": {"withheld": 2, "outbox full": 1}},
     }  # fmt: skip
-    view = View(SERVOS[2], state, edge, Judged(told, 9.0003, 58.0), 47, 4.2, 2)
-    shown = picture(view, Twin(5, 0.1, {"windows": 121, "refused": 0}))
+    view = ServoStatus(SERVOS[2], state, edge, EstimateError(told, 9.0003, 58.0), 47, 4.2, 2)
+    shown = picture(view, TwinStatus(5, 0.1, {"windows": 121, "refused": 0}))
     text = text_of(shown)
     for expected in (
         "1:02:03", "9.131", "9.000 ± 0.040", "-0.0003 58 s ago", "7 fallback set", "0.0316", "1.38 18.9 -0.14", "-50.0",
@@ -255,11 +265,11 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
 
 
 def test_a_truth_outside_of_the_interval_is_told_apart() -> None:
-    told = Estimated("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
+    told = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
     assert isnan(told.rate)
-    assert Judged(told, 9.03, 1.0).inside
-    assert Judged(told, 9.05, 1.0).inside is False
-    assert Judged(told, None, None).inside is None
+    assert EstimateError(told, 9.03, 1.0).inside
+    assert EstimateError(told, 9.05, 1.0).inside is False
+    assert EstimateError(told, None, None).inside is None
 
 
 def test_files_of_a_machine_belong_to_one_that_runs_on(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from math import nan
 import msgspec
 
 from servotwin.drives.simulated import wire
-from servotwin.edge.drive import Block, DriveLost, DriveRefused, Sample
+from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
@@ -127,7 +127,7 @@ class SimulatedControl:
         self._line.connect()
         self._owed = False
 
-    def read(self) -> Sample | None:
+    def read(self) -> DriveSample | None:
         """The next sample; one that was not answered lets the voltage hold."""
         if self._owed:
             self.write(nan)
@@ -135,7 +135,7 @@ class SimulatedControl:
         if number == wire.LAST:
             return None
         self._owed = True
-        return Sample(number, reference, theta_m, position)
+        return DriveSample(number, reference, theta_m, position)
 
     def write(self, voltage: float) -> None:
         """Answer the last sample, once."""

@@ -13,9 +13,9 @@ In a file::
     "ax-1" = "axis"                 # one servo
     "line-*" = "axis"               # all whose names begin so; the first pattern that fits counts
 
-A `Fleet` is a value: frozen, quickly made and small. It can be pickled to a pool's workers when these start (it is the
-service's own and never crossed a link), or read anew there from the same text. What takes long to make of a model, a
-proved fallback set above all, each process makes when it is first needed, and keeps.
+A `ModelRegistry` is a value: frozen, quickly made and small. It can be pickled to a pool's workers when these start (it
+is the service's own and never crossed a link), or read anew there from the same text. The slow parts of a model, a
+certified fallback set above all, are made by each process when it first needs them, and cached.
 """
 
 from __future__ import annotations
@@ -34,17 +34,16 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
+from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
-from servotwin.twin.policies import certified, policy_of
 from servotwin.twin.settings import TwinSettings, read_twin_settings
-from servotwin.twin.store import Store
-from servotwin.twin.twin import Twin
+from servotwin.twin.step import TwinModel
 
-MOST_MODELS = 256
+MAX_MODELS = 256
 
 
 @dataclass(frozen=True)
-class Model:
+class ServoModel:
     """What the twins of equal servos have in common.
 
     Attributes
@@ -65,29 +64,33 @@ class Model:
     start: Setting | None = None
 
     @property
-    def begins(self) -> Setting | None:
+    def first_setting(self) -> Setting | None:
         """`start`, or the certified fallback set; None where there is none for the whole stated range."""
         return _certified_start(self) if self.start is None else self.start
 
-    def twin(self, servo: str, store: Store, state: bytes | None = None) -> Twin:
-        """The twin of one servo of this model; estimator and policy are made once per process.
+    def twin(self, restored: bool) -> TwinModel:
+        """Model of the twins; estimator and policy are made once per process.
+
+        Parameters
+        ----------
+        restored : bool
+            True for a twin that goes on from a state: then `start` is not needed, and not made.
 
         Raises
         ------
         InvalidInput
-            The state is not understood or another servo's, or the policy cannot design for the controller.
+            The policy cannot design for the controller.
         """
-        begins = None if state else self.begins
-        return Twin.of(servo, self.servo, store, self.settings, _estimator(self), begins, state, _policy(self))
+        return _twin_model(self, self.start if restored else self.first_setting)
 
 
 @dataclass(frozen=True)
-class Fleet:
+class ModelRegistry:
     """The models, and which of them each servo has.
 
     Parameters
     ----------
-    models : tuple of Model
+    models : tuple of ServoModel
         With names of their own.
     servos : tuple of (str, str)
         (name of a servo, or a pattern with *, name of its model).
@@ -98,12 +101,12 @@ class Fleet:
         A name is none, comes twice, or a model does not exist.
     """
 
-    models: tuple[Model, ...]
+    models: tuple[ServoModel, ...]
     servos: tuple[tuple[str, str], ...]
 
     def __post_init__(self) -> None:
-        if len(self._by_name) < len(self.models) or not 1 <= len(self.models) <= MOST_MODELS:
-            raise InvalidInput(f"fleet: has {len(self.models)} models: 1 to {MOST_MODELS} with names of their own")
+        if len(self._by_name) < len(self.models) or not 1 <= len(self.models) <= MAX_MODELS:
+            raise InvalidInput(f"fleet: has {len(self.models)} models: 1 to {MAX_MODELS} with names of their own")
         if not self.servos:
             raise InvalidInput('servos: is empty; give at least one, such as "ax-1" = "NAME OF A MODEL"')
         for servo, model in self.servos:
@@ -113,7 +116,7 @@ class Fleet:
                 raise InvalidInput(f"servos.{servo} = {model!r}: there is no such model{hint}")
 
     @classmethod
-    def read(cls, table: Table, folder: Path) -> Fleet:
+    def read(cls, table: Table, folder: Path) -> ModelRegistry:
         """What [models] and [servos] of a twin's file say; paths are relative to `folder`.
 
         Other keys of the table are left to others, who have to ask for them before `table.done()`.
@@ -130,11 +133,11 @@ class Fleet:
             return cls(models, tuple((servo, servos.text(servo)) for servo in servos.values))
 
     @classmethod
-    def loads(cls, text: str, source: str, folder: Path) -> Fleet:
+    def loads(cls, text: str, source: str, folder: Path) -> ModelRegistry:
         """From a file's text; `source` is its name in messages. What else the file holds is not looked at."""
         return cls.read(parse_toml(text, source), folder)
 
-    def model_of(self, servo: str) -> Model:
+    def model_of(self, servo: str) -> ServoModel:
         """The model of a servo.
 
         Raises
@@ -149,7 +152,7 @@ class Fleet:
         return self._by_name[model]
 
     @cached_property
-    def _by_name(self) -> dict[str, Model]:
+    def _by_name(self) -> dict[str, ServoModel]:
         return {model.name: model for model in self.models}
 
     @cached_property
@@ -161,7 +164,7 @@ class Fleet:
         return tuple((servo, model) for servo, model in self.servos if "*" in servo)
 
 
-def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[Model, ...]:
+def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[ServoModel, ...]:
     """[models] of a twin's file; unless they are `checked`, what their policies need may still be missing."""
     inner = table.table("models", required=True)
     make = partial(_model, folder=folder, checked=checked)
@@ -173,7 +176,7 @@ def _check_pattern(servo: str) -> None:
         raise InvalidInput(f"servos: {servo!r} names no servo: 1 to 64 of A-Z a-z 0-9 . _ - are allowed, and * for any")
 
 
-def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
+def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     """One table of [models]."""
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
@@ -184,7 +187,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> Model:
     own = gains_of(law) == gains_of(servo.controller)
     if checked:
         policy_of(servo.replace(controller=law), settings)
-    return Model(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
+    return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
 def _servo(table: Table, folder: Path) -> Servo:
@@ -203,19 +206,24 @@ def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> 
     return Setting(servo.tolerance_for(settings.initial_gap, k_dz), gains_of(law))
 
 
-@lru_cache(maxsize=MOST_MODELS)
-def _estimator(model: Model) -> Estimator:
+@lru_cache(maxsize=2 * MAX_MODELS)
+def _twin_model(model: ServoModel, start: Setting | None) -> TwinModel:
+    return TwinModel.of(model.servo, model.settings, start=start, estimator=_estimator(model), policy=_policy(model))
+
+
+@lru_cache(maxsize=MAX_MODELS)
+def _estimator(model: ServoModel) -> Estimator:
     return estimator_of(model.servo, model.settings)
 
 
-@lru_cache(maxsize=MOST_MODELS)
-def _policy(model: Model) -> Policy:
+@lru_cache(maxsize=MAX_MODELS)
+def _policy(model: ServoModel) -> Policy:
     return policy_of(model.servo, model.settings)
 
 
-@lru_cache(maxsize=MOST_MODELS)
-def _certified_start(model: Model) -> Setting | None:
+@lru_cache(maxsize=MAX_MODELS)
+def _certified_start(model: ServoModel) -> Setting | None:
     try:
-        return certified(model.servo, model.settings).fallback().setting.setting()
+        return certified_policy(model.servo, model.settings).fallback().setting.setting()
     except InvalidInput:
         return None

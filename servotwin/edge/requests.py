@@ -1,4 +1,4 @@
-"""Decides about the twin's requests: pure, what is asked for goes in, what is granted comes out.
+"""Decisions about the twin's requests for longer windows and probing moves. Pure functions.
 
 A request that was decided gets its first answer again, so that a lost answer costs nothing. One that came at a bad
 moment is not decided: the same request may be taken later.
@@ -14,8 +14,8 @@ from servotwin.messages import Answer, LongerWindow, Outcome, Probe, Request
 
 
 @dataclass(frozen=True, slots=True)
-class Granted:
-    """What requests have led to.
+class RequestState:
+    """State that requests have led to.
 
     Parameters
     ----------
@@ -41,50 +41,50 @@ class Granted:
         return 0 if self.answer is None else self.answer.serial
 
 
-class Decided(NamedTuple):
-    """State and answer."""
+class RequestDecision(NamedTuple):
+    """State after a request, and the answer to it."""
 
-    granted: Granted
+    state: RequestState
     answer: Answer
 
 
-def decide(request: Request, granted: Granted, settings: AgentSettings, here: Instant, calm: bool) -> Decided:
+def decide(
+    request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+) -> RequestDecision:
     """Take a request, or say why not.
 
     Parameters
     ----------
     request : Request
-    granted : Granted
+    state : RequestState
     settings : AgentSettings
-        What is allowed.
+        Limits of windows and probing moves.
     here : Instant
-    calm : bool
-        Whether the reference rests, and no window is being recorded.
+    at_rest : bool
+        The reference rests, and no window is being recorded.
     """
-    if granted.answer is not None and _known(request, here) and request.serial == granted.newest:
-        return Decided(granted, granted.answer)
-    outcome = _judge(request, granted, settings, here, calm)
-    answer = Answer(here.servo, here.boot, request.serial, here.sample, outcome, granted.newest)
-    if outcome.passing or not _known(request, here) or outcome is Outcome.DUPLICATE:
-        return Decided(granted, answer)
-    granted = replace(
-        granted, answer=Answer(here.servo, here.boot, request.serial, here.sample, outcome, request.serial)
-    )
-    granted = _grant(request, granted, settings, here) if outcome is Outcome.TAKEN else granted
-    assert granted.answer is not None
-    return Decided(granted, granted.answer)
+    if state.answer is not None and _is_for(request, here) and request.serial == state.newest:
+        return RequestDecision(state, state.answer)
+    outcome = _judge(request, state, settings, here, at_rest)
+    answer = Answer(here.servo, here.boot, request.serial, here.sample, outcome, state.newest)
+    if outcome.passing or not _is_for(request, here) or outcome is Outcome.DUPLICATE:
+        return RequestDecision(state, answer)
+    state = replace(state, answer=Answer(here.servo, here.boot, request.serial, here.sample, outcome, request.serial))
+    state = _grant(request, state, settings, here) if outcome is Outcome.TAKEN else state
+    assert state.answer is not None
+    return RequestDecision(state, state.answer)
 
 
-def _known(request: Request, here: Instant) -> bool:
-    """Whether it is for this edge as it runs."""
+def _is_for(request: Request, here: Instant) -> bool:
+    """True where it was made for this edge and boot."""
     return request.servo == here.servo and request.boot == here.boot
 
 
-def _judge(request: Request, granted: Granted, settings: AgentSettings, here: Instant, calm: bool) -> Outcome:
+def _judge(request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool) -> Outcome:
     checks = (
         (request.servo == here.servo, Outcome.WRONG_SERVO),
         (request.boot == here.boot, Outcome.OTHER_BOOT),
-        (request.serial > granted.newest, Outcome.DUPLICATE),
+        (request.serial > state.newest, Outcome.DUPLICATE),
         (here.time < request.not_after, Outcome.EXPIRED),
     )
     outcome = next((outcome for passed, outcome in checks if not passed), Outcome.TAKEN)
@@ -92,7 +92,7 @@ def _judge(request: Request, granted: Granted, settings: AgentSettings, here: In
         return outcome
     if isinstance(request.ask, LongerWindow):
         return _judge_window(request.ask, settings)
-    return _judge_probe(request.ask, granted, settings, here, calm)
+    return _judge_probe(request.ask, state, settings, here, at_rest)
 
 
 def _judge_window(ask: LongerWindow, settings: AgentSettings) -> Outcome:
@@ -101,30 +101,30 @@ def _judge_window(ask: LongerWindow, settings: AgentSettings) -> Outcome:
     return Outcome.TAKEN if window <= longest and before <= earliest else Outcome.TOO_LARGE
 
 
-def _judge_probe(ask: Probe, granted: Granted, settings: AgentSettings, here: Instant, calm: bool) -> Outcome:
+def _judge_probe(ask: Probe, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool) -> Outcome:
     limits = settings.probe
     if limits is None:
         return Outcome.NOT_ALLOWED
     move = ProbingMove.of(ask, here.sample, here.rate)
     checks = (
         (abs(ask.size) <= limits.size, Outcome.TOO_LARGE),
-        (granted.pre_trigger + move.last - move.first <= settings.longest_samples, Outcome.TOO_LARGE),
-        (_rested(granted, limits, here), Outcome.TOO_SOON),
-        (calm and granted.probe is None, Outcome.BUSY),
+        (state.pre_trigger + move.last - move.first <= settings.longest_samples, Outcome.TOO_LARGE),
+        (_rested(state, limits, here), Outcome.TOO_SOON),
+        (at_rest and state.probe is None, Outcome.BUSY),
     )
     return next((outcome for passed, outcome in checks if not passed), Outcome.TAKEN)
 
 
-def _rested(granted: Granted, limits: ProbeLimits, here: Instant) -> bool:
-    """Whether the last probing move is long enough ago."""
-    return granted.probed is None or here.sample - granted.probed >= limits.interval_s * here.rate
+def _rested(state: RequestState, limits: ProbeLimits, here: Instant) -> bool:
+    """True where the last probing move is long enough ago."""
+    return state.probed is None or here.sample - state.probed >= limits.interval_s * here.rate
 
 
-def _grant(request: Request, granted: Granted, settings: AgentSettings, here: Instant) -> Granted:
+def _grant(request: Request, state: RequestState, settings: AgentSettings, here: Instant) -> RequestState:
     """Windows are at least as configured."""
     ask, rate = request.ask, settings.sample_rate
     if isinstance(ask, Probe):
-        return replace(granted, probe=ProbingMove.of(ask, here.sample, rate), probed=here.sample)
+        return replace(state, probe=ProbingMove.of(ask, here.sample, rate), probed=here.sample)
     window, before = round(ask.window_s * rate), round(ask.pre_trigger_s * rate)
     window, before = max(window, settings.window_samples), max(before, settings.pre_trigger_samples)
-    return replace(granted, window=window, pre_trigger=before)
+    return replace(state, window=window, pre_trigger=before)

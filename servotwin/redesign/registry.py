@@ -1,0 +1,101 @@
+"""All policies by name. A new one is a module in this package and one entry here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.lookup import TablePolicy
+from servotwin.redesign.certified.lookup_file import load
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
+from servotwin.redesign.policy import PaperPolicy, Policy
+
+
+class PolicyOptions(Protocol):
+    """Options of all policies, as a twin's settings have them; None: the policy's default."""
+
+    @property
+    def policy(self) -> str: ...
+    @property
+    def uncertainty(self) -> Uncertainty: ...
+    @property
+    def demands(self) -> Demands: ...
+    @property
+    def table(self) -> str | None: ...
+    @property
+    def k_dz(self) -> float | None: ...
+    @property
+    def smoothing(self) -> float | None: ...
+    @property
+    def k_noise(self) -> float | None: ...
+
+
+class PolicyEntry(NamedTuple):
+    """A policy's maker, and the options that belong to it alone."""
+
+    make: Callable[[Servo, PolicyOptions], Policy]
+    options: tuple[str, ...] = ()
+
+
+def policy_of(servo: Servo, options: PolicyOptions) -> Policy:
+    """Make the policy that the options name.
+
+    Parameters
+    ----------
+    servo : Servo
+        The model, with the controller that runs: its loop filter and limits count, and candidates scale its gains.
+    options : PolicyOptions
+
+    Raises
+    ------
+    InvalidInput
+        The policy cannot design for this controller, or its table is not this model's.
+    """
+    return POLICIES[options.policy].make(servo, options)
+
+
+def certified_policy(servo: Servo, options: PolicyOptions) -> CertifiedPolicy:
+    """Make the certified policy; it feeds no more forward than cancels the largest input bias that is stated."""
+    low, high = options.uncertainty.input_bias
+    return CertifiedPolicy(servo, options.uncertainty, options.demands, feedforward_limit=max(abs(low), abs(high)))
+
+
+def _certified(servo: Servo, options: PolicyOptions) -> Policy:
+    """Verify before every update, or look up."""
+    policy = certified_policy(servo, options)
+    return policy if options.table is None else TablePolicy(policy, load(Path(options.table), policy))
+
+
+def _margin(servo: Servo, options: PolicyOptions) -> MarginPolicy:
+    if servo.controller.voltage_limit is not None:
+        raise InvalidInput(
+            "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "
+            "with a voltage limit, and this one has one: give another policy"
+        )
+    step, continuous = options.uncertainty.step, servo.replace(sample_rate=None, rate_limit=None)
+    if options.k_noise is None:
+        return MarginPolicy(continuous, step)
+    return MarginPolicy(continuous, step, options.k_noise)
+
+
+def _hysteresis(servo: Servo, _options: PolicyOptions) -> HysteresisPolicy:
+    return HysteresisPolicy(servo)
+
+
+def _paper(servo: Servo, options: PolicyOptions) -> PaperPolicy:
+    return PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+
+
+POLICIES: Mapping[str, PolicyEntry] = {
+    "certified": PolicyEntry(_certified, ("table",)),
+    "margin": PolicyEntry(_margin, ("k_noise",)),
+    "hysteresis": PolicyEntry(_hysteresis),
+    "paper": PolicyEntry(_paper, ("k_dz", "smoothing")),
+}
+"""The first is the default."""

@@ -1,0 +1,400 @@
+"""One step of a twin: model, state and an event in; the next state, messages and evidence out. Pure: no clock, no I/O.
+
+A window is to be safe in the store before its step, and new: the caller knows. Windows may come in any order; every one
+is estimated, but only one that is newer than all before moves the parameters, the trend and the starting point of the
+next estimate. Only an estimate whose status is OK moves the trend, and one that does not fit it only once others agree.
+Of a window with another status a policy may use the rest, its input bias and noise, with the gap as the trend knows it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import disturbance
+from servotwin.messages import (
+    Answer,
+    Fallback,
+    Hello,
+    InvalidMessage,
+    Message,
+    ParameterMessage,
+    Receipt,
+    Setting,
+    Update,
+    Verification,
+    WindowMessage,
+    finite,
+)
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.lookup import TablePolicy
+from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Policy, Redesign
+from servotwin.redesign.registry import policy_of
+from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Estimator, Observer, estimator_of
+from servotwin.twin.evidence import (
+    DisturbanceRecord,
+    ExcitationRecord,
+    GapEstimateRecord,
+    GlanceRecord,
+    Record,
+    RedesignRecord,
+    TrendRecord,
+    VerificationRecord,
+    WithdrawalRecord,
+)
+from servotwin.twin.lookups import Lookups, LookupState, VerificationRequest
+from servotwin.twin.requests import Requests, RequestState
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import TwinState, decode_state
+from servotwin.twin.triage import Triage, TriageState
+from servotwin.twin.versions import Attempts, Versions, noted_setting
+from servotwin.twin.wear import Wear
+
+_STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
+
+
+@dataclass(frozen=True)
+class TwinModel:
+    """Constant parts of a twin.
+
+    Parameters
+    ----------
+    estimator : callable
+        (estimation.Window, Expectation) -> GapEstimate.
+    policy : Policy
+        Makes a setting of the evidence; where it raises InvalidInput, there is none.
+    settings : TwinSettings
+    observer : callable, optional
+        estimation.Window -> Disturbance; None: input bias and noise are not estimated.
+    start : Setting, optional
+        In force at the edge before the first update; None: not known.
+    requests : Requests, optional
+        Requests more informative windows.
+    triage : Triage, optional
+        Decides for which windows a glance is enough.
+    lookups : Lookups, optional
+        Verifies settings after they were looked up and sent; then `policy` is not used.
+    """
+
+    estimator: Estimator
+    policy: Policy
+    settings: TwinSettings
+    observer: Observer | None = None
+    start: Setting | None = None
+    requests: Requests | None = None
+    triage: Triage | None = None
+    lookups: Lookups | None = None
+
+    @classmethod
+    def of(
+        cls,
+        servo: Servo,
+        settings: TwinSettings,
+        start: Setting | None = None,
+        estimator: Estimator | None = None,
+        policy: Policy | None = None,
+    ) -> TwinModel:
+        """The model that `settings` describe for a servo, with the controller that runs: policies design for it.
+
+        `estimator` and `policy` replace those of the settings.
+
+        Raises
+        ------
+        InvalidInput
+            The policy cannot design for this controller, or its table is not this model's.
+        """
+        chosen = policy or policy_of(servo, settings)
+        return cls(
+            estimator=estimator or estimator_of(servo, settings),
+            policy=chosen,
+            settings=settings,
+            observer=partial(disturbance, servo=servo),
+            start=start,
+            requests=Requests.of(servo, settings),
+            triage=None if settings.triage is None else Triage(servo, settings.triage),
+            lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
+        )
+
+    def initial_state(self, servo: str) -> TwinState:
+        """State of the twin of a servo of that name before its first message."""
+        known = {} if self.start is None else {0: self.start}
+        return self._fitted(TwinState(servo, Versions(), known, Wear(self.settings.initial_gap)))
+
+    def restored(self, servo: str, data: bytes) -> TwinState:
+        """The stored state of a servo, with a slice for each optional part of this model and no other.
+
+        Raises
+        ------
+        InvalidInput
+            The bytes are no state, or another servo's.
+        """
+        return self._fitted(decode_state(servo, data))
+
+    def _fitted(self, state: TwinState) -> TwinState:
+        return replace(
+            state,
+            requests=None if self.requests is None else state.requests or RequestState(),
+            triage=None if self.triage is None else state.triage or TriageState(),
+            lookups=None if self.lookups is None else state.lookups or LookupState(),
+        )
+
+
+class WindowArrival(NamedTuple):
+    """A new window that is safe in the store, and when it arrived, s, on the clock of `now`.
+
+    The time between two boots of the edge is taken from `time`.
+    """
+
+    window: WindowMessage
+    time: float
+
+
+class Wake(NamedTuple):
+    """The time that `next_wake` gave."""
+
+
+Event = WindowArrival | ParameterMessage | VerificationRequest | Wake
+
+
+class StepResult(NamedTuple):
+    """Result of a step.
+
+    Attributes
+    ----------
+    state : TwinState
+    messages : tuple of Message
+        To be sent to the edge, in order.
+    evidence : tuple of Record
+        To be stored, in order; of a `VerificationRequest` among them the caller makes an event, at any later time.
+    """
+
+    state: TwinState
+    messages: tuple[Message, ...] = ()
+    evidence: tuple[Record, ...] = ()
+
+
+def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepResult:
+    """Process one event.
+
+    Parameters
+    ----------
+    model : TwinModel
+    state : TwinState
+    event : WindowArrival, message, VerificationRequest or Wake
+    now : float
+        s, a clock of the twin's own. It may jump: nothing is waited for longer than from `now` on.
+
+    Raises
+    ------
+    InvalidMessage
+        The message is for another servo, or of a kind that only an edge receives.
+    InvalidInput
+        A verification is requested, and no table is used any more.
+    """
+    if isinstance(event, VerificationRequest):
+        return _verify(model, state, event)
+    if not isinstance(event, Wake):
+        servo = event.window.servo if isinstance(event, WindowArrival) else event.servo
+        if servo != state.servo:
+            raise InvalidMessage(f"message of servo {servo!r} came to the twin of {state.servo!r}")
+    requests = None if state.requests is None else state.requests.not_after(now)
+    state = replace(state, attempts=state.attempts.not_after(now), requests=requests)
+    match event:
+        case WindowArrival():
+            return _take_window(model, state, event, now)
+        case Receipt():
+            versions, again = state.versions.after_receipt(event)
+            return _send(replace(state, versions=versions), again, now, (event,))
+        case Fallback():
+            return _take_fallback(state, event)
+        case Hello():
+            return _take_hello(state, event)
+        case Answer():
+            return _take_answer(model, state, event, now)
+        case Wake():
+            return _wake(model, state, now)
+    raise InvalidMessage(f"a twin does not receive {type(event).__name__} messages")
+
+
+def next_wake(model: TwinModel, state: TwinState) -> float | None:
+    """Time at which a `Wake` is due, s; None: nothing is awaited."""
+    update = None if state.versions.pending is None else state.attempts.sent_at + model.settings.retry
+    request = None if model.requests is None or state.requests is None else model.requests.next_wake(state.requests)
+    return min((due for due in (update, request) if due is not None), default=None)
+
+
+def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
+    """Estimate, redesign, request: whatever a window gives rise to."""
+    message, arrived, trends = event.window, event.time, model.settings.trend
+    state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
+    decoded, records = DecodedWindow.of(message), list[Record]()
+    if model.triage is not None and state.triage is not None and decoded.window is not None:
+        requested = state.requests is not None and state.requests.pending is not None
+        trend = state.wear.trend(trends)
+        triage, glance = model.triage.glance(state.triage, message, decoded.window, trend, requested)
+        state = replace(state, triage=triage)
+        if glance is not None:
+            records.append(GlanceRecord(message, glance, decoded.tail))
+            if not glance.moved:
+                return StepResult(state, (), tuple(records))
+    expected = state.wear.expect(trends, message.boot, message.middle, arrived)
+    estimate = decoded.estimate(model.estimator, expected)
+    disturbed = decoded.disturbance(model.observer)
+    records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
+    stale = not state.versions.admits(message)
+    rejection = _STALE
+    if not stale:
+        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived)
+        state = replace(state, wear=wear)
+    trend = state.wear.trend(trends)
+    records.append(TrendRecord(message, trend))
+    if model.triage is not None and state.triage is not None and not stale:
+        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
+        state = replace(state, triage=triage)
+    in_force = state.known.get(state.versions.in_force)
+    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection)
+    state, redesign = _redesign(model, state, evidence, stale)
+    records.append(RedesignRecord(message, redesign))
+    requests: tuple[Message, ...] = ()
+    if model.requests is not None and state.requests is not None and not stale and estimate.method != UNUSABLE:
+        widest = state.wear.expect(trends, message.boot, estimate.time, arrived).widest
+        asking, decision = model.requests.decide(state.requests, message, estimate, widest, in_force, now)
+        state = replace(state, requests=asking)
+        records.append(ExcitationRecord(message, decision))
+        if decision.ask is not None and asking.pending is not None:
+            records.append(asking.pending)
+            requests = (asking.pending,)
+    if redesign.setting is None:
+        return StepResult(state, requests, tuple(records))
+    versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))
+    state = replace(state, versions=versions, tuned_for=float(redesign.gap))
+    sent = _send(state, versions.pending, now, tuple(records))
+    assert versions.pending is not None
+    unverified = VerificationRequest.of(versions.pending, redesign)
+    found = sent.evidence if unverified is None else (*sent.evidence, unverified)
+    return StepResult(sent.state, sent.messages + requests, found)
+
+
+def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
+    """What the policy makes of the evidence; nothing, and why, where it is not consulted or finds nothing."""
+    needs_estimate = model.lookups is None and model.policy.needs_estimate
+    if stale or (evidence.why_not and needs_estimate):
+        return state, Redesign(None, math.nan, evidence.why_not)
+    try:
+        if model.lookups is None or state.lookups is None:
+            return state, model.policy.redesign(evidence)
+        lookups, redesign = model.lookups.redesign(state.lookups, evidence)
+        return replace(state, lookups=lookups), redesign
+    except InvalidInput as error:
+        return state, Redesign(None, math.nan, str(error))
+
+
+def _send(state: TwinState, update: Update | None, now: float, records: tuple[Record, ...]) -> StepResult:
+    """Send the pending update for the first time; None: nothing."""
+    if update is None:
+        return StepResult(state, (), records)
+    known = noted_setting(state.known, update.version, update.setting, update.base_version, state.versions.in_force)
+    return StepResult(replace(state, known=known, attempts=Attempts(now, 1)), (update,), (*records, update))
+
+
+def _take_hello(state: TwinState, hello: Hello) -> StepResult:
+    """Note that the edge started or came back, and what it runs: it may be a setting stored in an earlier boot."""
+    versions = state.versions.noted(hello.boot, hello.parameter_version)
+    if versions.has_ended(hello.boot):
+        return StepResult(state, (), (hello,))
+    known = noted_setting(state.known, hello.parameter_version, hello.setting, hello.parameter_version)
+    return StepResult(replace(state, versions=versions, known=known), (), (hello,))
+
+
+def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:
+    """Note that the edge has left what this twin gave it: nothing made before is sent again."""
+    versions = state.versions.noted(fallback.boot, fallback.parameter_version)
+    if versions.has_ended(fallback.boot):
+        return StepResult(state, (), (fallback,))
+    state = replace(
+        state,
+        versions=versions.without_pending(),
+        known=noted_setting(state.known, fallback.parameter_version, fallback.setting, fallback.replaced),
+        tuned_for=None,
+        triage=state.triage and state.triage.doubted("the edge has fallen back"),
+    )
+    return StepResult(state, (), (fallback,))
+
+
+def _take_answer(model: TwinModel, state: TwinState, answer: Answer, now: float) -> StepResult:
+    if model.requests is None or state.requests is None:
+        return StepResult(state, (), (answer,))
+    requests, again = model.requests.answered(state.requests, answer, now)
+    state = replace(state, requests=requests)
+    return StepResult(state, (), (answer,)) if again is None else StepResult(state, (again,), (answer, again))
+
+
+def _wake(model: TwinModel, state: TwinState, now: float) -> StepResult:
+    """The pending update and request once more when their answers are overdue; given up after some attempts."""
+    asked: tuple[Message, ...] = ()
+    if model.requests is not None and state.requests is not None:
+        requests, asked = model.requests.wake(state.requests, now)
+        state = replace(state, requests=requests)
+    pending = state.versions.pending
+    if pending is None or now < state.attempts.sent_at + model.settings.retry:
+        return StepResult(state, asked)
+    if state.attempts.count >= model.settings.attempts:
+        return StepResult(replace(state, versions=state.versions.without_pending()), asked)
+    return StepResult(replace(state, attempts=state.attempts.another(now)), (pending, *asked))
+
+
+def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) -> StepResult:
+    """Verify what was looked up, and withdraw it where that fails: then the next update is the fallback set."""
+    if model.lookups is None or state.lookups is None:
+        raise InvalidInput("nothing is to be verified, as no table is used any more")
+    current = [state.known.get(version) for version in state.versions.current]
+    lookups, result, why = model.lookups.verify(state.lookups, request, current)
+    record = VerificationRecord(request, result)
+    if not why:
+        return StepResult(replace(state, lookups=lookups), (), (record,))
+    triage = state.triage and state.triage.doubted(why)
+    state = replace(state, lookups=lookups, versions=state.versions.without_pending(), triage=triage)
+    return StepResult(state, (), (record, WithdrawalRecord(request, why)))
+
+
+def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
+    """An update but for its version and base; it may be applied until `validity` (s) after the window's start."""
+    assert redesign.setting is not None
+    estimate = evidence.estimate
+    low, high = estimate.interval
+    return Update(
+        servo=message.servo,
+        version=1,
+        base_version=0,
+        window=(message.boot, message.sequence),
+        data_time=message.start,
+        gap=finite(estimate.gap),
+        std=finite(estimate.std_total),
+        interval=(finite(low), finite(high)),
+        status=estimate.status.value,
+        setting=redesign.setting,
+        not_after=message.start + validity,
+        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
+    )
+
+
+def verification_of(certificate: Certificate) -> Verification:
+    """Summarise a certificate for an update, without how long it took: equal twins send equal bytes."""
+    return Verification(
+        members=certificate.members,
+        looked_at=certificate.looked_at,
+        settled=certificate.settled,
+        tail=certificate.tail,
+        overshoot=certificate.overshoot,
+        Ms=certificate.Ms,
+        crossover=certificate.crossover,
+        phase_margin=certificate.phase_margin,
+        saturated=certificate.saturated,
+    )
