@@ -169,7 +169,7 @@ class Window:
 
 
 def _samples(where: str, begin: float, rate: float, size: int, start: float, duration: float) -> slice:
-    """Select those of `size` samples at `rate` (Hz), the first at `begin` (s), in `duration` (s) from `start` (s) on."""
+    """Select of `size` samples at `rate` (Hz), the first at `begin` (s), those in `duration` (s) from `start` (s)."""
     first = round((_number(where, "start", "s", start) - begin) * rate)
     last = first + round(_number(where, "duration", "s", duration) * rate)
     if not 0 <= first < last <= size:

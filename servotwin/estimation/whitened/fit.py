@@ -314,7 +314,7 @@ def profile_interval(found: WhitenedFit, std: float, calibration: float, largest
     allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
 
     def rise(gap: float) -> float:
-        """Rise of the cost of the best fit with this gap, in units of what is allowed; well within, an upper bound of it."""
+        """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
         near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
         places = (found.point.place,) if near else (*same_way(found.point, gap), *PLACES)
         lowest = math.inf
