@@ -19,7 +19,7 @@ import msgspec
 from benchmarks.fleet.line import Line
 from benchmarks.fleet.plan import Load, Plan, Report, decode_load, shares
 from servotwin.link.seal import Sealed
-from servotwin.messages import Reason, Receipt, Update, Window, decode, encode
+from servotwin.messages import Reason, Receipt, Update, WindowMessage, decode, encode
 
 TAKEN, LATER = (200, 201, 202), (429, 503)
 PAUSE = 0.2
@@ -308,9 +308,9 @@ def _report(counts: Counts, seconds: float) -> Report:
     return Report(seconds, *done, used, shares(counts.latency), shares(counts.late), counts.waited)
 
 
-def _window(body: bytes) -> Window:
+def _window(body: bytes) -> WindowMessage:
     message = decode(body)
-    assert isinstance(message, Window)
+    assert isinstance(message, WindowMessage)
     return message
 
 

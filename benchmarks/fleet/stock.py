@@ -10,7 +10,7 @@ import msgspec
 
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Update, Window, decode, encode
+from servotwin.messages import Update, WindowMessage, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin.models import ModelRegistry
@@ -45,8 +45,8 @@ class Place(NamedTuple):
     """
 
     gap: float
-    first: tuple[Window, ...]
-    windows: tuple[Window, ...]
+    first: tuple[WindowMessage, ...]
+    windows: tuple[WindowMessage, ...]
 
 
 def stock(places: int, windows: int, seed: int = 0) -> list[Place]:
@@ -71,7 +71,7 @@ def _place(number: int, windows: int, seed: int) -> Place:
     return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
 
 
-def readdressed(window: Window, servo: str, sequence: int, start: float, version: int) -> Window:
+def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, version: int) -> WindowMessage:
     """The same measurements as another servo's, at another time; the checksum is over the channels, and stays."""
     shift = start - window.start
     return msgspec.structs.replace(

@@ -18,7 +18,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.window import Window
-from servotwin.logs.reader import Log, read_log
+from servotwin.logs.log import Log, read_log
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
@@ -29,8 +29,8 @@ _ROUNDING = 1e-6  # of a sample
 
 
 @dataclass(frozen=True)
-class Request:
-    """What to identify; times in s, angles in deg. None: as the log or the default says."""
+class IdentifyOptions:
+    """Options of the command; times in s, angles in deg. None: as the log or the default says."""
 
     log: Path
     servo: str | None = None
@@ -45,8 +45,8 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Identified:
-    """What a log shows.
+class Identification:
+    """Gaps of a log's windows and their trend.
 
     Attributes
     ----------
@@ -68,18 +68,18 @@ class Identified:
     until_limit: Passage | None
 
 
-def identify(request: Request) -> Identified:
-    """Read, cut, estimate, follow.
+def identify(options: IdentifyOptions) -> Identification:
+    """Read a log, cut windows, estimate their gaps and follow the trend.
 
     Raises
     ------
     InvalidInput
         The log, the servo or an option is not valid, or no window fits into the log.
     """
-    settings = _settings(request)
-    log = read_log(request.log)
-    servo = _servo(request, log)
-    windows = cut(log, request)
+    settings = _settings(options)
+    log = read_log(options.log)
+    servo = _servo(options, log)
+    windows = cut(log, options)
     estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap)
     estimates = []
     for window in windows:
@@ -88,35 +88,35 @@ def identify(request: Request) -> Identified:
         wear, _ = wear.update(settings.trend, "log", estimates[-1], now)
     limit, trend = settings.gap_limit, wear.trend(settings.trend)
     until = None if limit is None or trend is None else trend.time_until(limit)
-    return Identified(servo, windows, tuple(estimates), trend, until)
+    return Identification(servo, windows, tuple(estimates), trend, until)
 
 
-def cut(log: Log, request: Request) -> tuple[Window, ...]:
-    """One window as asked for, or one after each change of the reference, as an edge cuts them: never overlapping."""
+def cut(log: Log, options: IdentifyOptions) -> tuple[Window, ...]:
+    """Cut the window that the options name, or one after each change of the reference, as an edge does: no overlaps."""
     whole = log.whole
-    if request.start is not None or request.duration is not None:
-        if request.window is not None or request.pre_trigger is not None:
+    if options.start is not None or options.duration is not None:
+        if options.window is not None or options.pre_trigger is not None:
             raise InvalidInput(
                 "--window and --pre-trigger cut at the steps: leave them out with --start and --duration"
             )
-        return (_one(whole, request),)
+        return (_one(whole, options),)
     if whole.reference is None:
         raise InvalidInput(
             f"{whole.where}without column 'reference_m' there is no telling the steps: give --start and --duration"
         )
-    length = _option("window", request.window, log.metadata.get("window_s"), WINDOW)
-    before = _option("pre-trigger", request.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
+    length = _option("window", options.window, log.metadata.get("window_s"), WINDOW)
+    before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
     if not 0.0 <= before < length:
         raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")
-    firsts = opened(whole.reference, round(length * whole.sample_rate), round(before * whole.sample_rate))
+    firsts = window_starts(whole.reference, round(length * whole.sample_rate), round(before * whole.sample_rate))
     if not firsts:
         shown = f"no change of reference_m is followed by {length:g} s"
         raise InvalidInput(f"{whole.where}{shown}; give --start and --duration")
     return tuple(whole.slice(whole.start + first / whole.sample_rate, length) for first in firsts)
 
 
-def opened(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:
-    """First samples of the windows that changes of the reference (a start away from 0 included) open, in samples."""
+def window_starts(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:
+    """List the first samples of the windows that changes of the reference open, a start away from 0 included."""
     steps = np.flatnonzero(np.diff(np.asarray(reference), prepend=0.0))
     firsts: list[int] = []
     for step in steps:
@@ -126,10 +126,10 @@ def opened(reference: Sequence[float] | np.ndarray[Any, Any], length: int, befor
     return firsts
 
 
-def _one(whole: Window, request: Request) -> Window:
-    start = whole.start if request.start is None else request.start
+def _one(whole: Window, options: IdentifyOptions) -> Window:
+    start = whole.start if options.start is None else options.start
     end = float(whole.start + whole.position.size / whole.sample_rate)
-    duration = end - start if request.duration is None else request.duration
+    duration = end - start if options.duration is None else options.duration
     if not (math.isfinite(start) and math.isfinite(duration) and duration > 0.0):
         shown = f"--start {start!r} s, --duration {duration!r} s"
         raise InvalidInput(f"{whole.where}{shown}: the log goes from {whole.start:g} s to {end:g} s")
@@ -137,50 +137,50 @@ def _one(whole: Window, request: Request) -> Window:
 
 
 def _option(name: str, given: float | None, noted: Any, default: float) -> float:
-    """What was given, else what the log notes, else the default."""
+    """Choose the given value, else the log's, else the default."""
     value = given if given is not None else (noted if isinstance(noted, int | float) else default)
     if not (math.isfinite(value) and value >= 0.0):
         raise InvalidInput(f"--{name} {value!r} s: must be a finite number of at least 0")
     return float(value)
 
 
-def _servo(request: Request, log: Log) -> Servo:
-    if request.servo is not None:
-        return Servo.resolve(request.servo)
+def _servo(options: IdentifyOptions, log: Log) -> Servo:
+    if options.servo is not None:
+        return Servo.resolve(options.servo)
     text = log.metadata.get("servo")
     if not isinstance(text, str):
         raise InvalidInput(f"{log.whole.where}it does not say of which servo it is: give --servo, a preset or a TOML")
-    return Servo.loads(text, f"log {request.log}, servo")
+    return Servo.loads(text, f"log {options.log}, servo")
 
 
-def _settings(request: Request) -> TwinSettings:
-    wear, over, limit = request.wear_deg, request.wear_over_s, request.gap_limit_deg
+def _settings(options: IdentifyOptions) -> TwinSettings:
+    wear, over, limit = options.wear_deg, options.wear_over_s, options.gap_limit_deg
     if (wear is None) != (over is None):
         raise InvalidInput("--wear-deg and --wear-over-s belong together: give both, or neither")
     known = wear is not None and over is not None
     trend = TrendSettings.for_wear(math.radians(wear), over) if known else TrendSettings()  # type: ignore[arg-type]
     if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
         raise InvalidInput(f"--gap-limit-deg {limit!r}: must be a finite number of at least 0")
-    return TwinSettings(method=request.method, trend=trend, gap_limit=None if limit is None else math.radians(limit))
+    return TwinSettings(method=options.method, trend=trend, gap_limit=None if limit is None else math.radians(limit))
 
 
-def tell(request: Request, as_json: bool) -> None:
-    """The command: tables, or one JSON object, on the standard output."""
-    found = identify(request)
+def show(options: IdentifyOptions, as_json: bool) -> None:
+    """Print tables, or one JSON object, on the standard output."""
+    found = identify(options)
     if as_json:
-        print(json.dumps(as_dict(found, request), indent=2, allow_nan=False))
+        print(json.dumps(as_dict(found, options), indent=2, allow_nan=False))
         return
     console = Console()
     count = sum(estimate.ok for estimate in found.estimates)
     console.print(
-        f"{request.log}: {len(found.windows)} windows, {count} OK, model {found.servo.version}", highlight=False
+        f"{options.log}: {len(found.windows)} windows, {count} OK, model {found.servo.version}", highlight=False
     )
     console.print(_table(found), highlight=False)
-    for line in _trend_lines(found, request):
+    for line in _trend_lines(found, options):
         console.print(line, highlight=False)
 
 
-def _table(found: Identified) -> Table:
+def _table(found: Identification) -> Table:
     heads = ("window, s", "gap, deg", "std, deg", "95 % interval, deg", "status")
     table = Table(*heads, box=None, pad_edge=False)
     for window, estimate in zip(found.windows, found.estimates, strict=True):
@@ -200,12 +200,12 @@ def _table(found: Identified) -> Table:
 
 
 def _unsure(estimate: GapEstimate) -> tuple[str, str, str]:
-    """A bound where there is one; what was believed before is no result of the window."""
+    """Format a bound where there is one; the prior is no result of the window."""
     bounded = estimate.status is GapStatus.LOWER_BOUND
     return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-", "-")
 
 
-def _trend_lines(found: Identified, request: Request) -> list[str]:
+def _trend_lines(found: Identification, options: IdentifyOptions) -> list[str]:
     trend = found.trend
     if trend is None:
         return ["no window shows the gap, so there is no trend"]
@@ -219,18 +219,18 @@ def _trend_lines(found: Identified, request: Request) -> list[str]:
         median = (
             f"median {found.until_limit.median:.4g} s" if math.isfinite(found.until_limit.median) else "perhaps never"
         )
-        lines.append(f"{request.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
+        lines.append(f"{options.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
     return lines
 
 
-def as_dict(found: Identified, request: Request) -> dict[str, Any]:
-    """What a machine reads: angles in deg, times in s, null where there is no number."""
+def as_dict(found: Identification, options: IdentifyOptions) -> dict[str, Any]:
+    """Make the JSON object: angles in deg, times in s, null where there is no number."""
     trend, until = found.trend, found.until_limit
     pairs = zip(found.windows, found.estimates, strict=True)
     return {
-        "log": str(request.log),
+        "log": str(options.log),
         "model": found.servo.version,
-        "method": request.method,
+        "method": options.method,
         "windows": [_row(window, estimate) for window, estimate in pairs],
         "trend": None if trend is None else _finite(_trend(trend)),
         "until_limit": None
@@ -266,7 +266,7 @@ def _row(window: Window, estimate: GapEstimate) -> dict[str, Any]:
 
 
 def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON has no infinity and no NaN."""
+    """Replace infinity and NaN, which JSON does not have, by null."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, list):

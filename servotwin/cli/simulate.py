@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
 from servotwin.cosim import Loop
-from servotwin.errors import InvalidInput
-from servotwin.logs.reader import read_log
-from servotwin.runtime import files
-
-_ROWS = 20_000  # of a CSV file written at a time
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """Columns of equal length with their units in their names, and what is known of the run."""
-
-    columns: Mapping[str, NDArray[np.float64]]
-    metadata: Mapping[str, Any]
+from servotwin.logs.formats import SignalTable
+from servotwin.logs.log import check_output, read_log, write_log
 
 
 def record(scenario: Path, output: Path, console: Console | None = None) -> Path:
@@ -54,52 +37,29 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     InvalidInput
         Before anything is computed: an output that cannot be written, a scenario that is not valid.
     """
-    write = writer(output)
+    check_output(output)
     text, described = _read(scenario)
     found = recording(_run(described, console or Console()), text)
-    with files.atomic_output(output) as temporary:
-        write(found, temporary)
+    write_log(found, output)
     (console or Console()).print(f"{_rows(found)} samples: {output}", soft_wrap=True, highlight=False)
     return output
 
 
 def convert(log: Path, output: Path) -> Path:
-    """A log in another format, with what its windows are made of: a gateway replays .csv only.
+    """Write a log in another format, with the channels that windows are made of: a gateway replays .csv only.
 
     Raises
     ------
     InvalidInput
         The log is not one, or the output cannot be written.
     """
-    write = writer(output)
-    found = read_log(log)
-    whole = found.whole
-    columns = {"time_s": whole.time, "measured_position_m": whole.position}
-    others = {"theta_m_rad": whole.theta_m, "voltage_v": whole.voltage, "reference_m": whole.reference}
-    columns |= {name: values for name, values in others.items() if values is not None}
-    with files.atomic_output(output) as temporary:
-        write(Recording(columns, found.metadata), temporary)
+    check_output(output)
+    write_log(read_log(log).table(), output)
     return output
 
 
-def writer(output: Path) -> Callable[[Recording, Path], None]:
-    """The function that writes files of this suffix, once everything that can be checked has been.
-
-    Raises
-    ------
-    InvalidInput
-        Unknown suffix, missing directory, or a format whose library is not installed.
-    """
-    files.check_file(output, tuple(_WRITERS))
-    if output.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise InvalidInput(
-            f"output {output}: parquet needs pyarrow; give: pip install 'servotwin[parquet]', or use .npz"
-        )
-    return _WRITERS[output.suffix]
-
-
-def recording(loop: Loop, scenario_text: str) -> Recording:
-    """What a co-simulation's table holds."""
+def recording(loop: Loop, scenario_text: str) -> SignalTable:
+    """Make the table of a co-simulation."""
     run, scenario = loop.run, loop.scenario
     columns = {
         "time_s": run.time,
@@ -124,7 +84,7 @@ def recording(loop: Loop, scenario_text: str) -> Recording:
         "pre_trigger_s": scenario.pre_trigger,
         "scenario": scenario_text,
     }
-    return Recording(columns, metadata)
+    return SignalTable(columns, metadata)
 
 
 def _read(path: Path) -> tuple[str, st.Scenario]:
@@ -140,35 +100,5 @@ def _run(scenario: st.Scenario, console: Console) -> Loop:
         return st.cosimulate(scenario, lambda share: progress.update(bar, completed=share))
 
 
-def _rows(found: Recording) -> int:
+def _rows(found: SignalTable) -> int:
     return len(found.columns["time_s"])
-
-
-def _write_npz(found: Recording, path: Path) -> None:
-    arrays: dict[str, Any] = {"metadata": np.array(json.dumps(found.metadata)), **found.columns}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-
-
-def _write_csv(found: Recording, path: Path) -> None:
-    values = np.column_stack(list(found.columns.values()))
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(f"# {json.dumps(found.metadata)}\n{','.join(found.columns)}\n")
-        for first in range(0, len(values), _ROWS):
-            np.savetxt(file, values[first : first + _ROWS], fmt="%.12g", delimiter=",")
-
-
-def _write_parquet(found: Recording, path: Path) -> None:
-    import pyarrow
-    from pyarrow import parquet
-
-    table = pyarrow.table(dict(found.columns))
-    described = {key: value if isinstance(value, str) else json.dumps(value) for key, value in found.metadata.items()}
-    parquet.write_table(table.replace_schema_metadata(described), path)
-
-
-_WRITERS: dict[str, Callable[[Recording, Path], None]] = {
-    ".parquet": _write_parquet,
-    ".npz": _write_npz,
-    ".csv": _write_csv,
-}

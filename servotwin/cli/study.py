@@ -72,10 +72,10 @@ def identify(
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """The gap and its trend from a recorded log."""
-    from servotwin.cli.identify import Request, tell
+    from servotwin.cli.identify import IdentifyOptions, show
 
     cut = (start, duration, window, pre_trigger)
-    tell(Request(log, servo, *cut, method, wear_deg, wear_over_s, gap_limit_deg), json)
+    show(IdentifyOptions(log, servo, *cut, method, wear_deg, wear_over_s, gap_limit_deg), json)
 
 
 def bench(context: typer.Context) -> None:

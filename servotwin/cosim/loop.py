@@ -16,7 +16,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.trend import Trend
 from servotwin.link.simulated import Fate
-from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, Window, decode
+from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, WindowMessage, decode
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.runtime.notebook import html_table
@@ -68,7 +68,7 @@ class Loop:
     scenario : Scenario
     run : Run
         The trajectory.
-    windows : tuple of messages.Window
+    windows : tuple of messages.WindowMessage
         As decoded by the twin, each once, in the order of arrival.
     estimates : tuple of GapEstimate
         One for each window.
@@ -98,7 +98,7 @@ class Loop:
 
     scenario: Scenario
     run: Run
-    windows: tuple[Window, ...]
+    windows: tuple[WindowMessage, ...]
     estimates: tuple[GapEstimate, ...]
     disturbances: tuple[Disturbance, ...]
     trends: tuple[Trend | None, ...]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servotwin.cosim.loop import Loop
-from servotwin.estimation.window import Window as NumericWindow
-from servotwin.messages import Window
+from servotwin.estimation.window import Window
+from servotwin.messages import WindowMessage
 from servotwin.simulation import Run
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.wear import Expectation
@@ -50,11 +50,11 @@ def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
     return tuple(found)
 
 
-def _raw(run: Run, window: Window) -> NumericWindow:
+def _raw(run: Run, window: WindowMessage) -> Window:
     """The same samples as the sensors gave them."""
     first = round(window.start * window.rate)
     part = slice(first, first + window.samples)
-    return NumericWindow(
+    return Window(
         run.measured("position")[part],
         theta_m=run.measured("theta_m")[part],
         voltage=run.measured("voltage")[part],

@@ -13,11 +13,11 @@ from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Outcome, Probe, Request
 from servotwin.messages.setting import Band, Gains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
-from servotwin.messages.windows import Acknowledge, Hello, Window
+from servotwin.messages.windows import Acknowledge, Hello, WindowMessage
 
 __all__ = [
     "FINE", "MAX_BYTES", "NAME_PATTERN", "Acknowledge", "Answer", "Ask", "Band", "Cause", "Channel", "Fallback",
     "Gains", "Hello", "InvalidMessage", "LongerWindow", "Message", "Outcome", "ParameterMessage", "Probe", "Reason",
-    "Receipt", "Refusal", "Request", "Setting", "Update", "Verification", "Window", "checksum", "decode", "decode_json",
-    "encode", "encode_json", "finite", "pack_channel", "pack_finely", "unpack_channel",
+    "Receipt", "Refusal", "Request", "Setting", "Update", "Verification", "WindowMessage", "checksum", "decode",
+    "decode_json", "encode", "encode_json", "finite", "pack_channel", "pack_finely", "unpack_channel",
 ]  # fmt: skip

@@ -10,13 +10,13 @@ from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Request
 from servotwin.messages.updates import Fallback, Receipt, Update
-from servotwin.messages.windows import Acknowledge, Hello, Window
+from servotwin.messages.windows import Acknowledge, Hello, WindowMessage
 
 MAX_BYTES = 4 * 1024 * 1024
 """Largest message that is looked at: 1 s of four channels at 5 kHz takes 40 kB."""
 
 ParameterMessage = Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge
-Message = Window | ParameterMessage
+Message = WindowMessage | ParameterMessage
 _Decoded = TypeVar("_Decoded")
 
 
@@ -48,7 +48,7 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
         Too large (seen before anything is parsed), not MessagePack, unknown tag, bad field, wrong checksum.
     """
     message = _guarded(_decoder, data, limit)
-    if isinstance(message, Window):
+    if isinstance(message, WindowMessage):
         whole = message.crc == checksum(message.channels)
         require(whole, "window checksum does not match its channels", Refusal.BAD_CHECKSUM)
     return message

@@ -10,7 +10,7 @@ from servotwin.messages.checks import Count, Name, Text, all_finite, require
 from servotwin.messages.setting import Setting
 
 
-class Window(Struct, frozen=True, tag="window/1"):
+class WindowMessage(Struct, frozen=True, tag="window/1"):
     """A stretch of recorded samples, known by (servo, boot, sequence).
 
     Attributes

@@ -20,7 +20,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
 from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.estimation.window import Window
-from servotwin.messages import Window as WindowMessage
+from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.twin.settings import TriageSettings
 from servotwin.twin.wear import Expectation
@@ -142,7 +142,7 @@ def glance(
 
     Parameters
     ----------
-    message : messages.Window
+    message : messages.WindowMessage
         For its boot, version and reason.
     window : Window
         The same, decoded.

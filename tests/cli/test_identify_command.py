@@ -11,10 +11,11 @@ from typer.testing import CliRunner
 
 from servotwin.cli import app as cli
 from servotwin.cli import identify as identification
-from servotwin.cli.identify import Request, identify, opened
+from servotwin.cli.identify import IdentifyOptions, identify, window_starts
 from servotwin.cli.simulate import record
 from servotwin.errors import InvalidInput
-from servotwin.logs import reader as logfile
+from servotwin.logs import formats
+from servotwin.logs import log as logfile
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import simulate
@@ -57,7 +58,7 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("name", ["run.csv", "run.npz", "run.parquet"])
 def test_every_format_gives_the_gap_and_its_trend(folder, name):
-    found = identify(Request(folder / name, gap_limit_deg=10.0))
+    found = identify(IdentifyOptions(folder / name, gap_limit_deg=10.0))
     assert [window.start for window in found.windows] == pytest.approx([0.0, 5.0, 10.0, 15.0])
     truth = WEAR.pieces(80.0).value([estimate.time for estimate in found.estimates])
     assert all(estimate.ok for estimate in found.estimates)
@@ -91,19 +92,21 @@ def test_a_log_of_another_maker_needs_a_servo(folder, tmp_path):
     result = run(folder / "plain.csv")
     assert (result.exit_code, "give --servo" in result.stderr) == (2, True)
     (tmp_path / "mine.toml").write_text(Servo.preset("paper").dumps())
-    ours, named = (identify(Request(folder / "plain.csv", servo=s)) for s in (str(tmp_path / "mine.toml"), "paper"))
+    ours, named = (
+        identify(IdentifyOptions(folder / "plain.csv", servo=s)) for s in (str(tmp_path / "mine.toml"), "paper")
+    )
     assert len(ours.windows) == 3
     assert [e.gap for e in ours.estimates] == [e.gap for e in named.estimates]
 
 
 def test_one_window_as_asked_for(folder):
-    found = identify(Request(folder / "run.npz", start=5.0, duration=2.0))
+    found = identify(IdentifyOptions(folder / "run.npz", start=5.0, duration=2.0))
     (window,) = found.windows
     assert (window.start, window.duration) == pytest.approx((5.0, 2.0))
     assert found.estimates[0].ok
-    assert identify(Request(folder / "run.npz", duration=1.0)).windows[0].start == 0.0
+    assert identify(IdentifyOptions(folder / "run.npz", duration=1.0)).windows[0].start == 0.0
     with pytest.raises(InvalidInput, match="leave them out with --start"):
-        identify(Request(folder / "run.npz", start=5.0, window=1.0))
+        identify(IdentifyOptions(folder / "run.npz", start=5.0, window=1.0))
 
 
 def test_a_window_at_rest_says_so_and_there_is_no_trend(folder):
@@ -119,9 +122,9 @@ def test_a_window_at_rest_says_so_and_there_is_no_trend(folder):
 
 
 def test_the_method_and_the_cut_can_be_chosen(folder):
-    published = identify(Request(folder / "run.npz", method="paper"))
+    published = identify(IdentifyOptions(folder / "run.npz", method="paper"))
     assert {estimate.method for estimate in published.estimates} == {"paper"}
-    cut = identify(Request(folder / "run.npz", window=2.0, pre_trigger=0.3))
+    cut = identify(IdentifyOptions(folder / "run.npz", window=2.0, pre_trigger=0.3))
     assert [window.start for window in cut.windows] == pytest.approx([0.0, 4.7, 9.7])
 
 
@@ -130,7 +133,7 @@ def test_a_calm_loops_log_carries_its_cut(tmp_path):
     (tmp_path / "calm.toml").write_text(calm)
     for name in ("calm.csv", "calm.npz", "calm.parquet"):
         record(tmp_path / "calm.toml", tmp_path / name)
-        windows = identify(Request(tmp_path / name)).windows
+        windows = identify(IdentifyOptions(tmp_path / name)).windows
         assert [window.start for window in windows] == pytest.approx([0.0, 4.7, 9.7])
         assert {window.duration for window in windows} == {2.0}
 
@@ -146,11 +149,11 @@ def test_a_calm_loops_log_carries_its_cut(tmp_path):
     ],
 )
 def test_windows_open_as_at_the_edge(reference, expected):
-    assert opened(reference, 3, 0) == expected
+    assert window_starts(reference, 3, 0) == expected
 
 
 def test_a_window_opens_before_the_change_as_far_as_the_log_goes():
-    assert opened([0, 1, 1, 1, 1, 1, 2, 2, 2, 2], 4, 2) == [0, 4]
+    assert window_starts([0, 1, 1, 1, 1, 1, 2, 2, 2, 2], 4, 2) == [0, 4]
 
 
 def damaged(folder, tmp_path, change):
@@ -206,7 +209,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
         (("FOLDER/run.npz", "--window", "nan"), "--window nan s"),
         (("FOLDER/run.npz", "--window", "90"), "give --start and --duration"),
         (("FOLDER/run.npz", "--pre-trigger", "1"), "--pre-trigger 1.0 s"),
-        (("FOLDER/run.npz", "--method", "best"), "'best' does not exist"),
+        (("FOLDER/run.npz", "--method", "best"), "'best': must be one of whitened, paper"),
         (("FOLDER/run.npz", "--wear-deg", "3"), "belong together"),
         (("FOLDER/run.npz", "--wear-deg", "-3", "--wear-over-s", "4"), "greater than 0"),
         (("FOLDER/run.npz", "--gap-limit-deg", "nan"), "--gap-limit-deg nan"),
@@ -241,7 +244,7 @@ def test_columns_that_hold_no_numbers(tmp_path):
 
 
 def test_parquet_without_pyarrow_is_named(folder, monkeypatch):
-    monkeypatch.setattr(logfile.importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr(formats.importlib.util, "find_spec", lambda _name: None)
     with pytest.raises(InvalidInput, match="servotwin\\[parquet\\]"):
         logfile.read_log(folder / "run.parquet")
 
@@ -257,5 +260,5 @@ def test_measured_position_goes_before_the_true_one(folder):
 
 def test_without_reference_the_steps_cannot_be_told(folder):
     log = logfile.read_log(folder / "run.npz")
-    assert identification.cut(log, Request(folder / "run.npz", duration=1.0))
+    assert identification.cut(log, IdentifyOptions(folder / "run.npz", duration=1.0))
     assert log.metadata["window_s"] == 1.0

@@ -24,7 +24,7 @@ from servotwin.messages import (
     Probe,
     Request,
     Setting,
-    Window,
+    WindowMessage,
     unpack_channel,
 )
 from servotwin.runtime.retry import Retry
@@ -59,14 +59,14 @@ def answer(agent: Agent, message: Request) -> Answer:
     return said.message
 
 
-def references(window: Window) -> list[float]:
+def references(window: WindowMessage) -> list[float]:
     channel = window.channel("reference")
     assert channel is not None
     return [round(1e6 * x) / 1e6 for x in unpack_channel(channel)]
 
 
-def windows(sent: list[Message]) -> list[Window]:
-    return [message for message in sent if isinstance(message, Window)]
+def windows(sent: list[Message]) -> list[WindowMessage]:
+    return [message for message in sent if isinstance(message, WindowMessage)]
 
 
 def test_a_longer_window_counts_from_the_next_change_on() -> None:

@@ -12,7 +12,6 @@ import pytest
 from machines import machine, plant_file
 from test_opcua import server
 
-from servotwin.cli.simulate import Recording, writer
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.parameters import Parameters
@@ -20,7 +19,9 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Setting, Window, unpack_channel
+from servotwin.logs.formats import SignalTable
+from servotwin.logs.log import write_log
+from servotwin.messages import Setting, WindowMessage, unpack_channel
 
 RATE, WINDOW = 5000.0, 0.5
 SIMULATED = 11.0  # s: changes of the reference at 0, 2, ... 10 s
@@ -33,7 +34,7 @@ def replayed(folder: Path, _stack: ExitStack) -> dict[str, Any]:
     run = simulation.run()
     columns = {"time_s": run.time, "reference_m": run.reference, "theta_m_rad": run.theta_m, "voltage_v": run.voltage}
     columns["measured_position_m"] = run.measured_position
-    writer(folder / "run.csv")(Recording(columns, {}), folder / "run.csv")
+    write_log(SignalTable(columns, {}), folder / "run.csv")
     return {"kind": "replay", "log": "run.csv", "speed": 0.0}
 
 
@@ -47,7 +48,7 @@ def over_opcua(folder: Path, stack: ExitStack) -> dict[str, Any]:
     return {"kind": "opcua", "url": url, "poll_s": 0.03}
 
 
-def windows_of(folder: Path) -> list[Window]:
+def windows_of(folder: Path) -> list[WindowMessage]:
     """What waits in the outbox, in order."""
     outbox = SqliteOutbox(folder / "outbox.sqlite", "axis")
     try:

@@ -26,7 +26,7 @@ def window(sequence: int, boot: str = "b0", length: int = 100, change: float = 0
     channels = tuple(pack_channel(name, unit, [0.0] * length) for name, unit in (("position", "m"), ("theta_m", "rad")))
     changes = ((start + change, 1e-3),)
     crc = messages.checksum(channels)
-    return messages.Window("axis", boot, sequence, start, 100.0, channels, changes, 0, "model", reason, crc)
+    return messages.WindowMessage("axis", boot, sequence, start, 100.0, channels, changes, 0, "model", reason, crc)
 
 
 def long(sequence: int, **changes):

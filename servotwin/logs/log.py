@@ -1,0 +1,107 @@
+"""Recorded logs with unit-carrying column names: reading one as a window, writing a table of signals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.estimation.window import Window
+from servotwin.logs.formats import FORMATS, LogColumns, SignalTable
+from servotwin.plant.signals import Array
+from servotwin.runtime import files
+
+TIME = "time_s"
+# Columns of each channel; the first one that is there counts: the measured position before the true one.
+COLUMNS = {
+    "position": ("measured_position_m", "position_m"),
+    "theta_m": ("theta_m_rad",),
+    "voltage": ("voltage_v",),
+    "reference": ("reference_m",),
+}
+_WANTED = (TIME, *(name for names in COLUMNS.values() for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A log as one long window, and its metadata: servo, window_s ...; empty for a foreign log."""
+
+    whole: Window
+    metadata: Mapping[str, Any]
+
+    def table(self) -> SignalTable:
+        """Columns and metadata, as `write_log` takes them."""
+        whole = self.whole
+        columns = {TIME: whole.time}
+        columns |= {COLUMNS[channel][0]: values for channel, values in whole.channels.items()}
+        return SignalTable(columns, self.metadata)
+
+
+def read_log(path: Path) -> Log:
+    """Read a log, complete and uniformly sampled.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, of no known format or damaged; a column is missing, not numeric or not finite somewhere;
+        the times are not uniform.
+    """
+    if path.suffix not in FORMATS:
+        raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
+    if not path.is_file():
+        raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
+    FORMATS[path.suffix].check_installed(f"log {path}")
+    try:
+        columns = FORMATS[path.suffix].read(path, _WANTED)
+    except OSError as error:
+        raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
+    return Log(_whole(path, columns), columns.metadata)
+
+
+def check_output(path: Path) -> None:
+    """Check a path before anything is computed for it.
+
+    Raises
+    ------
+    InvalidInput
+        Unknown suffix, missing directory, or a format whose library is not installed.
+    """
+    files.check_file(path, tuple(FORMATS))
+    FORMATS[path.suffix].check_installed(f"output {path}")
+
+
+def write_log(table: SignalTable, path: Path) -> None:
+    """Write a table of signals in the format that the suffix names, whole or not at all.
+
+    Raises
+    ------
+    InvalidInput
+        As `check_output`.
+    """
+    check_output(path)
+    with files.atomic_output(path) as temporary:
+        FORMATS[path.suffix].write(table, temporary)
+
+
+def _whole(path: Path, columns: LogColumns) -> Window:
+    found = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
+    for name, place in (("position_m", found["position"]), (TIME, TIME if TIME in columns.values else None)):
+        if place is None:
+            hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)
+            raise InvalidInput(f"log {path}: column {name!r} is missing{hint}; it has {known or 'none'}")
+    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in found.items() if name is not None}
+    return Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
+
+
+def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+    try:
+        if np.iscomplexobj(columns.values[name]):
+            raise TypeError
+        return np.asarray(columns.values[name], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidInput(f"log {path}: column {name!r} must hold numbers") from None
