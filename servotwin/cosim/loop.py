@@ -55,7 +55,7 @@ class Transmission:
 
     @property
     def message(self) -> Message:
-        """Message that the bytes encode."""
+        """The decoded message."""
         return decode(self.data)
 
 
@@ -120,12 +120,12 @@ class Loop:
 
     @property
     def trend(self) -> Trend | None:
-        """Trend of the gap in the end."""
+        """Gap and wear rate at the end; None before the first accepted estimate."""
         return self.trends[-1] if self.trends else None
 
     @property
     def until_limit(self) -> Passage | None:
-        """Time after `trend.time` at which the gap reaches the scenario's `gap_limit`; None without limit or trend."""
+        """Time from `trend.time` until the gap reaches the scenario's `gap_limit`; None without limit or trend."""
         limit = self.scenario.twin.gap_limit
         return None if limit is None or self.trend is None else self.trend.time_until(limit)
 
