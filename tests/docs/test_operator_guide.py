@@ -19,7 +19,7 @@ import typer.main
 from service_system import twin_file
 
 from servotwin.cli.app import app
-from servotwin.cli.audit_text import HEAD
+from servotwin.cli.audit_report import HEAD
 from servotwin.edge import outlet
 from servotwin.edge_process import outlet as pipe_outlet
 from servotwin.link import outbox, sqlite_outbox
