@@ -15,8 +15,7 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.estimator_windows import Case, paper_loop_cases
 from servotwin.estimation.whitened.quick import quick_fit
-from servotwin.messages import Channel, checksum, decode, encode, pack_channel, pack_finely
-from servotwin.messages import Window as WindowMessage
+from servotwin.messages import Channel, WindowMessage, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.twin.estimating import decode_window
 from servotwin.twin.triage import TriageState, glance

@@ -79,19 +79,19 @@ class DecodedWindow(NamedTuple):
 
     Attributes
     ----------
-    message : messages.Window
+    message : messages.WindowMessage
     window : Window or None
         None: it cannot be used.
     problem : str
         Why it cannot be used.
     """
 
-    message: messages.Window
+    message: messages.WindowMessage
     window: Window | None
     problem: str = ""
 
     @classmethod
-    def of(cls, message: messages.Window) -> DecodedWindow:
+    def of(cls, message: messages.WindowMessage) -> DecodedWindow:
         """Decode a message, once for all who need its numbers."""
         try:
             return cls(message, decode_window(message))
@@ -130,7 +130,7 @@ class DecodedWindow(NamedTuple):
         return messages.finite(float(np.max(error)))
 
 
-def decode_window(message: messages.Window) -> Window:
+def decode_window(message: messages.WindowMessage) -> Window:
     """Decode the numbers of a message; channels that no estimator knows are left out.
 
     Raises

@@ -9,7 +9,7 @@ import msgspec
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import InvalidMessage, Window
+from servotwin.messages import InvalidMessage, WindowMessage
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
 from servotwin.twin.evidence import StoredEstimate, plain
@@ -17,7 +17,7 @@ from servotwin.twin.models import ServoModel
 
 
 class Replayed(NamedTuple):
-    """What came of it.
+    """Result of a replay.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = 
     return Replayed(estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again))
 
 
-def _window(data: bytes) -> Window:
+def _window(data: bytes) -> WindowMessage:
     try:
         message = messages.decode(data)
     except InvalidMessage as error:
         raise InvalidInput(f"the stored window is not understood: {error}") from None
-    if not isinstance(message, Window):
+    if not isinstance(message, WindowMessage):
         raise InvalidInput(
             f"the stored message is a {type(message).__name__}, and only a window can be estimated again"
         )

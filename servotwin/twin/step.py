@@ -28,7 +28,7 @@ from servotwin.messages import (
     Setting,
     Update,
     Verification,
-    Window,
+    WindowMessage,
     finite,
 )
 from servotwin.plant.servo import Servo
@@ -40,8 +40,8 @@ from servotwin.redesign.registry import policy_of
 from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Estimator, Observer, estimator_of
 from servotwin.twin.evidence import (
     DisturbanceRecord,
-    EstimateRecord,
     ExcitationRecord,
+    GapEstimateRecord,
     GlanceRecord,
     Record,
     RedesignRecord,
@@ -152,7 +152,7 @@ class WindowArrival(NamedTuple):
     The time between two boots of the edge is taken from `time`.
     """
 
-    window: Window
+    window: WindowMessage
     time: float
 
 
@@ -247,7 +247,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     expected = state.wear.expect(trends, message.boot, message.middle, arrived)
     estimate = decoded.estimate(model.estimator, expected)
     disturbed = decoded.disturbance(model.observer)
-    records += [EstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
+    records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
@@ -283,7 +283,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
 
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
-    """What the policy makes of the evidence; nothing, and why, where it is not consulted or finds nothing."""
+    """Consult the policy; no setting, with the reason, where it is not consulted or finds none."""
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)
@@ -364,7 +364,7 @@ def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) ->
     return StepResult(state, (), (record, WithdrawalRecord(request, why)))
 
 
-def _draft(message: Window, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
+def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
     """An update but for its version and base; it may be applied until `validity` (s) after the window's start."""
     assert redesign.setting is not None
     estimate = evidence.estimate

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from msgspec import Struct
 from msgspec.structs import replace
 
-from servotwin.messages import Reason, Receipt, Setting, Update, Window
+from servotwin.messages import Reason, Receipt, Setting, Update, WindowMessage
 
 MAX_ENDED_BOOTS = 1000
 """Boots that a twin remembers, so that its state is bounded."""
@@ -83,7 +83,7 @@ class Versions(Struct, frozen=True):
         in_force = max(now.in_force, in_force)
         return replace(now, in_force=in_force, issued=max(now.issued, in_force))
 
-    def admits(self, window: Window) -> bool:
+    def admits(self, window: WindowMessage) -> bool:
         """True where parameters that stand on this window would be newer than all before."""
         return window.boot == self.boot and window.start > self.data_time
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
-from servotwin.messages import MAX_BYTES, Message, Window
+from servotwin.messages import MAX_BYTES, Message, WindowMessage
 from servotwin.messages.compression import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
@@ -129,7 +129,7 @@ def _event(stored: StoredMessage) -> Event:
     if stored.kind is MessageKind.VERIFICATION:
         return decode_request(stored.body)
     message = messages.decode(decompress(stored.body, stored.encoding, MAX_BYTES))
-    return WindowArrival(message, stored.received) if isinstance(message, Window) else message
+    return WindowArrival(message, stored.received) if isinstance(message, WindowMessage) else message
 
 
 def _queued(request: VerificationRequest, now: float) -> Incoming:

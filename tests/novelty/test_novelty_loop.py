@@ -21,7 +21,7 @@ from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
-from servotwin.messages import Window
+from servotwin.messages import WindowMessage
 from servotwin.novelty.detector import FIRST, NEWS, PERIODIC
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
@@ -121,14 +121,14 @@ def test_a_reference_that_never_changes_is_looked_at_all_the_same(block: int) ->
     for first in range(0, count, block):
         zeros = [0.0] * min(block, count - first)
         sent += edge.absorb_block(zeros, zeros, zeros, zeros)
-    windows = [(each.sample, each.message.reason) for each in sent if isinstance(each.message, Window)]
+    windows = [(each.sample, each.message.reason) for each in sent if isinstance(each.message, WindowMessage)]
     assert [w for w in windows if w[0] <= 2000] == [(1000, FIRST), (2000, FIRST)]
     assert [reason for _, reason in windows if reason == PERIODIC]
     assert edge.dropped[FILTERED] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
 
 
-def messages(sent: list[Outgoing]) -> list[Window]:
-    return [each.message for each in sent if isinstance(each.message, Window)]
+def messages(sent: list[Outgoing]) -> list[WindowMessage]:
+    return [each.message for each in sent if isinstance(each.message, WindowMessage)]
 
 
 def test_without_novelty_time_cuts_nothing() -> None:

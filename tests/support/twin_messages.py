@@ -26,7 +26,7 @@ def window_message(sequence=0, start=0.0, boot="boot-1", servo="axis", version=0
     channels = channels or tuple(
         pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
     )
-    return messages.Window(
+    return messages.WindowMessage(
         servo, boot, sequence, start, 100.0, channels, (), version, "model", "test", messages.checksum(channels)
     )
 

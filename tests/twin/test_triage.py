@@ -51,20 +51,20 @@ def cases(noisy: bool) -> tuple[Case, ...]:
 
 
 @cache
-def calm_windows() -> tuple[messages.Window, ...]:
+def calm_windows() -> tuple[messages.WindowMessage, ...]:
     """Of a deployed loop: at rest between steps, 2 s with a bias of 50 mV; only the first few show both contacts."""
     scenario = Scenario.preset("certified").replace(gap=25.0 * DEG, duration=165.0)
     return cosimulate(scenario).windows
 
 
-def message_of(window: Window, sequence: int = 1, **changes) -> messages.Window:
+def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
     channels = []
     for name, samples in window.channels.items():
         unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
         packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
         channels += packed
     told = {"version": 0, "reason": "reference", "boot": "b", **changes}
-    return messages.Window(
+    return messages.WindowMessage(
         "axis",
         told["boot"],
         sequence,
