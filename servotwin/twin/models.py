@@ -36,8 +36,8 @@ from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings, read_twin_settings
-from servotwin.twin.step import TwinModel
 
 MAX_MODELS = 256
 
