@@ -5,7 +5,7 @@ STAMP := .venv/.installed-from-lock
 
 PACKAGES ?= yes
 
-.PHONY: help demo reproduce check test fuzz bench lint format lock clean packages
+.PHONY: help demo reproduce reference check test fuzz bench lint format lock clean packages
 
 help:
 	@echo "make demo       a worn servo loses stability; its digital twin wins it back"
@@ -16,6 +16,7 @@ help:
 	@echo "make fuzz       the random tests with fresh and with more examples"
 	@echo "make bench      speed beside other solvers; or: python -m benchmarks NAME"
 	@echo "make format     format the code and fix what can be fixed"
+	@echo "make reference  write docs/configuration.md and docs/schemas from the code"
 	@echo "make lock       pin the dependencies anew (needs uv)"
 
 demo: $(STAMP)
@@ -48,6 +49,9 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+reference: $(STAMP)
+	$(BIN)/python -m servotwin.cli.configuration docs
 
 lock:
 	uv pip compile --quiet pyproject.toml --extra dev --universal --fork-strategy fewest --python-version 3.11 --generate-hashes \

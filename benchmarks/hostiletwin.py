@@ -15,10 +15,10 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.window import Window as NumericWindow
-from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, Window
+from servotwin.estimation.window import Window
+from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, WindowMessage
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.step import TwinModel
+from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 
@@ -45,7 +45,7 @@ _LIES = {TwinFault.LIES_HIGH: FACTOR, TwinFault.LIES_LOW: 1.0 / FACTOR}
 def deceived_twin(scenario: Scenario, gap: float) -> Twin:
     """Make the scenario's own twin with an estimator that always returns `gap` (rad)."""
 
-    def estimate(window: NumericWindow, _expected: Expectation) -> GapEstimate:
+    def estimate(window: Window, _expected: Expectation) -> GapEstimate:
         interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
         return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="constant")
 
@@ -86,15 +86,15 @@ class HostileTwin:
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """Answer a message according to the fault."""
-        self.windows += isinstance(message, Window)
+        self.windows += isinstance(message, WindowMessage)
         if self.kind is TwinFault.NONE or (self.kind is TwinFault.SILENT and self.windows > HONEST):
             return []
         if isinstance(message, Receipt | Fallback):
             self.in_force = max(self.in_force, message.parameter_version)
         if self.kind is TwinFault.WANTON:
-            return self._wanton(message) if isinstance(message, Window) else []
+            return self._wanton(message) if isinstance(message, WindowMessage) else []
         answer = self.twin.receive(message, now)
-        repeated = self._repeated() if isinstance(message, Window) else ()
+        repeated = self._repeated() if isinstance(message, WindowMessage) else ()
         self.sent += [each for each in answer if isinstance(each, Update)]
         return [*repeated, *answer]
 
@@ -117,7 +117,7 @@ class HostileTwin:
         self.version = max(self.version, self.in_force) + 1
         return self.version
 
-    def _wanton(self, window: Window) -> list[Message]:
+    def _wanton(self, window: WindowMessage) -> list[Message]:
         """Each value by itself anywhere in its range and a little beyond; its prediction cannot be held against it."""
         draw, own, none = self.draw, self.own, (None, None)
         kp, kd, tf = (

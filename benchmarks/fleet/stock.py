@@ -10,7 +10,7 @@ import msgspec
 
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Update, Window, decode, encode
+from servotwin.messages import Update, WindowMessage, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin.models import ModelRegistry
@@ -31,7 +31,7 @@ COMMISSIONED = 10 * PERIOD
 """s of sample time, at which a servo joins the bench; its twin is told of the windows before."""
 
 
-class Place(NamedTuple):
+class WindowSource(NamedTuple):
     """One gap of the stock.
 
     Attributes
@@ -45,16 +45,16 @@ class Place(NamedTuple):
     """
 
     gap: float
-    first: tuple[Window, ...]
-    windows: tuple[Window, ...]
+    first: tuple[WindowMessage, ...]
+    windows: tuple[WindowMessage, ...]
 
 
-def stock(places: int, windows: int, seed: int = 0) -> list[Place]:
+def stock(places: int, windows: int, seed: int = 0) -> list[WindowSource]:
     """Steady loops at `places` gaps, `windows` (an even number) of each, with a bias and a little noise."""
     return [_place(number, windows, seed + number) for number in range(places)]
 
 
-def _place(number: int, windows: int, seed: int) -> Place:
+def _place(number: int, windows: int, seed: int) -> WindowSource:
     base = Scenario.preset("certified")
     gap = FIRST_GAP + number * GAP_STEP
     scenario = base.replace(
@@ -68,10 +68,10 @@ def _place(number: int, windows: int, seed: int) -> Place:
         name="axis",
     )
     found = cosimulate(scenario).windows
-    return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
+    return WindowSource(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
 
 
-def readdressed(window: Window, servo: str, sequence: int, start: float, version: int) -> Window:
+def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, version: int) -> WindowMessage:
     """The same measurements as another servo's, at another time; the checksum is over the channels, and stays."""
     shift = start - window.start
     return msgspec.structs.replace(
@@ -85,14 +85,14 @@ def readdressed(window: Window, servo: str, sequence: int, start: float, version
     )
 
 
-class Known(NamedTuple):
-    """What the twin of a servo knows that has been watched for a while, and the version of its parameters."""
+class CommissionedTwin(NamedTuple):
+    """State of the twin of a servo that has run for a while, and the version of its parameters."""
 
     state: TwinState
     version: int
 
 
-def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
+def commissioned(fleet: ModelRegistry, servo: str, place: WindowSource) -> CommissionedTwin:
     """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
     state, version = b"", 0
     learnt = (*place.first, *place.windows)[: SETTLED + 2]
@@ -106,7 +106,7 @@ def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
         version = max([version, *(update.version for update in sent if isinstance(update, Update))])
         for asked in outcome.enqueue:
             state = work(fleet, _claim(servo, state, number, MessageKind.VERIFICATION, asked.body), start).state
-    return Known(msgspec.msgpack.decode(state, type=TwinState), version)
+    return CommissionedTwin(msgspec.msgpack.decode(state, type=TwinState), version)
 
 
 def _claim(servo: str, state: bytes, serial: int, kind: MessageKind, body: bytes) -> Lease:

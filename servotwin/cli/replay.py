@@ -15,7 +15,7 @@ from servotwin.messages.compression import decompress
 from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.models import ServoModel
-from servotwin.twin.replay import Replayed, replay
+from servotwin.twin.replay import ReplayResult, replay
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of
 
@@ -31,7 +31,7 @@ BAD = (OTHER, UNREADABLE)
 
 
 class Again(NamedTuple):
-    """What came of one window.
+    """Result of estimating one window again.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ def replayed(store: Store, servo: str, model: ServoModel | None, only: tuple[str
 
 
 def summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
-    """How many of which, and what differs since."""
+    """Counts by result, and what differs since."""
     lines = [f"servo {servo}: {_windows(sum(counts.values()))}"]
     lines += [f"  {number:6d} {result}" for result, number in counts.most_common()]
     lines += [f"  otherwise since {_windows(number)}: {part}" for part, number in sorted(differing.items())]
@@ -122,7 +122,7 @@ def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: Ser
         return Again(name, UNREADABLE, str(error))
 
 
-def _compared(name: str, found: StoredEvidence, again: Replayed) -> Again:
+def _compared(name: str, found: StoredEvidence, again: ReplayResult) -> Again:
     if again.same:
         return Again(name, SAME, "", again.differs)
     gaps = f"gap {_degrees(found.gap)} deg then, {_degrees(again.estimate.gap)} deg now"

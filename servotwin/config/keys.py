@@ -109,6 +109,7 @@ class Key:
     prefix: str | None = None
     switch: str = ""
     relative: bool = False
+    required: bool = False
     makers: Mapping[str, Maker] | None = None
     select: Callable[[Table], Maker] | None = None
     parse: Callable[[Table, str, Any], Any] | None = None
@@ -130,6 +131,7 @@ def key(
     prefix: str | None = None,
     switch: str = "",
     relative: bool = False,
+    required: bool = False,
     makers: Mapping[str, Maker] | None = None,
     select: Callable[[Table], Maker] | None = None,
     parse: Callable[[Table, str, Any], Any] | None = None,
@@ -158,6 +160,8 @@ def key(
         For an attribute that is a declared class or None: a key that is true or false; false: None.
     relative : bool
         The text is a path, relative to the file's folder.
+    required : bool
+        A file has to give the key, though the attribute has a default.
     makers : mapping
         What makes the attribute of an inner table, by kind; the table's key `kind` says which, or `select`, and neither
         is needed for a single one.
@@ -167,7 +171,9 @@ def key(
         Keys and values of an attribute that `makers` makes.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
-    return Key(names, unit, allowed, help, table, choices, prefix, switch, relative, makers, select, parse, dump)
+    return Key(
+        names, unit, allowed, help, table, choices, prefix, switch, relative, required, makers, select, parse, dump
+    )
 
 
 def value(
@@ -230,7 +236,7 @@ class Item:
     @property
     def required(self) -> bool:
         """A file has to give it."""
-        return self.default is MISSING
+        return self.default is MISSING or self.key.required
 
     @property
     def makers(self) -> Mapping[str, Maker]:

@@ -1,4 +1,4 @@
-"""What a co-simulation returns: the trajectory, and everything that crossed the link."""
+"""Result of a co-simulation: the trajectory, and everything that crossed the link."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.trend import Trend
 from servotwin.link.simulated import Fate
-from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, Window, decode
+from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, WindowMessage, decode
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.runtime.notebook import html_table
@@ -55,20 +55,20 @@ class Transmission:
 
     @property
     def message(self) -> Message:
-        """What the bytes say."""
+        """The decoded message."""
         return decode(self.data)
 
 
 @dataclass(frozen=True, repr=False)
 class Loop:
-    """What a co-simulation returns.
+    """Result of a co-simulation.
 
     Attributes
     ----------
     scenario : Scenario
     run : Run
         The trajectory.
-    windows : tuple of messages.Window
+    windows : tuple of messages.WindowMessage
         As decoded by the twin, each once, in the order of arrival.
     estimates : tuple of GapEstimate
         One for each window.
@@ -98,7 +98,7 @@ class Loop:
 
     scenario: Scenario
     run: Run
-    windows: tuple[Window, ...]
+    windows: tuple[WindowMessage, ...]
     estimates: tuple[GapEstimate, ...]
     disturbances: tuple[Disturbance, ...]
     trends: tuple[Trend | None, ...]
@@ -120,12 +120,12 @@ class Loop:
 
     @property
     def trend(self) -> Trend | None:
-        """What is known of the wear in the end."""
+        """Gap and wear rate at the end; None before the first accepted estimate."""
         return self.trends[-1] if self.trends else None
 
     @property
     def until_limit(self) -> Passage | None:
-        """How long after `trend.time` the gap reaches the scenario's `gap_limit`; None without limit or trend."""
+        """Time from `trend.time` until the gap reaches the scenario's `gap_limit`; None without limit or trend."""
         limit = self.scenario.twin.gap_limit
         return None if limit is None or self.trend is None else self.trend.time_until(limit)
 

@@ -1,12 +1,12 @@
-"""What sending windows as int16 does to the estimates that are made from them."""
+"""Effect of the int16 channels of messages on the estimates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from servotwin.cosim.loop import Loop
-from servotwin.estimation.window import Window as NumericWindow
-from servotwin.messages import Window
+from servotwin.estimation.window import Window
+from servotwin.messages import WindowMessage
 from servotwin.simulation import Run
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.wear import Expectation
@@ -14,7 +14,7 @@ from servotwin.twin.wear import Expectation
 
 @dataclass(frozen=True)
 class Quantisation:
-    """What the int16 channels of one window did to its estimate.
+    """Effect of the int16 channels of one window on its estimate.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Quantisation:
 
 
 def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
-    """What sending int16 did to each estimate: every window is estimated once more from the unquantised samples.
+    """Effect of the int16 channels on each estimate: every window is estimated again from the unquantised samples.
 
     Both estimates start from the same previous gap, that of the window before (as the twin does while windows arrive in
     order).
@@ -50,11 +50,11 @@ def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
     return tuple(found)
 
 
-def _raw(run: Run, window: Window) -> NumericWindow:
+def _raw(run: Run, window: WindowMessage) -> Window:
     """The same samples as the sensors gave them."""
     first = round(window.start * window.rate)
     part = slice(first, first + window.samples)
-    return NumericWindow(
+    return Window(
         run.measured("position")[part],
         theta_m=run.measured("theta_m")[part],
         voltage=run.measured("voltage")[part],

@@ -79,8 +79,8 @@ class Scenario:
         key(help="Root of all randomness: each source has its own generator, from (seed, name, source)."),
     ] = 0
     name: Annotated[str, key(help="The servo's name in messages.")] = "servo"
-    reference: Annotated[SignalLike, key(makers=REFERENCES, help="Reference, m.")] = 0.0
-    gap: Annotated[SignalLike, key(makers=GAPS, select=gap_maker, help="Total gap, rad.")] = 0.0
+    reference: Annotated[SignalLike, key(makers=REFERENCES, required=True, help="Reference, m.")] = 0.0
+    gap: Annotated[SignalLike, key(makers=GAPS, select=gap_maker, required=True, help="Total gap, rad.")] = 0.0
     theta_d0: Annotated[
         float,
         key(
@@ -157,9 +157,6 @@ class Scenario:
     def from_table(cls, table: Table, folder: Path) -> Scenario:
         """A scenario from a table that was read already; a servo's path in it is relative to `folder`."""
         with named(table):
-            for name in ("reference", "gap"):
-                if name not in table.values:
-                    raise table.missing(name, table=True)
             scenario: Scenario = read(table, cls, folder, **read_parts(table, folder))
             table.done()
             scenario.servo.check_loop(scenario.law)

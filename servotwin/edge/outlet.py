@@ -15,7 +15,7 @@ from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Session
-from servotwin.messages import Acknowledge, InvalidMessage, Window
+from servotwin.messages import Acknowledge, InvalidMessage, WindowMessage
 
 NOT_FINITE = "sample not finite"
 FILTERED = "nothing new"
@@ -45,7 +45,7 @@ class Outlet(Protocol):
     def offer(self, cut: Cut, now: float) -> None:
         """Take charge of a cut window."""
 
-    def due(self, now: float) -> list[Window]:
+    def due(self, now: float) -> list[WindowMessage]:
         """Return the windows that the agent is to send now, oldest first; each counts as sent."""
 
     def acknowledge(self, message: Acknowledge) -> bool:
@@ -134,7 +134,7 @@ class LocalOutlet:
         """Take charge of a cut window: it is due at once."""
         self._writer.write(cut)
 
-    def due(self, now: float) -> list[Window]:
+    def due(self, now: float) -> list[WindowMessage]:
         """Return the windows to send now, oldest first; each counts as sent."""
         keys = [item for item in self._session.due(now) if not isinstance(item, bytes)]
         for key in keys:

@@ -5,7 +5,7 @@ from itertools import chain, pairwise
 
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.messages import Channel, Window, checksum, pack_channel, pack_finely
+from servotwin.messages import Channel, WindowMessage, checksum, pack_channel, pack_finely
 from servotwin.messages.checks import all_finite
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
@@ -15,7 +15,7 @@ MAX_CHANGES = 256
 """Reference changes listed per window; the reference channel has them all."""
 
 
-def pack(cut: Cut, settings: AgentSettings) -> Window:
+def pack(cut: Cut, settings: AgentSettings) -> WindowMessage:
     """Pack a cut into the window that is sent.
 
     Raises
@@ -25,7 +25,7 @@ def pack(cut: Cut, settings: AgentSettings) -> Window:
     """
     packed = (_packed(name, values, settings.fine_angle) for name, values in cut.signals.items())
     channels = tuple(chain.from_iterable(packed))
-    return Window(
+    return WindowMessage(
         servo=settings.servo,
         boot=settings.boot,
         sequence=cut.sequence,

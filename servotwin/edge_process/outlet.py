@@ -12,7 +12,7 @@ from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame
-from servotwin.messages import Acknowledge, InvalidMessage, Message, Window, decode, encode
+from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage, decode, encode
 from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
@@ -117,7 +117,7 @@ class PipeOutlet:
         while self._size > MOST:
             self._give_up(next(iter(self._unacknowledged)))
 
-    def due(self, now: float) -> list[Window]:  # noqa: ARG002
+    def due(self, now: float) -> list[WindowMessage]:  # noqa: ARG002
         """Return nothing: the link process sends."""
         return []
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
 from servotwin.link.transport import Parcel, deflated
-from servotwin.messages import Window, encode
+from servotwin.messages import WindowMessage, encode
 
 Key = tuple[str, int]
 """(boot, sequence): identifies a window of a servo."""
@@ -32,10 +32,10 @@ class Outbox(Protocol):
     def dropped(self) -> Mapping[str, int]:
         """Windows given up so far, by reason."""
 
-    def put(self, window: Window) -> Sequence[Dropped]:
+    def put(self, window: WindowMessage) -> Sequence[Dropped]:
         """Keep a window; return what was dropped to make room, oldest first."""
 
-    def get(self, key: Key) -> Window:
+    def get(self, key: Key) -> WindowMessage:
         """Return a window; KeyError when it is not (or no longer) kept."""
 
     def parcel(self, key: Key) -> Parcel:
@@ -87,7 +87,7 @@ class MemoryOutbox:
         if capacity < 1:
             raise InvalidInput(f"outbox capacity = {capacity!r} windows: must be at least 1")
         self._capacity, self._servo = capacity, servo
-        self._windows: dict[Key, Window] = {}
+        self._windows: dict[Key, WindowMessage] = {}
         self._letters: dict[bytes, bytes] = {}
         self._values: dict[str, bytes] = {}
         self._dropped: Counter[str] = Counter()
@@ -98,7 +98,7 @@ class MemoryOutbox:
         """Windows given up so far, by reason."""
         return self._dropped
 
-    def put(self, window: Window) -> list[Dropped]:
+    def put(self, window: WindowMessage) -> list[Dropped]:
         """Keep a window; return what was dropped to make room, oldest first."""
         self._windows[window.boot, window.sequence] = window
         excess = len(self._windows) - self._capacity
@@ -107,7 +107,7 @@ class MemoryOutbox:
             self.drop(*each)
         return drops
 
-    def get(self, key: Key) -> Window:
+    def get(self, key: Key) -> WindowMessage:
         """Return a window; KeyError when it is not (or no longer) kept."""
         return self._windows[key]
 

@@ -32,7 +32,7 @@ from servotwin.link.sqlite_file import (
     was_read_only,
 )
 from servotwin.link.transport import DEFLATE, Parcel, deflated
-from servotwin.messages import Window, decode, encode
+from servotwin.messages import WindowMessage, decode, encode
 
 BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000
@@ -94,7 +94,7 @@ class SqliteOutbox:
         with self._lock:
             return not self._unwritten and self._connection is not None
 
-    def put(self, window: Window) -> list[Dropped]:
+    def put(self, window: WindowMessage) -> list[Dropped]:
         """Keep a window, on the disk when this returns unless `flushed` is False; what had to go to make room."""
         body, encoding = deflated(encode(window))
         key = window.boot, window.sequence
@@ -109,11 +109,11 @@ class SqliteOutbox:
             self.flush()
             return drops
 
-    def get(self, key: Key) -> Window:
+    def get(self, key: Key) -> WindowMessage:
         """The window; KeyError when it is not (or no longer) kept."""
         parcel = self.parcel(key)
         window = decode(zlib.decompress(parcel.body) if parcel.encoding == DEFLATE else parcel.body)
-        assert isinstance(window, Window)
+        assert isinstance(window, WindowMessage)
         return window
 
     def parcel(self, key: Key) -> Parcel:
@@ -254,7 +254,7 @@ class SqliteOutbox:
         self.trouble = ""
 
     def _load(self, connection: sqlite3.Connection) -> None:
-        """What the file holds, before what is to be written to it."""
+        """Load the file's index, before what is to be written to it."""
         windows = connection.execute("SELECT boot, sequence, reason, length(body) FROM windows ORDER BY place")
         found = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]

@@ -98,7 +98,7 @@ class Servo:
     controller: Annotated[
         Controller, key(help="The controller that runs when none is given; it also carries voltage and rate limits.")
     ]
-    n: Annotated[int, key("masses", table="structure", minimum=2, help="Number of masses.")] = 3
+    n: Annotated[int, key("masses", table="structure", minimum=2, required=True, help="Number of masses.")] = 3
     k_d: Annotated[
         float,
         key(

@@ -209,12 +209,12 @@ def _applied(loop: Loop) -> tuple[tuple[float, float], ...]:
     return tuple((receipt.sample / rate, begins[receipt.version]) for receipt in loop.applied)
 
 
-def _channels(window: messages.Window) -> tuple[messages.Channel, ...]:
+def _channels(window: messages.WindowMessage) -> tuple[messages.Channel, ...]:
     """The two channels that the paper sends."""
     return tuple(c for c in window.channels if c.name in ("theta_m", "position"))
 
 
-def _half_step(window: messages.Window) -> float:
+def _half_step(window: messages.WindowMessage) -> float:
     """Largest rounding error of the position as sent, m."""
     return max(c.scale / 2.0 for c in window.channels if c.name == "position")
 
@@ -222,7 +222,7 @@ def _half_step(window: messages.Window) -> float:
 def _window_bytes(loop: Loop) -> tuple[int, ...]:
     """Bytes of each window message, its first copy."""
     up = (m for m in loop.messages if m.direction == "up" and m.copy == 0)
-    return tuple(len(m.data) for m in up if isinstance(m.message, messages.Window))
+    return tuple(len(m.data) for m in up if isinstance(m.message, messages.WindowMessage))
 
 
 def setting_changes(loop: Loop) -> tuple[SettingChange, ...]:

@@ -79,19 +79,19 @@ class DecodedWindow(NamedTuple):
 
     Attributes
     ----------
-    message : messages.Window
+    message : messages.WindowMessage
     window : Window or None
         None: it cannot be used.
     problem : str
         Why it cannot be used.
     """
 
-    message: messages.Window
+    message: messages.WindowMessage
     window: Window | None
     problem: str = ""
 
     @classmethod
-    def of(cls, message: messages.Window) -> DecodedWindow:
+    def of(cls, message: messages.WindowMessage) -> DecodedWindow:
         """Decode a message, once for all who need its numbers."""
         try:
             return cls(message, decode_window(message))
@@ -123,6 +123,7 @@ class DecodedWindow(NamedTuple):
     @property
     def tail(self) -> float | None:
         """Largest tracking error (m) in the last tenth of the window; None where a channel is missing."""
+        # Of the numbers as decoded: the edge sends neither channel with a fine part.
         if self.window is None or self.window.reference is None:
             return None
         last = -(-self.message.samples // _TAIL)
@@ -130,7 +131,7 @@ class DecodedWindow(NamedTuple):
         return messages.finite(float(np.max(error)))
 
 
-def decode_window(message: messages.Window) -> Window:
+def decode_window(message: messages.WindowMessage) -> Window:
     """Decode the numbers of a message; channels that no estimator knows are left out.
 
     Raises

@@ -24,7 +24,7 @@ from servotwin.messages import (
     Receipt,
     Request,
     Update,
-    Window,
+    WindowMessage,
     encode,
     finite,
 )
@@ -43,15 +43,15 @@ MAX_STATUS = 300
 class GlanceRecord(NamedTuple):
     """A glance at a window, all there is of one for which it was enough; `tail` as in `EvidenceRecord`."""
 
-    window: Window
+    window: WindowMessage
     glance: Glance
     tail: float | None
 
 
-class EstimateRecord(NamedTuple):
+class GapEstimateRecord(NamedTuple):
     """An estimate with what was expected before, so that it can be made again."""
 
-    window: Window
+    window: WindowMessage
     estimate: GapEstimate
     expected: Expectation
     tail: float | None
@@ -60,28 +60,28 @@ class EstimateRecord(NamedTuple):
 class DisturbanceRecord(NamedTuple):
     """Input bias and noise of a window."""
 
-    window: Window
+    window: WindowMessage
     disturbance: Disturbance
 
 
 class TrendRecord(NamedTuple):
     """Gap and wear after a window; None before the first estimate."""
 
-    window: Window
+    window: WindowMessage
     trend: Trend | None
 
 
 class RedesignRecord(NamedTuple):
     """A redesign, or why there is none."""
 
-    window: Window
+    window: WindowMessage
     redesign: Redesign
 
 
 class ExcitationRecord(NamedTuple):
     """A decision to request a more informative window, or why not."""
 
-    window: Window
+    window: WindowMessage
     decision: Decision
 
 
@@ -100,7 +100,7 @@ class WithdrawalRecord(NamedTuple):
 
 
 Record = (
-    GlanceRecord | EstimateRecord | DisturbanceRecord | TrendRecord | RedesignRecord | ExcitationRecord
+    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | RedesignRecord | ExcitationRecord
     | VerificationRecord | WithdrawalRecord | VerificationRequest
     | Update | Request | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
@@ -114,7 +114,7 @@ WindowId = tuple[str, str, int]
 class EvidenceLog:
     """Windows and evidence in memory, for simulation and tests."""
 
-    windows: dict[WindowId, Window] = field(default_factory=dict)
+    windows: dict[WindowId, WindowMessage] = field(default_factory=dict)
     glances: dict[WindowId, Glance] = field(default_factory=dict)
     estimates: dict[WindowId, GapEstimate] = field(default_factory=dict)
     disturbances: dict[WindowId, Disturbance] = field(default_factory=dict)
@@ -131,7 +131,7 @@ class EvidenceLog:
     verifications: list[VerificationRecord] = field(default_factory=list)
     withdrawals: list[WithdrawalRecord] = field(default_factory=list)
 
-    def add_window(self, window: Window) -> bool:
+    def add_window(self, window: WindowMessage) -> bool:
         """Store a window under its identity; False when it was there already."""
         new = window.identity not in self.windows
         self.windows.setdefault(window.identity, window)
@@ -146,7 +146,7 @@ class EvidenceLog:
         match record:
             case GlanceRecord(window, glance):
                 self.glances[window.identity] = glance
-            case EstimateRecord(window, estimate):
+            case GapEstimateRecord(window, estimate):
                 self.estimates[window.identity] = estimate
             case DisturbanceRecord(window, disturbance):
                 self.disturbances[window.identity] = disturbance
@@ -230,7 +230,7 @@ def _row(record: Record) -> EvidenceRecord | None:
         case GlanceRecord(window, glance, tail):
             made = _made("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
             return made._replace(version=window.parameter_version)
-        case EstimateRecord(window, estimate, expected, tail):
+        case GapEstimateRecord(window, estimate, expected, tail):
             body = StoredEstimate(msgspec.Raw(plain(estimate)), StoredExpectation.of(expected), window.boot)
             gap, std = finite(estimate.gap), finite(estimate.std_total)
             made = _made("estimate", body, estimate.status.value, gap=gap, std=std, tail=tail)

@@ -1,4 +1,4 @@
-"""Making a stored estimate again: from the stored window, what was known before it, model and settings."""
+"""Replay of a stored estimate, from the stored window, the expectation before it, model and settings."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import msgspec
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import InvalidMessage, Window
+from servotwin.messages import InvalidMessage, WindowMessage
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
 from servotwin.twin.evidence import StoredEstimate, plain
 from servotwin.twin.models import ServoModel
 
 
-class Replayed(NamedTuple):
-    """What came of it.
+class ReplayResult(NamedTuple):
+    """Result of a replay.
 
     Attributes
     ----------
     estimate : GapEstimate
         As it comes out now.
     same : bool
-        Whether it is the stored one, bit for bit.
+        True where it is the stored one, bit for bit.
     differs : tuple of str
         What is not as it was then: versions, sources, processor and, under another model, its numbers and settings;
         each with both values.
@@ -41,7 +41,7 @@ class Replayed(NamedTuple):
 _estimated = msgspec.msgpack.Decoder(StoredEstimate)
 
 
-def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> Replayed:
+def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> ReplayResult:
     """Make an estimate again and compare.
 
     Parameters
@@ -66,15 +66,17 @@ def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = 
     expected = stored.prior.expectation(settings.trend)
     estimate = DecodedWindow.of(message).estimate(estimator_of(servo, settings), expected)
     again = plain(estimate)
-    return Replayed(estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again))
+    return ReplayResult(
+        estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again)
+    )
 
 
-def _window(data: bytes) -> Window:
+def _window(data: bytes) -> WindowMessage:
     try:
         message = messages.decode(data)
     except InvalidMessage as error:
         raise InvalidInput(f"the stored window is not understood: {error}") from None
-    if not isinstance(message, Window):
+    if not isinstance(message, WindowMessage):
         raise InvalidInput(
             f"the stored message is a {type(message).__name__}, and only a window can be estimated again"
         )

@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import Answer, Outcome, Probe, Request, Setting, Window
+from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
@@ -46,7 +46,7 @@ class RequestState(Struct, frozen=True):
             excitation = changed(excitation, probed=now)
         return replace(self, attempts=self.attempts.not_after(now), excitation=excitation)
 
-    def closed(self, outcome: Outcome | None) -> RequestState:
+    def closed(self, outcome: RequestOutcome | None) -> RequestState:
         """With the pending request over; outcome None: the edge never answered."""
         assert self.pending is not None
         return replace(self, excitation=self.excitation.answered(self.pending.ask, outcome), pending=None)
@@ -86,7 +86,7 @@ class Requests:
     def decide(
         self,
         state: RequestState,
-        window: Window,
+        window: WindowMessage,
         estimate: GapEstimate,
         widest: float,
         in_force: Setting | None,
@@ -97,7 +97,7 @@ class Requests:
         Parameters
         ----------
         state : RequestState
-        window : Window
+        window : WindowMessage
         estimate : GapEstimate
             Of its gap.
         widest : float
@@ -126,7 +126,7 @@ class Requests:
         pending = state.pending
         if pending is None or (answer.boot, answer.serial) != (pending.boot, pending.serial) or answer.outcome.passing:
             return state, None
-        if answer.outcome is not Outcome.DUPLICATE:
+        if answer.outcome is not RequestOutcome.DUPLICATE:
             return state.closed(answer.outcome), None
         serial = max(state.serial, answer.newest) + 1
         again = replace(pending, serial=serial)
@@ -146,7 +146,7 @@ class Requests:
         return replace(state, attempts=state.attempts.another(now)), (state.pending,)
 
 
-def _extent(window: Window) -> tuple[float, float]:
+def _extent(window: WindowMessage) -> tuple[float, float]:
     """Length, and how much of it lies before the first change of the reference, s.
 
     Nothing lies before a boot's first sample: there, no longer pre-trigger could be had.

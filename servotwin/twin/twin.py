@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from servotwin.estimation.trend import Trend
-from servotwin.messages import Acknowledge, InvalidMessage, Message, Window
+from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import VerificationRequest
+from servotwin.twin.model import TwinModel
 from servotwin.twin.state import encode_state
-from servotwin.twin.step import Event, TwinModel, Wake, WindowArrival, next_wake, step
+from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 
 
 class Twin:
@@ -62,7 +63,7 @@ class Twin:
         InvalidMessage
             The message is for another servo, or of a kind that only an edge receives.
         """
-        if not isinstance(message, Window):
+        if not isinstance(message, WindowMessage):
             return self._step(message, now)
         if message.servo != self.servo:
             raise InvalidMessage(f"message of servo {message.servo!r} came to the twin of {self.servo!r}")

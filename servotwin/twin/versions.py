@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from msgspec import Struct
 from msgspec.structs import replace
 
-from servotwin.messages import Reason, Receipt, Setting, Update, Window
+from servotwin.messages import Reason, Receipt, Setting, Update, WindowMessage
 
 MAX_ENDED_BOOTS = 1000
 """Boots that a twin remembers, so that its state is bounded."""
@@ -83,7 +83,7 @@ class Versions(Struct, frozen=True):
         in_force = max(now.in_force, in_force)
         return replace(now, in_force=in_force, issued=max(now.issued, in_force))
 
-    def admits(self, window: Window) -> bool:
+    def admits(self, window: WindowMessage) -> bool:
         """True where parameters that stand on this window would be newer than all before."""
         return window.boot == self.boot and window.start > self.data_time
 
@@ -156,5 +156,6 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     if setting.gains is None and before is not None:
         setting = replace(setting, gains=before.gains)
     after = {**known, version: setting}
+    # 0 is what the edge starts with, the fallback for gains that later updates leave alone.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
     return {number: each for number, each in sorted(after.items()) if number in keep}

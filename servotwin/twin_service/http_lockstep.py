@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import defaultdict
 
-from servotwin.messages import Refusal, Window
+from servotwin.messages import Refusal, WindowMessage
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import PutResult
 from servotwin.store.store import Store
@@ -87,13 +87,13 @@ class LockstepApi:
         now = request.seconds("now")
         body = await self._bodies.read(request.content_length, request.receive)
         incoming, message = self._ingest.read(servo, body, request.content_encoding)
-        if isinstance(message, Window) and end_of(message) > now + 1.0 / message.rate:
+        if isinstance(message, WindowMessage) and end_of(message) > now + 1.0 / message.rate:
             detail = f"the window ends at {end_of(message):g} s, and it is {now:g} s"
             raise RequestRejected(Refusal.FUTURE, detail)
         async with self._locks[servo]:
             new = await self._ingest.commit(incoming._replace(received=now)) is PutResult.NEW
             sent = await self._process(servo, now) if new else []
-        first = [acknowledgement(message)] if isinstance(message, Window) else []
+        first = [acknowledgement(message)] if isinstance(message, WindowMessage) else []
         return await self._response(servo, first + sent)
 
     async def _wake(self, request: HttpRequest) -> HttpResponse:

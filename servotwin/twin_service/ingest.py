@@ -17,7 +17,7 @@ from servotwin.messages import (
     Message,
     Receipt,
     Refusal,
-    Window,
+    WindowMessage,
     decode,
     encode,
 )
@@ -77,17 +77,17 @@ class Ingest:
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
 
-    def read_window(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, Window]:
+    def read_window(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, WindowMessage]:
         """Decode a window of that servo; raises RequestRejected as `read` does."""
         incoming, message = self.read(servo, body, encoding)
-        if not isinstance(message, Window):
+        if not isinstance(message, WindowMessage):
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"a window is expected here, not {_kind(message)}")
         return incoming, message
 
     def read_letter(self, servo: str, body: bytes, encoding: str = "") -> tuple[Incoming, Message]:
         """Decode a hello, receipt, fallback or answer of that servo; raises RequestRejected as `read` does."""
         incoming, message = self.read(servo, body, encoding)
-        if isinstance(message, Window):
+        if isinstance(message, WindowMessage):
             raise RequestRejected(
                 Refusal.NOT_UNDERSTOOD, "a hello, receipt, fallback or answer is expected here, not window"
             )
@@ -110,7 +110,7 @@ class Ingest:
         """
         data, message = self._decoded(servo, body, encoding)
         now, digest = self._clocks.monotonic(), _digest(data)
-        if isinstance(message, Window):
+        if isinstance(message, WindowMessage):
             self._sample_times.check(servo, message.boot, end_of(message), now)
             incoming = Incoming(
                 servo=servo,
@@ -163,12 +163,12 @@ class Ingest:
         return data, message
 
 
-def end_of(window: Window) -> float:
+def end_of(window: WindowMessage) -> float:
     """Sample time of a window's last sample, s."""
     return window.start + (window.samples - 1) / window.rate
 
 
-def acknowledgement(window: Window) -> bytes:
+def acknowledgement(window: WindowMessage) -> bytes:
     """Message that tells the edge that its window is safe."""
     return encode(Acknowledge(window.servo, window.boot, window.sequence))
 

@@ -24,7 +24,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear
-from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, Window, decode, encode
+from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, WindowMessage, decode, encode
 from servotwin.plant.signals import PiecewiseCubic
 
 _TIMEOUT_S = 300.0
@@ -172,7 +172,7 @@ class LockStep(msgspec.Struct, frozen=True):
         From the twin: acknowledgements, updates, requests.
     """
 
-    windows: tuple[Window, ...]
+    windows: tuple[WindowMessage, ...]
     receipts: tuple[Receipt, ...]
     fallbacks: tuple[Fallback, ...]
     sent: tuple[Message, ...]
@@ -198,5 +198,5 @@ def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress
             progress(run.share)
     up = {record.serial: decode(record.data) for record in run.link.up.records}
     down = {record.serial: decode(record.data) for record in run.link.down.records}
-    windows = {each.identity: each for each in up.values() if isinstance(each, Window)}
+    windows = {each.identity: each for each in up.values() if isinstance(each, WindowMessage)}
     return LockStep(tuple(windows.values()), tuple(run.receipts), tuple(run.fallbacks), tuple(down.values()))

@@ -12,7 +12,7 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.limits import Limits
 from servotwin.estimation.estimate import GapStatus
 from servotwin.link.simulated import Fate, LinkSettings
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, Window
+from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, WindowMessage
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -52,7 +52,7 @@ def test_an_update_lands_three_seconds_after_the_reference_step(controller):
     assert [estimate.status for estimate in loop.estimates] == [GapStatus.OK] * 2
     assert [receipt.sample for receipt in loop.receipts] == [15000, 40000]
     kinds = [(type(m.message), m.sent, m.arrival) for m in loop.messages[:4]]
-    assert kinds == [(Window, 1.0, 2.0), (Acknowledge, 2.0, 3.0), (Update, 2.0, 3.0), (Receipt, 3.0, 4.0)]
+    assert kinds == [(WindowMessage, 1.0, 2.0), (Acknowledge, 2.0, 3.0), (Update, 2.0, 3.0), (Receipt, 3.0, 4.0)]
     expected = np.zeros(loop.scenario.samples)
     expected[15000:40000], expected[40000:] = (update.setting.tolerance for update in loop.updates)
     assert np.array_equal(loop.run.tolerance, expected)
@@ -147,7 +147,7 @@ def test_a_lost_update_and_a_lost_acknowledgement_are_made_good():
     assert lost == [Acknowledge, Update]
     assert [receipt.sample for receipt in loop.applied] == [40000]  # sent at 2 s, again at 7 s, there at 8 s
     assert len(loop.windows) == 1
-    sent = [m.sent for m in loop.messages if isinstance(m.message, Window)]
+    sent = [m.sent for m in loop.messages if isinstance(m.message, WindowMessage)]
     assert sent == [1.0, 6.0]
 
 
@@ -189,7 +189,7 @@ def test_every_message_is_bytes_that_decode():
     assert not any(isinstance(m.message, Hello) for m in loop.messages)
     window = loop.windows[0]
     assert sum(window.channel(name).samples for name in ("theta_m", "position")) == 10_000
-    assert [m.message for m in loop.messages if isinstance(m.message, Window)] == list(loop.windows)
+    assert [m.message for m in loop.messages if isinstance(m.message, WindowMessage)] == list(loop.windows)
 
 
 def test_progress_rises_to_one_in_few_blocks():

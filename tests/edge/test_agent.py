@@ -16,7 +16,17 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, Window, checksum, unpack_channel
+from servotwin.messages import (
+    Acknowledge,
+    Hello,
+    Reason,
+    Receipt,
+    Setting,
+    Update,
+    WindowMessage,
+    checksum,
+    unpack_channel,
+)
 from servotwin.runtime.retry import Retry
 
 
@@ -32,8 +42,8 @@ def feed(agent: Agent, reference: list[float]) -> list[OutgoingMessage]:
     return agent.absorb_block(reference, [0.1 * x for x in ramp], [1e-3 * x for x in ramp], [-x for x in ramp])
 
 
-def windows(sent: list[OutgoingMessage]) -> list[Window]:
-    return [out.message for out in sent if isinstance(out.message, Window)]
+def windows(sent: list[OutgoingMessage]) -> list[WindowMessage]:
+    return [out.message for out in sent if isinstance(out.message, WindowMessage)]
 
 
 def update(**changes: Any) -> Update:

@@ -12,7 +12,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink
-from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.runtime.clock import VirtualClock
 from servotwin.runtime.retry import Retry
 
@@ -20,7 +20,7 @@ RATE, STEPS, HOSTILE_S, TAIL_S = 10.0, 10, 20.0, 40.0
 """Tiny windows of four samples, a reference step every two seconds, then a clean link to settle on."""
 
 
-def make_update(version: int, base: int, window: Window, lifetime_s: float) -> Update:
+def make_update(version: int, base: int, window: WindowMessage, lifetime_s: float) -> Update:
     """An update whose tolerance tells its window."""
     known, start = (None, None, (None, None)), window.start
     tolerance = 1e-5 * (1 + window.sequence)
@@ -35,12 +35,12 @@ class StubTwin:
     lifetime_s: float
     version: int = 0
     base: int = 0
-    newest: Window | None = None
+    newest: WindowMessage | None = None
     pending: Update | None = None
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
-        if isinstance(message, Window):
+        if isinstance(message, WindowMessage):
             return self._window(message)
         if isinstance(message, Receipt) and self.pending and message.version == self.pending.version:
             return self._receipt(message)
@@ -49,7 +49,7 @@ class StubTwin:
     def repeat(self) -> list[Message]:
         return [self.pending] if self.pending else []
 
-    def _window(self, window: Window) -> list[Message]:
+    def _window(self, window: WindowMessage) -> list[Message]:
         self.seen.add(window.sequence)
         answer: list[Message] = [Acknowledge(window.servo, window.boot, window.sequence)]
         if self.newest is None or window.start > self.newest.start:
@@ -62,7 +62,7 @@ class StubTwin:
         refused = receipt.reason in (Reason.BASE_MISMATCH, Reason.OLD_VERSION)
         return self._issue(self.newest) if refused and self.newest else []
 
-    def _issue(self, window: Window) -> list[Message]:
+    def _issue(self, window: WindowMessage) -> list[Message]:
         self.version = max(self.version, self.base) + 1
         self.pending = make_update(self.version, self.base, window, self.lifetime_s)
         return [self.pending]
@@ -81,7 +81,7 @@ class CarelessTwin:
     seen: set[int] = field(default_factory=set)
 
     def receive(self, message: Message) -> list[Message]:
-        if not isinstance(message, Window):
+        if not isinstance(message, WindowMessage):
             return []
         self.seen.add(message.sequence)
         self.version += message.sequence % 3 != 0

@@ -18,7 +18,7 @@ from servotwin.edge.store import MemoryParameterStore
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
-from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Setting, Update, Window
+from servotwin.messages import Acknowledge, Band, Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage
 
 RATE = 200.0
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=RATE)
@@ -99,7 +99,7 @@ def test_after_a_fallback_a_good_update_counts_again() -> None:
 def test_a_silent_twin_is_borne_for_a_while(answers: bool) -> None:
     agent = Agent(agent_settings(silence_s=6.0, watch=None))
     sent = feed(agent, 2.0)
-    (window,) = [out.message for out in sent if isinstance(out.message, Window)]
+    (window,) = [out.message for out in sent if isinstance(out.message, WindowMessage)]
     if answers:
         agent.receive(Acknowledge("axis-1", "b0", window.sequence))
     found = fallbacks(feed(agent, 20.0))

@@ -21,7 +21,7 @@ from servotwin.edge_process.config_file import edge_toml
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.logs.formats import SignalTable
 from servotwin.logs.log import write_log
-from servotwin.messages import Setting, Window, unpack_channel
+from servotwin.messages import Setting, WindowMessage, unpack_channel
 
 RATE, WINDOW = 5000.0, 0.5
 SIMULATED = 11.0  # s: changes of the reference at 0, 2, ... 10 s
@@ -48,7 +48,7 @@ def over_opcua(folder: Path, stack: ExitStack) -> dict[str, Any]:
     return {"kind": "opcua", "url": url, "poll_s": 0.03}
 
 
-def windows_of(folder: Path) -> list[Window]:
+def windows_of(folder: Path) -> list[WindowMessage]:
     """What waits in the outbox, in order."""
     outbox = SqliteOutbox(folder / "outbox.sqlite", "axis")
     try:

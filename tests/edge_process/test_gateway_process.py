@@ -25,7 +25,7 @@ from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.edge_process.monitoring import read_status
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Hello, Receipt, Refusal, Setting, Update, Window
+from servotwin.messages import Hello, Receipt, Refusal, Setting, Update, WindowMessage
 from servotwin.runtime.retry import Retry
 
 RATE = 500.0
@@ -205,7 +205,7 @@ def test_a_terminal_that_is_closed_leaves_the_safe_voltage(gateway: Gateway, mac
     assert "link process gone" not in gateway.log()
 
 
-def update(window: Window, version: int) -> Update:
+def update(window: WindowMessage, version: int) -> Update:
     known = (None, None, (None, None))
     identity, values = (window.boot, window.sequence), (Setting(1e-5 * version), window.start + 1000.0)
     return Update("axis-1", version, version - 1, identity, window.start, *known, "OK", *values)
@@ -225,7 +225,7 @@ def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
             handler.close_connection = True
         return kind < 0.4
 
-    def answer(window: Window) -> None:
+    def answer(window: WindowMessage) -> None:
         if (window.boot, window.sequence) not in answered:
             answered.add((window.boot, window.sequence))
             said = update(window, next(versions))

@@ -13,16 +13,26 @@ from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
 from servotwin.link.session import Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Update, Window, checksum, encode, pack_channel
+from servotwin.messages import (
+    Acknowledge,
+    Hello,
+    Refusal,
+    Setting,
+    Update,
+    WindowMessage,
+    checksum,
+    encode,
+    pack_channel,
+)
 from servotwin.runtime.retry import Retry
 
 RETRY = Retry(1.0, 2.0, 8.0)
 KEY = key_of(verifier_of("secret"))
 
 
-def window(sequence: int) -> Window:
+def window(sequence: int) -> WindowMessage:
     channels = (pack_channel("position", "m", [0.0, 1e-3]),)
-    return Window("axis-1", "b0", sequence, 0.0, 10.0, channels, (), 0, "", "reference", checksum(channels))
+    return WindowMessage("axis-1", "b0", sequence, 0.0, 10.0, channels, (), 0, "", "reference", checksum(channels))
 
 
 class Script:

@@ -13,14 +13,14 @@ from faketwin import FakeTwin, Handler
 from servotwin.errors import InvalidInput
 from servotwin.link.http import HttpTransport
 from servotwin.link.transport import Parcel, Refused, Unreachable, deflated
-from servotwin.messages import Acknowledge, Hello, Refusal, Setting, Window, checksum, encode, pack_channel
+from servotwin.messages import Acknowledge, Hello, Refusal, Setting, WindowMessage, checksum, encode, pack_channel
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")
 
 
-def window(sequence: int) -> Window:
-    return Window("axis-1", "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+def window(sequence: int) -> WindowMessage:
+    return WindowMessage("axis-1", "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
 
 
 def parcel(sequence: int) -> Parcel:

@@ -7,14 +7,16 @@ from hypothesis import strategies as st
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import FULL, Dropped, MemoryOutbox
 from servotwin.link.session import Session
-from servotwin.messages import Window, checksum, pack_channel
+from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.runtime.retry import Retry
 
 CHANNELS = (pack_channel("position", "m", [0.0, 1.0]),)
 
 
-def window(sequence: int) -> Window:
-    return Window("axis-1", "b0", sequence, float(sequence), 5.0, CHANNELS, (), 0, "", "test", checksum(CHANNELS))
+def window(sequence: int) -> WindowMessage:
+    return WindowMessage(
+        "axis-1", "b0", sequence, float(sequence), 5.0, CHANNELS, (), 0, "", "test", checksum(CHANNELS)
+    )
 
 
 def sent(session: Session, now: float) -> list[int]:

@@ -18,14 +18,14 @@ from servotwin.link.outbox import FULL, Dropped
 from servotwin.link.session import Session
 from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
-from servotwin.messages import Window, checksum, pack_channel
+from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.runtime.retry import Retry
 
 
-def window(sequence: int, reason: str = "reference", samples: int = 50, boot: str = "b0") -> Window:
+def window(sequence: int, reason: str = "reference", samples: int = 50, boot: str = "b0") -> WindowMessage:
     noise = [((k * 7919 + sequence) % 997) * 1e-6 for k in range(samples)]
     channels = (pack_channel("position", "m", noise),)
-    return Window("axis-1", boot, sequence, 0.0, 10.0, channels, (), 0, "", reason, checksum(channels))
+    return WindowMessage("axis-1", boot, sequence, 0.0, 10.0, channels, (), 0, "", reason, checksum(channels))
 
 
 @pytest.fixture

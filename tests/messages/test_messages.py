@@ -27,7 +27,7 @@ from servotwin.messages import (
     Setting,
     Update,
     Verification,
-    Window,
+    WindowMessage,
     checksum,
     codec,
     decode,
@@ -42,14 +42,14 @@ from servotwin.messages.legacy import MAX_LEGACY_BYTES
 SAMPLES = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e200, max_value=1e200)
 
 
-def window(**changes: Any) -> Window:
+def window(**changes: Any) -> WindowMessage:
     channels = (pack_channel("position", "m", [0.0, 1e-3, 2e-3]), pack_channel("theta_m", "rad", [1.0, 1.0, 1.0]))
     values: dict[str, Any] = {
         "servo": "axis-1", "boot": "b0", "sequence": 4, "start": 20.0, "rate": 5000.0, "channels": channels,
         "reference_changes": ((20.0, 1e-3),), "parameter_version": 2, "model_version": "paper", "reason": "reference",
         "crc": checksum(channels),
     }  # fmt: skip
-    return Window(**{**values, **changes})
+    return WindowMessage(**{**values, **changes})
 
 
 UPDATE = Update("axis-1", 3, 2, ("b0", 4), 20.0, 0.1, 0.01, (0.08, None), "OK", Setting(1e-4), 60.0)

@@ -13,7 +13,7 @@ import pytest
 
 import servotwin as st
 from benchmarks.novelty.command import QUICK, charted, saved
-from benchmarks.novelty.loops import Case, account, summary
+from benchmarks.novelty.loops import LoopCase, account, summary
 from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
@@ -21,7 +21,7 @@ from servotwin.edge.agent import Agent, Outgoing
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
-from servotwin.messages import Window
+from servotwin.messages import WindowMessage
 from servotwin.novelty.detector import FIRST, NEWS, PERIODIC
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
@@ -121,14 +121,14 @@ def test_a_reference_that_never_changes_is_looked_at_all_the_same(block: int) ->
     for first in range(0, count, block):
         zeros = [0.0] * min(block, count - first)
         sent += edge.absorb_block(zeros, zeros, zeros, zeros)
-    windows = [(each.sample, each.message.reason) for each in sent if isinstance(each.message, Window)]
+    windows = [(each.sample, each.message.reason) for each in sent if isinstance(each.message, WindowMessage)]
     assert [w for w in windows if w[0] <= 2000] == [(1000, FIRST), (2000, FIRST)]
     assert [reason for _, reason in windows if reason == PERIODIC]
     assert edge.dropped[FILTERED] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
 
 
-def messages(sent: list[Outgoing]) -> list[Window]:
-    return [each.message for each in sent if isinstance(each.message, Window)]
+def messages(sent: list[Outgoing]) -> list[WindowMessage]:
+    return [each.message for each in sent if isinstance(each.message, WindowMessage)]
 
 
 def test_without_novelty_time_cuts_nothing() -> None:
@@ -148,7 +148,7 @@ def test_the_bench_measures_what_it_says() -> None:
     assert figures["1 um: windows that say nothing, share"] == 0.0
     assert figures["1 um: scatter of the score, deg"] < 0.01
     assert figures["1 um: 0.5 deg: seen after, windows (median)"] == 1.0
-    case = Case("fig15", 60.0, False, NoveltyRules())
+    case = LoopCase("fig15", 60.0, False, NoveltyRules())
     found = account(case)
     assert (found.windows, found.sent, found.updates) == (3, 1, 1)
     assert saved([(case, "news", found)]).row_count == 1

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from servotwin.messages import Window, decode, encode
+from servotwin.messages import WindowMessage, decode, encode
 from servotwin.store.engine import transaction
 from servotwin.store.migrate import VERSIONS
 from servotwin.store.records import MessageKind, PutResult
@@ -36,12 +36,12 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store.close()
 
 
-def newest_window(store: Store) -> Window:
+def newest_window(store: Store) -> WindowMessage:
     last = store.windows(SERVO, 1)[0]
     stored = store.window(SERVO, last.boot, last.sequence)
     assert stored is not None
     found = decode(incoming(store, stored.body, stored.encoding)[1])
-    assert isinstance(found, Window)
+    assert isinstance(found, WindowMessage)
     return found
 
 

@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import msgspec
 
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
-from servotwin.messages import Acknowledge, Message, Refusal, Window, decode, encode
+from servotwin.messages import Acknowledge, Message, Refusal, WindowMessage, decode, encode
 
 Fault = Callable[["Handler", bytes], bool]
 """Looks at a request; whether it has answered it (badly) itself."""
@@ -23,12 +23,12 @@ class FakeTwin:
 
     def __init__(self, servo: str = "axis-1", token: str = "secret") -> None:
         self.servo, self.token = servo, token
-        self.windows: dict[tuple[str, int], Window] = {}
+        self.windows: dict[tuple[str, int], WindowMessage] = {}
         self.letters: list[Message] = []
         self.requests: Counter[str] = Counter()
         self.sealed: list[tuple[int, bytes]] = []
         self.fault: Fault | None = None
-        self.on_window: Callable[[Window], None] = lambda _: None
+        self.on_window: Callable[[WindowMessage], None] = lambda _: None
         self.news, self.closed = threading.Condition(), False
         self.sockets: set[socket.socket] = set()
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), type("Bound", (Handler,), {"twin": self}))
@@ -107,7 +107,7 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Content-Encoding") == "deflate":
             body = zlib.decompress(body)
         message = decode(body)
-        if not isinstance(message, Window):
+        if not isinstance(message, WindowMessage):
             self.twin.letters.append(message)
             self.answer(202, b"")
             return

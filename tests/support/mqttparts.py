@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 from mosquitto import Mosquitto
 
-from servotwin.link.broker import Broker, Connection, Events, Wanted
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
 from servotwin.link.transport import Parcel, Unreachable, deflated
-from servotwin.messages import Window, checksum, encode, pack_channel
+from servotwin.messages import WindowMessage, checksum, encode, pack_channel
 from servotwin.store.group_commit import GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
@@ -30,8 +30,8 @@ VERIFIERS = Verifiers({servo: verifier_of(token) for servo, token in TOKENS.item
 PATIENCE = 60.0
 
 
-def window(sequence: int, servo: str = "axis-1") -> Window:
-    return Window(servo, "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+def window(sequence: int, servo: str = "axis-1") -> WindowMessage:
+    return WindowMessage(servo, "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
 
 
 def parcel(sequence: int, servo: str = "axis-1") -> Parcel:
@@ -133,8 +133,8 @@ def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
         acknowledge()
         arrived.set()
 
-    events = Events(message, lambda _: ready.set(), lambda _: None)
-    wanted = Wanted("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
+    events = MqttCallbacks(message, lambda _: ready.set(), lambda _: None)
+    wanted = MqttSession("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
     connection = Connection(Broker(server.url), wanted, events)
     try:
         assert ready.wait(PATIENCE)

@@ -15,7 +15,7 @@ import msgspec
 
 from servotwin import messages
 from servotwin.link.seal import verifier_of
-from servotwin.messages import Hello, Setting, Window, encode, pack_channel
+from servotwin.messages import Hello, Setting, WindowMessage, encode, pack_channel
 from servotwin.store.store import open_store
 from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.twin_service.service import TwinService
@@ -40,14 +40,14 @@ def twin_file(folder: Path, service: str = "", tokens: bool = True, servos: str 
 
 def window(
     sequence: int = 0, servo: str = "ax-1", boot: str = "b", start: float | None = None, samples: int = 200
-) -> Window:
+) -> WindowMessage:
     """A window of noise."""
     random = Random(sequence)
     names = (("position", "m"), ("theta_m", "rad"))
     channels = tuple(pack_channel(name, unit, [random.gauss(0, 1) for _ in range(samples)]) for name, unit in names)
     begin = float(sequence) if start is None else start
     crc = messages.checksum(channels)
-    return Window(servo, boot, sequence, begin, 1000.0, channels, (), 0, "model", "test", crc)
+    return WindowMessage(servo, boot, sequence, begin, 1000.0, channels, (), 0, "model", "test", crc)
 
 
 def hello(servo: str = "ax-1", boot: str = "b", time: float = 0.0) -> bytes:
@@ -60,7 +60,7 @@ def bearer(token: str = TOKEN) -> dict[str, str]:
     return {"authorization": f"Bearer {token}"}
 
 
-def place(found: Window) -> str:
+def place(found: WindowMessage) -> str:
     """Where a window is put."""
     return f"/v1/servos/{found.servo}/windows/{found.boot}/{found.sequence}"
 

@@ -13,8 +13,8 @@ from servotwin.messages import (
 )
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 
@@ -26,7 +26,7 @@ def window_message(sequence=0, start=0.0, boot="boot-1", servo="axis", version=0
     channels = channels or tuple(
         pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
     )
-    return messages.Window(
+    return messages.WindowMessage(
         servo, boot, sequence, start, 100.0, channels, (), version, "model", "test", messages.checksum(channels)
     )
 

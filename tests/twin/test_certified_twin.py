@@ -36,7 +36,7 @@ def window(sequence=0, start=20.0):
         pack_channel(name, unit, rng.normal(size=50)) for name, unit in (("position", "m"), ("theta_m", "rad"))
     )
     crc = messages.checksum(channels)
-    return messages.Window("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
+    return messages.WindowMessage("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
 
 
 def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK):

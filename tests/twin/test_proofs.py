@@ -13,7 +13,7 @@ import pytest
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
@@ -33,7 +33,7 @@ SERVO = SCENARIO.model
 
 
 @cache
-def windows() -> tuple[Window, ...]:
+def windows() -> tuple[WindowMessage, ...]:
     return cosimulate(SCENARIO).windows
 
 
@@ -57,7 +57,7 @@ class Queue:
     def __init__(self, fleet: ModelRegistry) -> None:
         self.fleet, self.state, self.serial, self.outcomes = fleet, b"", 0, []
 
-    def give(self, message: Window | Receipt | Fallback | Incoming) -> WorkResult:
+    def give(self, message: WindowMessage | Receipt | Fallback | Incoming) -> WorkResult:
         body, kind = (
             (message.body, message.kind) if isinstance(message, Incoming) else (encode(message), MessageKind.WINDOW)
         )

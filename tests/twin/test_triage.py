@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from twin_messages import eq_21
 
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from benchmarks.glances import triage as bench
 from servotwin import messages
 from servotwin.config.table import Table, parse_toml
@@ -29,8 +29,8 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
@@ -42,7 +42,7 @@ OFFSET = (0.0, 0.0155 * DEG)
 
 
 @cache
-def cases(noisy: bool) -> tuple[Case, ...]:
+def cases(noisy: bool) -> tuple[WindowCase, ...]:
     """Windows of the paper's loop at gaps of 4 to 18 deg; in the paper's noise on a floor of 1 um, or clean."""
     noise = Noise(0.22e-3, (10.0, 50.0)) if noisy else None
     found = paper_loop_cases(np.linspace(4.0, 18.0, 4) * DEG, 3, 5, noise)
@@ -51,20 +51,20 @@ def cases(noisy: bool) -> tuple[Case, ...]:
 
 
 @cache
-def calm_windows() -> tuple[messages.Window, ...]:
+def calm_windows() -> tuple[messages.WindowMessage, ...]:
     """Of a deployed loop: at rest between steps, 2 s with a bias of 50 mV; only the first few show both contacts."""
     scenario = Scenario.preset("certified").replace(gap=25.0 * DEG, duration=165.0)
     return cosimulate(scenario).windows
 
 
-def message_of(window: Window, sequence: int = 1, **changes) -> messages.Window:
+def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
     channels = []
     for name, samples in window.channels.items():
         unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
         packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
         channels += packed
     told = {"version": 0, "reason": "reference", "boot": "b", **changes}
-    return messages.Window(
+    return messages.WindowMessage(
         "axis",
         told["boot"],
         sequence,
@@ -86,7 +86,7 @@ def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
     )
 
 
-def seen(case: Case, expected: float, **changes) -> Glance:
+def seen(case: WindowCase, expected: float, **changes) -> Glance:
     return glance(message_of(case.window), case.window, case.servo, watch_of(expected, **changes))
 
 

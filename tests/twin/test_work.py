@@ -18,7 +18,7 @@ from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, Window, decode, encode
+from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
 from servotwin.messages.compression import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
@@ -44,7 +44,7 @@ def loop() -> Loop:
     return cosimulate(SCENARIO.replace(twin=QUICK))
 
 
-def windows() -> tuple[Window, ...]:
+def windows() -> tuple[WindowMessage, ...]:
     return loop().windows
 
 

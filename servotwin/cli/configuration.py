@@ -1,0 +1,178 @@
+"""The reference of all configuration files, written to docs/configuration.md and docs/schemas by `make reference`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from servotwin.config.keys import key
+from servotwin.config.reference import TableSpec, markdown, schema
+from servotwin.control.controller import Controller
+from servotwin.cosim.scenario import Scenario
+from servotwin.cosim.scenario_file import Recording
+from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.drives.table import SUPERVISED
+from servotwin.edge.parameters import FallbackSet
+from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.edge.settings_file import setting_table, start_table
+from servotwin.edge_process.config import EdgeConfig
+from servotwin.edge_process.config_file import update_gains_table
+from servotwin.estimation.gap import METHODS
+from servotwin.link.simulated import LinkSettings
+from servotwin.messages import Gains
+from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.servo import Servo
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin_service.config import ServiceConfig, mqtt_table
+
+HEAD = """# Configuration reference
+
+Made by `make reference` from the declarations in the code: do not edit. A file may leave out every key that is not
+required. Where a key has two names, a file may give either; the unit is the end of the name. Editors that know TOML
+schemas (Even Better TOML, Taplo) check a file against the schema of its kind in `docs/schemas`.
+"""
+
+
+def _servo(servo: Annotated[str, key(help="A preset, or the path of a servo's TOML, relative to this file.")]) -> None:
+    """Servo of a file."""
+
+
+def _gains_stay(
+    gains_stay: Annotated[bool | None, key(help="Leave the gains as they are; true where updates set none.")] = None,
+) -> None:
+    """Switch of a table with gains."""
+
+
+def _machine(
+    scenario: Annotated[
+        object, key(help="A packaged scenario, the path of one relative to this file, or a table with its keys.")
+    ],
+    listen: Annotated[str, key(help="unix:PATH, relative to this file, or HOST:PORT.")],
+) -> None:
+    """Keys of a simulated machine."""
+
+
+def _password(
+    store_password_file: Annotated[str | None, key(help="File of mode 0600 with the store's password.")] = None,
+) -> None:
+    """Secret of a store."""
+
+
+_GAINS = Gains.__struct_fields__
+_CHANGED = TableSpec((Controller,), "Changes of the servo's own controller.", partial=True)
+_FALLBACK = TableSpec(
+    (setting_table, FallbackSet, Controller, _gains_stay),
+    "Setting that the edge falls back to; gains that are left out are those of the controller.",
+    only=("tolerance", "band", "silence_s", "refuse_s", "gains_stay", *_GAINS),
+    partial=True,
+)
+_START = TableSpec(
+    (setting_table, start_table, Controller, _gains_stay),
+    "Parameters before the first update.",
+    only=("tolerance", "band", "fallback", "gains_stay", *_GAINS),
+    partial=True,
+)
+_OWN = TableSpec(
+    (Controller, _gains_stay),
+    "Gains in the middle of the box that updates must stay in; the controller's where absent.",
+    only=("gains_stay", *_GAINS),
+    partial=True,
+)
+_ESTIMATOR = TableSpec(
+    help="Settings of the estimator that `method` names.",
+    kinds={f"method {name}": TableSpec((method.settings,)) for name, method in METHODS.items()},
+)
+_TWIN = TableSpec((TwinSettings,), "The twin.", {"estimator": _ESTIMATOR})
+_DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED.items()}
+
+FILES = {
+    "servo": ("Servo: `servo.toml`", TableSpec((Servo,))),
+    "scenario": (
+        "Scenario of a co-simulation: `scenario.toml`",
+        TableSpec(
+            (_servo, Scenario),
+            tables={
+                "controller": _CHANGED,
+                "recording": TableSpec((Recording,), "What the edge records and sends."),
+                "edge": TableSpec(
+                    (Supervision,),
+                    "Supervision: with this table updates may set gains too, and the edge looks after itself.",
+                    {
+                        "fallback": _FALLBACK,
+                        "probe": TableSpec((ProbeLimits,), "Probing moves of the reference that the twin may request."),
+                    },
+                ),
+                "novelty": TableSpec((NoveltyRules,), "Rules by which the edge sends a window; all where absent."),
+                "link": TableSpec(
+                    (LinkSettings,),
+                    "The link, both ways.",
+                    {
+                        "up": TableSpec((LinkSettings,), "Changes for edge to twin.", partial=True),
+                        "down": TableSpec((LinkSettings,), "Changes for twin to edge.", partial=True),
+                    },
+                ),
+                "twin": _TWIN,
+            },
+        ),
+    ),
+    "edge": (
+        "Edge: `edge.toml`",
+        TableSpec(
+            (AgentSettings, EdgeConfig, update_gains_table),
+            tables={
+                "drive": TableSpec(help="The drive.", kinds=_DRIVES),
+                "controller": TableSpec((Controller,), "Controller; needed to control and where updates set gains."),
+                "own": _OWN,
+                "start": _START,
+                "supervision": TableSpec((Supervision,), "Supervision of the loop.", {"fallback": _FALLBACK}),
+                "novelty": TableSpec((NoveltySettings,), "Filter of the windows that are sent; all where absent."),
+            },
+        ),
+    ),
+    "twin": (
+        "Twin: `twin.toml`",
+        TableSpec(
+            tables={
+                "service": TableSpec(
+                    (ServiceConfig, _password),
+                    "The service.",
+                    {"mqtt": TableSpec((mqtt_table,), "Broker over which edges may reach the service as well.")},
+                ),
+                "models": TableSpec(
+                    help="Any number of models, each in a table with its name.",
+                    tables={"NAME": TableSpec((_servo,), tables={"controller": _CHANGED, "twin": _TWIN})},
+                    repeated="NAME",
+                ),
+                "servos": TableSpec(help='Lines `"NAME" = "MODEL"`; a name may hold `*`.', text=True),
+            },
+        ),
+    ),
+    "machine": ("Simulated machine: `machine.toml`", TableSpec((_machine, MachineSettings))),
+}
+"""The kinds of files: name of the schema, title, keys."""
+
+
+def texts() -> dict[str, str]:
+    """The files of the reference, by their path below docs/."""
+    pages = [markdown(title, spec) for title, spec in FILES.values()]
+    schemas = {f"schemas/{name}.json": _json(title, spec) for name, (title, spec) in FILES.items()}
+    return {"configuration.md": "\n".join([HEAD, *pages]).rstrip() + "\n", **schemas}
+
+
+def _json(title: str, spec: TableSpec) -> str:
+    return json.dumps(schema(title.partition(":")[0], spec), indent=1, ensure_ascii=False) + "\n"
+
+
+def main(folder: Path) -> None:
+    """Write the reference below a folder."""
+    for name, text in texts().items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs"))

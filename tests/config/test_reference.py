@@ -1,0 +1,64 @@
+"""The reference in docs/ is that of the code, and its schemas accept what the program reads."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema_rs
+import pytest
+
+from servotwin.cli.configuration import texts
+
+ROOT = Path(__file__).parents[2]
+PACKAGED = [
+    *(("scenario", path) for path in sorted((ROOT / "servotwin/cosim/scenarios").glob("*.toml"))),
+    *(("servo", path) for path in sorted((ROOT / "servotwin/plant/presets").glob("*.toml"))),
+]
+
+
+@pytest.mark.parametrize("name", texts())
+def test_the_reference_is_up_to_date(name: str) -> None:
+    assert (ROOT / "docs" / name).read_text(encoding="utf-8") == texts()[name], "run `make reference`"
+
+
+@pytest.mark.parametrize(("kind", "path"), PACKAGED, ids=lambda value: getattr(value, "name", value))
+def test_a_packaged_file_fits_its_schema(kind: str, path: Path) -> None:
+    schema = json.loads(texts()[f"schemas/{kind}.json"])
+    values = tomllib.loads(path.read_text(encoding="utf-8").replace("= inf", "= 1e300"))  # JSON has no inf
+    jsonschema_rs.validate(schema, values)
+    assert not jsonschema_rs.is_valid(schema, {**values, "unknown_key": 1})
+
+
+def test_an_edge_s_file_fits_its_schema_as_it_is_written() -> None:
+    from servotwin.control.controller import Controller
+    from servotwin.edge.settings import AgentSettings
+    from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+    from servotwin.edge_process.config_file import edge_toml
+
+    law = Controller(1377.7, 18907.6, -135.1, 0.1, sample_rate=1000.0)
+    agent = AgentSettings("axis-1", UNBOOTED, 1000.0, controller=law)
+    text = edge_toml(EdgeConfig(agent, "control", law, {"kind": "simulated", "address": "unix:s"}))
+    values = tomllib.loads(text.replace("= inf", "= 1e300"))
+    jsonschema_rs.validate(json.loads(texts()["schemas/edge.json"]), values)
+
+
+def test_a_twin_s_file_fits_its_schema() -> None:
+    values = tomllib.loads(
+        """
+        [service]
+        port = 0
+        [models.axis]
+        servo = "paper"
+        [models.axis.twin]
+        policy = "certified"
+        [models.axis.twin.trend]
+        wear_deg = 20
+        over_s = 200
+        [servos]
+        "ax-*" = "axis"
+        """
+    )
+    schema = json.loads(texts()["schemas/twin.json"])
+    jsonschema_rs.validate(schema, values)
+    values["service"]["port"] = -1
+    assert not jsonschema_rs.is_valid(schema, values)
