@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks import accuracy, endurance, glances, tick
 from benchmarks.fleet import command as whole
-from benchmarks.fleet.setting import QUICK, Scale
+from benchmarks.fleet.setting import QUICK, FleetScale
 from benchmarks.novelty import command as worth_sending
 from benchmarks.policies import command as side_by_side
 from servotwin.errors import InvalidInput
@@ -32,7 +32,7 @@ def _novelty(date: str, output: Path | None, quick: bool) -> None:
 
 
 def _fleet(date: str, output: Path | None, quick: bool) -> None:
-    whole.fleet(date, output, QUICK if quick else Scale())
+    whole.fleet(date, output, QUICK if quick else FleetScale())
 
 
 def _triage(date: str, output: Path | None, quick: bool) -> None:
@@ -74,7 +74,7 @@ def run_alone(
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
     if full:
-        whole.fleet(date, output, Scale().full())
+        whole.fleet(date, output, FleetScale().full())
     else:
         ALONE[name](date, output, quick)
     return True

@@ -85,7 +85,7 @@ def shown(runs: Sequence[dict[str, Any]]) -> Table:
 
 
 def said(runs: Sequence[dict[str, Any]]) -> list[str]:
-    """What the columns mean, and what limits them."""
+    """Explain the columns and their limits."""
     slowest = max(runs, key=lambda run: (run["rate_hz"], -run["pack_s"]))
     handling = f"{slowest['pack_s'] * 1e3:.1f} ms to pack and {slowest['put_s'] * 1e3:.1f} ms to put on disk"
     realtime = "" if any(run["realtime"] for run in runs) else " (not allowed here)"

@@ -15,18 +15,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from benchmarks import report
 from benchmarks.fleet import runs
 from benchmarks.fleet.processes import check_system
-from benchmarks.fleet.setting import TABLE, Scale, prove
-from benchmarks.fleet.stock import Place, stock
+from benchmarks.fleet.setting import TABLE, FleetScale, prove
+from benchmarks.fleet.stock import WindowSource, stock
 from benchmarks.fleet.tables import document, show
-from benchmarks.fleet.watch import Sample
+from benchmarks.fleet.watch import ResourceSample
 
 SCHEMA = "servotwin-bench-fleet/1"
 NAME = "fleet"
 
 
 def fleet(
-    date: str = "", output: Path | None = None, scale: Scale | None = None, console: Console | None = None
-) -> tuple[runs.Ran, runs.Ran]:
+    date: str = "", output: Path | None = None, scale: FleetScale | None = None, console: Console | None = None
+) -> tuple[runs.FleetRun, runs.FleetRun]:
     """Measure ingest alone, then a fleet at its cadence with an outage; show, and write JSON when asked to.
 
     Everything lies in a folder of its own in the system's temporary one, which is removed at the end, as are all
@@ -38,7 +38,7 @@ def fleet(
         Written into the JSON.
     output : Path, optional
         File to write, suffix .json.
-    scale : Scale, optional
+    scale : FleetScale, optional
     console : Console, optional
 
     Raises
@@ -48,7 +48,7 @@ def fleet(
     RuntimeError
         The twin or the edges failed: that is no measurement.
     """
-    console, scale = console or Console(), scale or Scale()
+    console, scale = console or Console(), scale or FleetScale()
     check_system()
     report.check(output)
     with _folder() as folder, _progress(console) as progress:
@@ -60,7 +60,7 @@ def fleet(
     return alone, whole
 
 
-def _prepared(folder: Path, scale: Scale, progress: Progress) -> list[Place]:
+def _prepared(folder: Path, scale: FleetScale, progress: Progress) -> list[WindowSource]:
     """The stock of windows, and the table of proofs."""
     bar = progress.add_task("simulating windows", total=None)
     places = stock(scale.places, scale.windows)
@@ -70,7 +70,7 @@ def _prepared(folder: Path, scale: Scale, progress: Progress) -> list[Place]:
     return places
 
 
-def _ingest(folder: Path, scale: Scale, places: list[Place], progress: Progress) -> runs.Ran:
+def _ingest(folder: Path, scale: FleetScale, places: list[WindowSource], progress: Progress) -> runs.FleetRun:
     apart = folder / "ingest"
     apart.mkdir()
     shutil.copy(folder / TABLE, apart / TABLE)
@@ -81,10 +81,10 @@ def _ingest(folder: Path, scale: Scale, places: list[Place], progress: Progress)
     return found
 
 
-def _fleet(folder: Path, scale: Scale, places: list[Place], progress: Progress) -> runs.Ran:
+def _fleet(folder: Path, scale: FleetScale, places: list[WindowSource], progress: Progress) -> runs.FleetRun:
     bar = progress.add_task("introducing servos", total=scale.steady + scale.outage + scale.after)
 
-    def tell(sample: Sample) -> None:
+    def tell(sample: ResourceSample) -> None:
         phase = _phase(scale, sample.time)
         progress.update(bar, completed=sample.time, description=f"{phase}: {sample.waiting} windows wait")
 
@@ -93,7 +93,7 @@ def _fleet(folder: Path, scale: Scale, places: list[Place], progress: Progress) 
     return found
 
 
-def _phase(scale: Scale, time: float) -> str:
+def _phase(scale: FleetScale, time: float) -> str:
     ends = {"at cadence": scale.steady, "outage": scale.outage, "after the outage": scale.after}
     passed = 0.0
     for name, length in ends.items():

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.fleet.line import Line
-from benchmarks.fleet.plan import Load, Plan, Report, decode_load, shares
+from benchmarks.fleet.line import HttpConnection
+from benchmarks.fleet.plan import LoadPlan, LoadReport, LoadStart, decode_load, shares
 from servotwin.link.seal import Sealed
 from servotwin.messages import Reason, Receipt, Update, WindowMessage, decode, encode
 
@@ -31,7 +31,7 @@ _sealed = msgspec.msgpack.Decoder(list[bytes])
 
 
 @dataclass
-class Edge:
+class LoadEdge:
     """One servo.
 
     Attributes
@@ -54,8 +54,8 @@ class Edge:
 
 
 @dataclass
-class Counts:
-    """What is counted on the way to a `Report`."""
+class LoadCounts:
+    """Counters that become a `LoadReport`."""
 
     windows: int = 0
     news: int = 0
@@ -68,32 +68,32 @@ class Counts:
     late: list[float] = field(default_factory=list)
 
 
-class Fleet:
+class EdgeLoad:
     """All servos, and what falls due.
 
     Parameters
     ----------
-    load : Load
+    load : LoadStart
     clock : callable
         s, that never steps.
     """
 
-    def __init__(self, load: Load, now: float) -> None:
+    def __init__(self, load: LoadStart, now: float) -> None:
         self.plan, self.begin = load.plan, now
         self.places = [[_window(body) for body in bodies] for bodies in load.places]
         self.chance = random.Random(load.plan.seed)
         plan, count = load.plan, len(self.places)
-        self.edges = [Edge(f"ax-{n:05d}", n % count, plan.version, plan.sequence) for n in range(plan.servos)]
-        self.counts = Counts()
+        self.edges = [LoadEdge(f"ax-{n:05d}", n % count, plan.version, plan.sequence) for n in range(plan.servos)]
+        self.counts = LoadCounts()
         self._issued = 0
-        self._kept: deque[tuple[Edge, float]] = deque()
+        self._kept: deque[tuple[LoadEdge, float]] = deque()
 
     @property
     def waiting(self) -> int:
         """Windows that are due and not sent."""
         return len(self._kept)
 
-    def fall_due(self, now: float) -> None:
+    def add_due(self, now: float) -> None:
         """Keep the windows whose time has come."""
         plan, since = self.plan, now - self.begin
         most = min(int(since * plan.rate) + 1, round(plan.duration * plan.rate)) if plan.rate > 0.0 else 0
@@ -103,7 +103,7 @@ class Fleet:
             self._issued += 1
         self.counts.waited = max(self.counts.waited, len(self._kept))
 
-    def take(self, now: float) -> tuple[Edge, float] | None:
+    def take(self, now: float) -> tuple[LoadEdge, float] | None:
         """The next window to be sent, and when it fell due; None: not now."""
         plan, since = self.plan, now - self.begin
         if self.cut(now):
@@ -118,15 +118,15 @@ class Fleet:
         return None
 
     def cut(self, now: float) -> bool:
-        """Whether the link is: every connection has ended."""
+        """Test for an outage that has cut every connection."""
         return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
 
-    def put_back(self, edge: Edge, due: float) -> None:
+    def requeue(self, edge: LoadEdge, due: float) -> None:
         """One that was put off."""
         self._kept.appendleft((edge, due))
 
-    def window(self, edge: Edge, due: float) -> bytes:
-        """What is sent: a window of the edge's place, readdressed; sometimes of the next one, that is the news."""
+    def window(self, edge: LoadEdge, due: float) -> bytes:
+        """Encoded window of the edge's source, readdressed; sometimes of the next source, which shows a changed gap."""
         if self.plan.news > 0.0 and self.chance.random() < self.plan.news:
             edge.place = (edge.place + 1) % len(self.places)
             self.counts.news += 1
@@ -147,7 +147,7 @@ class Fleet:
             )
         )
 
-    def heard(self, edge: Edge, body: bytes) -> None:
+    def apply_messages(self, edge: LoadEdge, body: bytes) -> None:
         """Messages of the twin: an update is applied at once, and answered."""
         for each in _sealed.decode(body):
             found = msgspec.msgpack.decode(each, type=Sealed)
@@ -160,19 +160,19 @@ class Fleet:
                 edge.receipts.append(told)
 
     def undisturbed(self, now: float) -> bool:
-        """Whether there was no outage by then."""
+        """Test that no outage has begun by `now`."""
         begin, end = self.plan.outage
         return begin == end or now - self.begin < begin
 
 
-class Turn:
+class EdgeTurn:
     """One servo's turn on one connection: poll, answer, send the window."""
 
-    def __init__(self, fleet: Fleet, line: Line, done: asyncio.Event, failed: list[str]) -> None:
+    def __init__(self, fleet: EdgeLoad, line: HttpConnection, done: asyncio.Event, failed: list[str]) -> None:
         self.fleet, self.line, self.done, self.failed = fleet, line, done, failed
         self.edge, self.due, self.sent, self.body = fleet.edges[0], 0.0, 0.0, b""
 
-    def begin(self, edge: Edge, due: float) -> None:
+    def begin(self, edge: LoadEdge, due: float) -> None:
         """Start with the poll, where there is one."""
         self.edge, self.due, self.body = edge, due, b""
         if self.fleet.plan.polls:
@@ -184,7 +184,7 @@ class Turn:
     def _polled(self, status: int, body: bytes) -> None:
         if self._bad(status):
             return
-        self.fleet.heard(self.edge, body)
+        self.fleet.apply_messages(self.edge, body)
         self._answer()
 
     def _answer(self, status: int = 202, _body: bytes = b"") -> None:
@@ -215,19 +215,19 @@ class Turn:
         self.done.set()
 
     def _bad(self, status: int) -> bool:
-        """Whether the turn ends here: to be made again, or the whole run."""
+        """Handle an unexpected status; True: the turn ends, to be repeated or with the whole run."""
         if status in TAKEN:
             return False
         if status in LATER:
             self.fleet.counts.later += 1
-            self.fleet.put_back(self.edge, self.due)
+            self.fleet.requeue(self.edge, self.due)
         else:
             self.failed.append(f"the twin answered {status} to {self.edge.name}")
         self.done.set()
         return True
 
 
-async def run(load: Load) -> Report:
+async def run(load: LoadStart) -> LoadReport:
     """Everything that a plan says.
 
     Raises
@@ -235,7 +235,7 @@ async def run(load: Load) -> Report:
     RuntimeError
         The twin answered what it never should, or went away.
     """
-    fleet, failed = Fleet(load, time.monotonic()), list[str]()
+    fleet, failed = EdgeLoad(load, time.monotonic()), list[str]()
     # No servo has two windows on their way at once.
     turns = [await _connected(fleet, failed) for _ in range(min(load.plan.connections, load.plan.servos // 2 or 1))]
     fleet.begin = time.monotonic()
@@ -251,30 +251,30 @@ async def run(load: Load) -> Report:
     return _report(fleet.counts, time.monotonic() - fleet.begin)
 
 
-async def _connected(fleet: Fleet, failed: list[str]) -> Turn:
+async def _connected(fleet: EdgeLoad, failed: list[str]) -> EdgeTurn:
     """A connection, and whose turn it is there."""
     done = asyncio.Event()
-    return Turn(fleet, await _line(fleet.plan, done, failed), done, failed)
+    return EdgeTurn(fleet, await _line(fleet.plan, done, failed), done, failed)
 
 
-async def _line(plan: Plan, done: asyncio.Event, failed: list[str]) -> Line:
+async def _line(plan: LoadPlan, done: asyncio.Event, failed: list[str]) -> HttpConnection:
     """A connection to the twin; where it breaks while an answer is due, everything ends."""
 
     def broken(why: str) -> None:
         failed.append(why)
         done.set()
 
-    _, line = await asyncio.get_running_loop().create_connection(lambda: Line(broken), "127.0.0.1", plan.port)
+    _, line = await asyncio.get_running_loop().create_connection(lambda: HttpConnection(broken), "127.0.0.1", plan.port)
     return line
 
 
-async def _ticks(fleet: Fleet) -> None:
+async def _ticks(fleet: EdgeLoad) -> None:
     while True:
-        fleet.fall_due(time.monotonic())
+        fleet.add_due(time.monotonic())
         await asyncio.sleep(0.005)
 
 
-async def _serve(turn: Turn) -> None:
+async def _serve(turn: EdgeTurn) -> None:
     """One connection, until nothing is left to do."""
     fleet, plan = turn.fleet, turn.fleet.plan
     while not turn.failed:
@@ -302,10 +302,10 @@ async def _serve(turn: Turn) -> None:
             await asyncio.sleep(PAUSE)
 
 
-def _report(counts: Counts, seconds: float) -> Report:
+def _report(counts: LoadCounts, seconds: float) -> LoadReport:
     used = time.process_time()
     done = counts.windows, counts.news, counts.polls, counts.updates, counts.later, counts.bytes
-    return Report(seconds, *done, used, shares(counts.latency), shares(counts.late), counts.waited)
+    return LoadReport(seconds, *done, used, shares(counts.latency), shares(counts.late), counts.waited)
 
 
 def _window(body: bytes) -> WindowMessage:
@@ -314,7 +314,7 @@ def _window(body: bytes) -> WindowMessage:
     return message
 
 
-def _servo(edge: Edge) -> str:
+def _servo(edge: LoadEdge) -> str:
     return f"/v1/servos/{edge.name}"
 
 

@@ -1,4 +1,4 @@
-"""What a run left in the store: how long windows waited, and what was made of them."""
+"""Results of a run in the store: waiting times of windows, and the evidence from them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from benchmarks.fleet.plan import shares
 
 
-class Done(NamedTuple):
+class ProcessedWork(NamedTuple):
     """Of windows that came in some time.
 
     Attributes
@@ -48,21 +48,21 @@ def stored(connection: sqlite3.Connection) -> int:
     return int(count)
 
 
-def done(connection: sqlite3.Connection, since: float, until: float) -> Done:
+def done(connection: sqlite3.Connection, since: float, until: float) -> ProcessedWork:
     """Of the windows that came between two times (s since the epoch)."""
     query = "SELECT received, done FROM messages WHERE kind = 'window' AND received >= ? AND received < ?"
     rows = connection.execute(query, (since, until)).fetchall()
     ages = [end - begin for begin, end in rows if end is not None]
-    return Done(len(rows), len(rows) - len(ages), shares(ages))
+    return ProcessedWork(len(rows), len(rows) - len(ages), shares(ages))
 
 
 def made(connection: sqlite3.Connection, since: float) -> dict[str, int]:
-    """How much of each kind of evidence was made since then (s since the epoch)."""
+    """Number of records of each kind of evidence since a time (s since the epoch)."""
     query = "SELECT kind, count(*) FROM evidence WHERE made >= ? GROUP BY kind"
     return {str(kind): int(count) for kind, count in connection.execute(query, (since,))}
 
 
 def failures(connection: sqlite3.Connection) -> list[str]:
-    """Why work failed, a few of the reasons."""
+    """Reasons of failed work, a few of them."""
     query = "SELECT DISTINCT status FROM evidence WHERE status LIKE 'failed%' LIMIT 3"
     return [str(status) for (status,) in connection.execute(query)]

@@ -11,7 +11,7 @@ _HEAD_END = b"\r\n\r\n"
 _LENGTH = b"content-length:"
 
 
-class Line(asyncio.Protocol):
+class HttpConnection(asyncio.Protocol):
     """Sends a request, and tells who sent it what the answer is.
 
     Parameters
@@ -29,7 +29,7 @@ class Line(asyncio.Protocol):
 
     @property
     def closed(self) -> bool:
-        """Whether it takes requests no more."""
+        """True: the connection accepts no more requests."""
         return self._transport is None or self._transport.is_closing()
 
     def ask(self, head: bytes, body: bytes, answered: Answered) -> None:

@@ -1,4 +1,4 @@
-"""What the bench asks of its edges, as it is handed to their process, and what that says of itself."""
+"""Messages between the bench and the process of its edges: plan and windows in, report out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Struct
 
 
-class Plan(Struct, frozen=True):
+class LoadPlan(Struct, frozen=True):
     """One run of the edges.
 
     Attributes
@@ -47,8 +47,8 @@ class Plan(Struct, frozen=True):
     seed: int = 0
 
 
-class Report(Struct, frozen=True):
-    """What edges did.
+class LoadReport(Struct, frozen=True):
+    """Report of the edges.
 
     Attributes
     ----------
@@ -82,21 +82,21 @@ class Report(Struct, frozen=True):
     waited: int
 
 
-class Load(Struct, frozen=True):
-    """What the edges' process reads first: the plan and the windows, place by place."""
+class LoadStart(Struct, frozen=True):
+    """First message to the process of the edges: the plan, and the windows by source."""
 
-    plan: Plan
+    plan: LoadPlan
     places: tuple[tuple[bytes, ...], ...]
 
 
-def encode_load(load: Load) -> bytes:
+def encode_load(load: LoadStart) -> bytes:
     """As a file."""
     return msgspec.msgpack.encode(load)
 
 
-def decode_load(data: bytes) -> Load:
+def decode_load(data: bytes) -> LoadStart:
     """From a file."""
-    return msgspec.msgpack.decode(data, type=Load)
+    return msgspec.msgpack.decode(data, type=LoadStart)
 
 
 def shares(values: list[float]) -> tuple[float, float, float]:

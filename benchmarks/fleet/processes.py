@@ -20,14 +20,14 @@ _ADDRESS = re.compile(r"listening on http://127\.0\.0\.1:(\d+)")
 _TICK = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 
 
-class Used(NamedTuple):
+class ProcessUsage(NamedTuple):
     """Processor time (s) and resident memory (bytes) of a process."""
 
     cpu: float
     memory: int
 
 
-class Service(NamedTuple):
+class ServiceProcess(NamedTuple):
     """A twin that runs.
 
     Attributes
@@ -52,7 +52,7 @@ def check_system() -> None:
 
 
 @contextmanager
-def service(folder: Path) -> Iterator[Service]:
+def service(folder: Path) -> Iterator[ServiceProcess]:
     """The twin of `twin.toml` in a folder, on a port of its own; its log goes to twin.log there.
 
     Raises
@@ -66,19 +66,19 @@ def service(folder: Path) -> Iterator[Service]:
             command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True, env=_environment()
         )
     try:
-        yield Service(process, _port(process, folder))
+        yield ServiceProcess(process, _port(process, folder))
     finally:
         _end(process)
 
 
-def used(pid: int) -> Used | None:
-    """What a process has used by now; None: it is gone."""
+def used(pid: int) -> ProcessUsage | None:
+    """Resource use of a process so far; None: it has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
         resident = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
     except (OSError, IndexError):
         return None
-    return Used((int(stat[11]) + int(stat[12])) / _TICK, resident * os.sysconf("SC_PAGE_SIZE"))
+    return ProcessUsage((int(stat[11]) + int(stat[12])) / _TICK, resident * os.sysconf("SC_PAGE_SIZE"))
 
 
 def children(pid: int) -> list[int]:
@@ -91,7 +91,7 @@ def children(pid: int) -> list[int]:
 
 
 def _port(process: subprocess.Popen[str], folder: Path) -> int:
-    """Where it listens, once it says so."""
+    """Wait for the service's address; returns its port."""
     assert process.stdout is not None
     end = time.monotonic() + _BEGIN_S
     while time.monotonic() < end:

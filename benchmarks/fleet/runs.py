@@ -14,12 +14,12 @@ from typing import NamedTuple
 import msgspec
 
 from benchmarks.fleet import findings
-from benchmarks.fleet.findings import Done
-from benchmarks.fleet.plan import Load, Plan, Report, encode_load
+from benchmarks.fleet.findings import ProcessedWork
+from benchmarks.fleet.plan import LoadPlan, LoadReport, LoadStart, encode_load
 from benchmarks.fleet.processes import service
-from benchmarks.fleet.setting import STORE, Scale, commission, write_file
-from benchmarks.fleet.stock import BOOT, COMMISSIONED, Place
-from benchmarks.fleet.watch import Sample, Watch
+from benchmarks.fleet.setting import STORE, FleetScale, commission, write_file
+from benchmarks.fleet.stock import BOOT, COMMISSIONED, WindowSource
+from benchmarks.fleet.watch import ResourceSample, ResourceWatch
 from servotwin.messages import encode
 from servotwin.store.store import open_store
 
@@ -29,15 +29,15 @@ LONGEST_DRAIN = 1800.0
 _RAMP = 0.1  # of the steady time that is not counted: caches fill, code is compiled
 
 
-class Ran(NamedTuple):
+class FleetRun(NamedTuple):
     """A run as it was seen.
 
     Attributes
     ----------
-    report : Report
+    report : LoadReport
         The edges' own.
-    watch : Watch
-    steady : Done
+    watch : ResourceWatch
+    steady : ProcessedWork
         Of the windows that came in undisturbed time.
     made : dict of str to int
         Evidence by kind.
@@ -47,28 +47,32 @@ class Ran(NamedTuple):
         s from then until no more than a second's windows waited; NaN: never.
     """
 
-    report: Report
-    watch: Watch
-    steady: Done
+    report: LoadReport
+    watch: ResourceWatch
+    steady: ProcessedWork
     made: dict[str, int]
     behind: float
     drained: float
 
 
-def ingest(folder: Path, scale: Scale, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+def ingest(
+    folder: Path, scale: FleetScale, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
+) -> FleetRun:
     """Windows as fast as they are taken, into a twin that estimates nothing."""
     write_file(folder, scale, enabled=False)
     open_store(f"sqlite:///{folder / STORE}").close()
-    plan = Plan(0, scale.servos, BOOT, scale.connections, scale.ingest, start=COMMISSIONED)
+    plan = LoadPlan(0, scale.servos, BOOT, scale.connections, scale.ingest, start=COMMISSIONED)
     return _run(folder, plan, places, tell)
 
 
-def fleet(folder: Path, scale: Scale, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+def fleet(
+    folder: Path, scale: FleetScale, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
+) -> FleetRun:
     """Steady time, an outage, and time after it."""
     known = write_file(folder, scale)
     version = commission(folder, known, scale, places)
     begin = scale.steady
-    plan = Plan(
+    plan = LoadPlan(
         0,
         scale.servos,
         BOOT,
@@ -85,12 +89,14 @@ def fleet(folder: Path, scale: Scale, places: Sequence[Place], tell: Callable[[S
     return _run(folder, plan, places, tell)
 
 
-def _run(folder: Path, plan: Plan, places: Sequence[Place], tell: Callable[[Sample], None]) -> Ran:
+def _run(
+    folder: Path, plan: LoadPlan, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
+) -> FleetRun:
     with service(folder) as twin, findings.reading(folder / STORE) as store:
         plan = msgspec.structs.replace(plan, port=twin.port)
         before, since = findings.stored(store), time.time()
         with _edges(folder, plan, places) as edges:
-            watch = Watch(twin.process.pid, edges.pid, lambda: findings.waiting(store, time.time()))
+            watch = ResourceWatch(twin.process.pid, edges.pid, lambda: findings.waiting(store, time.time()))
             behind = _watched(edges, watch, plan, tell, lambda: findings.stored(store) - before)
             report = _reported(edges)
         steady = plan.outage[0] or plan.duration
@@ -98,14 +104,14 @@ def _run(folder: Path, plan: Plan, places: Sequence[Place], tell: Callable[[Samp
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        return Ran(report, watch, found, findings.made(store, since), *behind)
+        return FleetRun(report, watch, found, findings.made(store, since), *behind)
 
 
 def _watched(
     edges: subprocess.Popen[bytes],
-    watch: Watch,
-    plan: Plan,
-    tell: Callable[[Sample], None],
+    watch: ResourceWatch,
+    plan: LoadPlan,
+    tell: Callable[[ResourceSample], None],
     stored: Callable[[], int],
 ) -> tuple[float, float]:
     """Look on until the edges are done and nothing waits; (windows behind when the link came back, s until not)."""
@@ -127,9 +133,9 @@ def _watched(
 
 
 @contextmanager
-def _edges(folder: Path, plan: Plan, places: Sequence[Place]) -> Iterator[subprocess.Popen[bytes]]:
+def _edges(folder: Path, plan: LoadPlan, places: Sequence[WindowSource]) -> Iterator[subprocess.Popen[bytes]]:
     """The edges' process, at work."""
-    load = Load(plan, tuple(tuple(encode(window) for window in place.windows) for place in places))
+    load = LoadStart(plan, tuple(tuple(encode(window) for window in place.windows) for place in places))
     path = folder / "edges.load"
     path.write_bytes(encode_load(load))
     command = [sys.executable, "-m", "benchmarks.fleet.edges", str(path)]
@@ -141,8 +147,8 @@ def _edges(folder: Path, plan: Plan, places: Sequence[Place]) -> Iterator[subpro
                 process.kill()
 
 
-def _reported(edges: subprocess.Popen[bytes]) -> Report:
+def _reported(edges: subprocess.Popen[bytes]) -> LoadReport:
     said, complaint = edges.communicate()
     if edges.returncode != 0:
         raise RuntimeError(f"the edges failed: {complaint.decode(errors='replace').strip().splitlines()[-1:]}")
-    return msgspec.json.decode(said, type=Report)
+    return msgspec.json.decode(said, type=LoadReport)

@@ -1,4 +1,4 @@
-"""What stands ready before the clock starts: the twin's file, its table of proofs, a store that knows the servos."""
+"""Preparation of a bench: the twin's file, its table of certificates, a store with commissioned servos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.fleet.stock import BOOT, COMMISSIONED, RATE, Known, Place, commissioned
+from benchmarks.fleet.stock import BOOT, COMMISSIONED, RATE, CommissionedTwin, WindowSource, commissioned
 from servotwin.config.table import parse_toml
 from servotwin.messages import Hello, Setting, encode
 from servotwin.redesign.certified.lookup import Grid
@@ -55,8 +55,8 @@ every = {every}
 
 
 @dataclass(frozen=True)
-class Scale:
-    """How large a bench is.
+class FleetScale:
+    """Size of a bench.
 
     Attributes
     ----------
@@ -92,15 +92,15 @@ class Scale:
     proofs: float = 6.0
     every: int = 50
 
-    def full(self) -> Scale:
+    def full(self) -> FleetScale:
         """Five minutes, and an outage of ten."""
         return replace(self, steady=300.0, outage=600.0, after=600.0)
 
 
-QUICK = Scale(200, 20.0, 0.1, 3.0, 1.0, 2.0, 1.0, 2, 2, 1, 4)
+QUICK = FleetScale(200, 20.0, 0.1, 3.0, 1.0, 2.0, 1.0, 2, 2, 1, 4)
 
 
-def prove(folder: Path, scale: Scale) -> None:
+def prove(folder: Path, scale: FleetScale) -> None:
     """Write the table of proofs that every twin of the bench looks up."""
     text = _text(scale, enabled=True)
     (model,) = models_of(parse_toml(text, "twin.toml"), folder, checked=False)
@@ -108,14 +108,14 @@ def prove(folder: Path, scale: Scale) -> None:
         pass
 
 
-def write_file(folder: Path, scale: Scale, enabled: bool = True) -> ModelRegistry:
+def write_file(folder: Path, scale: FleetScale, enabled: bool = True) -> ModelRegistry:
     """Write the twin's file, beside the table; the fleet that it says."""
     text = _text(scale, enabled)
     (folder / "twin.toml").write_text(text, encoding="utf-8")
     return ModelRegistry.loads(text, "twin.toml", folder)
 
 
-def commission(folder: Path, fleet: ModelRegistry, scale: Scale, places: Sequence[Place]) -> int:
+def commission(folder: Path, fleet: ModelRegistry, scale: FleetScale, places: Sequence[WindowSource]) -> int:
     """A store in which every servo's twin knows it already; the version of the parameters that all run.
 
     One twin of each place learns; the others are told what it knows.
@@ -131,7 +131,7 @@ def commission(folder: Path, fleet: ModelRegistry, scale: Scale, places: Sequenc
     return version
 
 
-def _introduce(store: Store, numbers: range, scale: Scale, known: Sequence[Known]) -> None:
+def _introduce(store: Store, numbers: range, scale: FleetScale, known: Sequence[CommissionedTwin]) -> None:
     """Some servos say hello, and their twins know them."""
     now = time.time()
     states = {f"ax-{n:05d}": known[n % len(known)].state for n in numbers}
@@ -152,8 +152,8 @@ def _introduce(store: Store, numbers: range, scale: Scale, known: Sequence[Known
         raise RuntimeError("servos could not be commissioned")
 
 
-def _ages(scale: Scale, numbers: range) -> dict[str, int]:
-    """How many windows each has been glanced at since its last estimate, as if the bench had run for hours."""
+def _ages(scale: FleetScale, numbers: range) -> dict[str, int]:
+    """Number of glances of each servo since its last estimate, as if the bench had run for hours."""
     chance, since = random.Random(numbers.start), range(scale.every - 1)
     likely = [(1.0 - scale.news) ** count for count in since]
     return {f"ax-{n:05d}": chance.choices(since, likely)[0] for n in numbers}
@@ -172,6 +172,6 @@ def _hello(servo: str, now: float) -> Incoming:
     return Incoming(servo, MessageKind.LETTER, digest.hex(), body, "", digest, now)
 
 
-def _text(scale: Scale, enabled: bool) -> str:
+def _text(scale: FleetScale, enabled: bool) -> str:
     told = {"store": STORE, "table": TABLE, "workers": scale.workers, "proofs": scale.proofs, "every": scale.every}
     return _FILE.format(**told, enabled=str(enabled).lower())

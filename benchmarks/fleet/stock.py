@@ -31,7 +31,7 @@ COMMISSIONED = 10 * PERIOD
 """s of sample time, at which a servo joins the bench; its twin is told of the windows before."""
 
 
-class Place(NamedTuple):
+class WindowSource(NamedTuple):
     """One gap of the stock.
 
     Attributes
@@ -49,12 +49,12 @@ class Place(NamedTuple):
     windows: tuple[WindowMessage, ...]
 
 
-def stock(places: int, windows: int, seed: int = 0) -> list[Place]:
+def stock(places: int, windows: int, seed: int = 0) -> list[WindowSource]:
     """Steady loops at `places` gaps, `windows` (an even number) of each, with a bias and a little noise."""
     return [_place(number, windows, seed + number) for number in range(places)]
 
 
-def _place(number: int, windows: int, seed: int) -> Place:
+def _place(number: int, windows: int, seed: int) -> WindowSource:
     base = Scenario.preset("certified")
     gap = FIRST_GAP + number * GAP_STEP
     scenario = base.replace(
@@ -68,7 +68,7 @@ def _place(number: int, windows: int, seed: int) -> Place:
         name="axis",
     )
     found = cosimulate(scenario).windows
-    return Place(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
+    return WindowSource(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
 
 
 def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, version: int) -> WindowMessage:
@@ -85,14 +85,14 @@ def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, 
     )
 
 
-class Known(NamedTuple):
-    """What the twin of a servo knows that has been watched for a while, and the version of its parameters."""
+class CommissionedTwin(NamedTuple):
+    """State of the twin of a servo that has run for a while, and the version of its parameters."""
 
     state: TwinState
     version: int
 
 
-def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
+def commissioned(fleet: ModelRegistry, servo: str, place: WindowSource) -> CommissionedTwin:
     """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
     state, version = b"", 0
     learnt = (*place.first, *place.windows)[: SETTLED + 2]
@@ -106,7 +106,7 @@ def commissioned(fleet: ModelRegistry, servo: str, place: Place) -> Known:
         version = max([version, *(update.version for update in sent if isinstance(update, Update))])
         for asked in outcome.enqueue:
             state = work(fleet, _claim(servo, state, number, MessageKind.VERIFICATION, asked.body), start).state
-    return Known(msgspec.msgpack.decode(state, type=TwinState), version)
+    return CommissionedTwin(msgspec.msgpack.decode(state, type=TwinState), version)
 
 
 def _claim(servo: str, state: bytes, serial: int, kind: MessageKind, body: bytes) -> Lease:

@@ -1,4 +1,4 @@
-"""What the bench found, beside what was asked."""
+"""Results of the bench beside its targets."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.fleet.runs import Ran
-from benchmarks.fleet.setting import Scale
+from benchmarks.fleet.runs import FleetRun
+from benchmarks.fleet.setting import FleetScale
 from benchmarks.fleet.watch import EDGES, TWIN, WORKERS
 from benchmarks.report import cores, machine
 
@@ -19,7 +19,7 @@ ASKED_INGEST = 2000.0
 _MB = 1e6
 
 
-class Line(NamedTuple):
+class ReportLine(NamedTuple):
     """One line of the table."""
 
     what: str
@@ -27,56 +27,58 @@ class Line(NamedTuple):
     measured: str
 
 
-def lines(scale: Scale, alone: Ran, whole: Ran) -> Iterator[Line]:
+def lines(scale: FleetScale, alone: FleetRun, whole: FleetRun) -> Iterator[ReportLine]:
     """Everything, in the order of the issue's demands."""
     yield from _of_ingest(alone)
     yield from _of_cadence(scale, whole)
     yield from _of_outage(scale, whole)
     for role in ROLES:
         first, middle, most = (size / _MB for size in whole.watch.memory(role))
-        yield Line(f"memory of the {role}: first, half-way, most", "bounded", _numbers("MB", first, middle, most))
+        yield ReportLine(f"memory of the {role}: first, half-way, most", "bounded", _numbers("MB", first, middle, most))
 
 
-def _of_ingest(alone: Ran) -> Iterator[Line]:
+def _of_ingest(alone: FleetRun) -> Iterator[ReportLine]:
     told = alone.report
-    yield Line("windows/s committed, nobody estimates", f">= {ASKED_INGEST:g}", f"{told.windows / told.seconds:.0f}")
-    yield Line("... of bytes", "20 kB", f"{told.bytes / max(1, told.windows) / 1e3:.1f} kB")
-    yield Line("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
-    yield Line("... cores kept busy: edges, twin, workers", "2", _cores(alone))
+    yield ReportLine(
+        "windows/s committed, nobody estimates", f">= {ASKED_INGEST:g}", f"{told.windows / told.seconds:.0f}"
+    )
+    yield ReportLine("... of bytes", "20 kB", f"{told.bytes / max(1, told.windows) / 1e3:.1f} kB")
+    yield ReportLine("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
+    yield ReportLine("... cores kept busy: edges, twin, workers", "2", _cores(alone))
 
 
-def _of_cadence(scale: Scale, whole: Ran) -> Iterator[Line]:
+def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
     told, steady = whole.report, whole.steady
     seconds = 0.9 * scale.steady
-    yield Line(f"{scale.servos} servos, windows/s", f"{scale.rate:g}", f"{steady.windows / seconds:.0f}")
-    yield Line("... with news", f"{100.0 * scale.news:g} %", f"{100.0 * told.news / max(1, told.windows):.1f} %")
+    yield ReportLine(f"{scale.servos} servos, windows/s", f"{scale.rate:g}", f"{steady.windows / seconds:.0f}")
+    yield ReportLine("... with news", f"{100.0 * scale.news:g} %", f"{100.0 * told.news / max(1, told.windows):.1f} %")
     estimated, glances = whole.made.get("estimate", 0), max(1, whole.made.get("glance", 0))
-    yield Line("... estimated, the others glanced at", "", f"{100.0 * estimated / glances:.1f} %")
+    yield ReportLine("... estimated, the others glanced at", "", f"{100.0 * estimated / glances:.1f} %")
     proofs = whole.made.get("proof", 0)
-    yield Line("... updates, proofs by now", "", f"{whole.made.get('update', 0)}, {proofs}")
-    yield Line("... queue age: median, 99 %, most", "", _numbers("s", *steady.age))
-    yield Line("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
-    yield Line(
+    yield ReportLine("... updates, proofs by now", "", f"{whole.made.get('update', 0)}, {proofs}")
+    yield ReportLine("... queue age: median, 99 %, most", "", _numbers("s", *steady.age))
+    yield ReportLine("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
+    yield ReportLine(
         "... behind schedule at the edges: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.late))
     )
-    yield Line("... cores kept busy: edges, twin, workers", "2", _cores(whole))
+    yield ReportLine("... cores kept busy: edges, twin, workers", "2", _cores(whole))
     spent = [1e3 * whole.watch.spent(role) / max(1, told.windows) for role in ROLES]
     allowed = 1e3 * cores() / scale.rate
-    yield Line("... processor time per window: the same", f"< {allowed:.3g} ms", _numbers("ms", *spent))
+    yield ReportLine("... processor time per window: the same", f"< {allowed:.3g} ms", _numbers("ms", *spent))
 
 
-def _of_outage(scale: Scale, whole: Ran) -> Iterator[Line]:
-    yield Line(f"after {scale.outage:g} s without a link, windows behind", "", f"{whole.behind:.0f}")
+def _of_outage(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
+    yield ReportLine(f"after {scale.outage:g} s without a link, windows behind", "", f"{whole.behind:.0f}")
     if math.isnan(whole.drained):
-        yield Line("... worked off within", "drains", "not: more comes than can be worked on")
+        yield ReportLine("... worked off within", "drains", "not: more comes than can be worked on")
         return
-    yield Line("... worked off within", "drains", f"{whole.drained:.0f} s")
+    yield ReportLine("... worked off within", "drains", f"{whole.drained:.0f} s")
     came = scale.rate * min(whole.drained, scale.after)
     rate = (whole.behind + came) / max(whole.drained, 1.0)
-    yield Line("... windows/s worked on meanwhile", f"> {scale.rate:g}", f"{rate:.0f}")
+    yield ReportLine("... windows/s worked on meanwhile", f"> {scale.rate:g}", f"{rate:.0f}")
 
 
-def show(scale: Scale, alone: Ran, whole: Ran, console: Console) -> None:
+def show(scale: FleetScale, alone: FleetRun, whole: FleetRun, console: Console) -> None:
     """The table, and what it was measured on."""
     table = Table("what", "asked", "measured", box=None, pad_edge=False)
     for line in lines(scale, alone, whole):
@@ -87,14 +89,14 @@ def show(scale: Scale, alone: Ran, whole: Ran, console: Console) -> None:
     console.print(_says(whole), highlight=False)
 
 
-def _says(whole: Ran) -> str:
-    """What shares the machine with the twin."""
+def _says(whole: FleetRun) -> str:
+    """Sentence about the load that shares the machine with the twin."""
     spent = {role: whole.watch.spent(role) for role in ROLES}
     share = spent[EDGES] / max(1e-9, sum(spent.values()))
     return f"The edges are {100.0 * share:.0f} % of the processor time; they run on the same cores as the twin."
 
 
-def document(scale: Scale, alone: Ran, whole: Ran) -> dict[str, Any]:
+def document(scale: FleetScale, alone: FleetRun, whole: FleetRun) -> dict[str, Any]:
     """The same for machines to read."""
     return {
         "lines": [line._asdict() for line in lines(scale, alone, whole)],
@@ -110,7 +112,7 @@ def _sizes(used: dict[str, Any]) -> dict[str, float]:
     return {**memory, **{f"{role}_cpu_s": one.cpu for role, one in used.items()}}
 
 
-def _cores(ran: Ran) -> str:
+def _cores(ran: FleetRun) -> str:
     return ", ".join(f"{ran.watch.cores(role):.2f}" for role in ROLES)
 
 

@@ -1,4 +1,4 @@
-"""What is seen of a run while it goes on, from outside: times, memory, and how much waits."""
+"""Resource use during a run, seen from outside: processor time, memory, and the backlog."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from benchmarks.fleet.processes import Used, children, used
+from benchmarks.fleet.processes import ProcessUsage, children, used
 
 EDGES, TWIN, WORKERS = "edges", "twin", "workers"
 
 
-class Sample(NamedTuple):
+class ResourceSample(NamedTuple):
     """One look.
 
     Attributes
     ----------
     time : float
         s since the beginning.
-    used : dict of str to Used
+    used : dict of str to ProcessUsage
         By role: the edges, the twin's own process, its workers together.
     waiting : int
         Windows that are committed and not worked on.
@@ -28,13 +28,13 @@ class Sample(NamedTuple):
     """
 
     time: float
-    used: dict[str, Used]
+    used: dict[str, ProcessUsage]
     waiting: int
     age: float
 
 
 @dataclass
-class Watch:
+class ResourceWatch:
     """Looks at processes.
 
     Parameters
@@ -48,16 +48,16 @@ class Watch:
     twin: int
     edges: int
     waiting: Callable[[], tuple[int, float]]
-    samples: list[Sample] = field(default_factory=list)
+    samples: list[ResourceSample] = field(default_factory=list)
     _begin: float = field(default_factory=time.monotonic)
 
-    def look(self) -> Sample:
+    def look(self) -> ResourceSample:
         """Once."""
         workers = [found for pid in children(self.twin) if (found := used(pid))]
         roles = {EDGES: used(self.edges), TWIN: used(self.twin)}
         now = {role: found for role, found in roles.items() if found is not None}
-        now[WORKERS] = Used(sum(each.cpu for each in workers), sum(each.memory for each in workers))
-        sample = Sample(time.monotonic() - self._begin, now, *self.waiting())
+        now[WORKERS] = ProcessUsage(sum(each.cpu for each in workers), sum(each.memory for each in workers))
+        sample = ResourceSample(time.monotonic() - self._begin, now, *self.waiting())
         self.samples.append(sample)
         return sample
 
@@ -67,7 +67,7 @@ class Watch:
         return seen[-1] - seen[0]
 
     def cores(self, role: str) -> float:
-        """How many cores a role kept busy meanwhile."""
+        """Cores that a role kept busy meanwhile."""
         times = [sample.time for sample in self.samples if role in sample.used]
         return self.spent(role) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 

@@ -14,7 +14,7 @@ from servotwin.twin_service.worker import WorkerStart
 
 @dataclass(frozen=True)
 class TwinFile:
-    """What a twin runs on.
+    """Parsed twin's file.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class TwinFile:
 
     @property
     def start(self) -> WorkerStart:
-        """What a worker is told."""
+        """First message to a worker."""
         return WorkerStart(self.text, str(self.path), str(self.path.parent))
 
 

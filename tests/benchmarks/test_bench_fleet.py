@@ -16,31 +16,31 @@ from twin_messages import window_message
 from typer.testing import CliRunner
 
 from benchmarks.fleet import findings
-from benchmarks.fleet.edges import Fleet, Turn
-from benchmarks.fleet.line import Line
-from benchmarks.fleet.plan import Load, Plan, decode_load, encode_load, shares
-from benchmarks.fleet.processes import Used, children, used
-from benchmarks.fleet.runs import Ran
+from benchmarks.fleet.edges import EdgeLoad, EdgeTurn
+from benchmarks.fleet.line import HttpConnection
+from benchmarks.fleet.plan import LoadPlan, LoadStart, decode_load, encode_load, shares
+from benchmarks.fleet.processes import ProcessUsage, children, used
+from benchmarks.fleet.runs import FleetRun
 from benchmarks.fleet.setting import QUICK
 from benchmarks.fleet.stock import BOOT, readdressed
 from benchmarks.fleet.tables import lines
-from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, Sample, Watch
+from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, ResourceSample, ResourceWatch
 from servotwin.cli.app import app
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.store.records import Incoming, MessageKind
 from servotwin.store.store import open_store
 
-PLAN = Plan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
+PLAN = LoadPlan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
 
 
-def load(plan: Plan = PLAN, places: int = 2) -> Load:
+def load(plan: LoadPlan = PLAN, places: int = 2) -> LoadStart:
     made = tuple(tuple(encode(window_message(sequence=10 * p + k, start=5.0)) for k in range(2)) for p in range(places))
-    return Load(plan, made)
+    return LoadStart(plan, made)
 
 
-def fleet(plan: Plan = PLAN) -> Fleet:
-    return Fleet(load(plan), 0.0)
+def fleet(plan: LoadPlan = PLAN) -> EdgeLoad:
+    return EdgeLoad(load(plan), 0.0)
 
 
 # --- what is sent
@@ -57,11 +57,11 @@ def test_a_window_is_readdressed_and_stays_whole() -> None:
 
 def test_windows_fall_due_at_the_rate_and_no_more_than_the_plan_has() -> None:
     edges = fleet()
-    edges.fall_due(0.0)
+    edges.add_due(0.0)
     assert edges.waiting == 1
-    edges.fall_due(0.55)
+    edges.add_due(0.55)
     assert edges.waiting == 6
-    edges.fall_due(100.0)
+    edges.add_due(100.0)
     assert edges.waiting == 20
     taken = [edges.take(100.0) for _ in range(20)]
     assert [due for _, due in taken] == pytest.approx([0.1 * k for k in range(20)])
@@ -71,7 +71,7 @@ def test_windows_fall_due_at_the_rate_and_no_more_than_the_plan_has() -> None:
 
 def test_in_an_outage_windows_are_kept() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 1.5)))
-    edges.fall_due(1.0)
+    edges.add_due(1.0)
     assert edges.take(1.0) is None
     assert edges.waiting == 11
     assert edges.take(1.5) is not None
@@ -108,7 +108,7 @@ def test_updates_are_applied_once_and_answered() -> None:
     update = Update("ax-00001", 4, 3, ("boot-9", 100), 200.0, 0.1, 1e-3, (0.09, 0.11), "ok", Setting(0.0), 400.0)
     key = key_of(verifier_of(""))
     body = msgspec.msgpack.encode([seal(key, TO_EDGE, "ax-00001", serial, encode(update)) for serial in (5, 6)])
-    edges.heard(edge, body)
+    edges.apply_messages(edge, body)
     assert (edge.version, edge.serial, edges.counts.updates) == (4, 6, 1)
     (receipt,) = edge.receipts
     assert isinstance(receipt, Receipt)
@@ -131,7 +131,7 @@ def test_a_turn_polls_answers_and_sends() -> None:
     edge, told = edges.edges[0], []
     edge.receipts.append(Receipt("ax-00000", 3, True, 1, "applied", 3, "boot-9"))
     line = Spoken((200, b"\x90"), (202, b""), (201, b"\x90"))
-    turn = Turn(edges, line, asyncio.Event(), told)
+    turn = EdgeTurn(edges, line, asyncio.Event(), told)
     turn.begin(edge, 0.0)
     assert [what for what, _ in line.asked] == [
         "GET /v1/servos/ax-00000/outgoing?after=0&wait=0",
@@ -146,7 +146,7 @@ def test_a_turn_polls_answers_and_sends() -> None:
 @pytest.mark.parametrize(("status", "kept", "failures"), [(503, 1, 0), (429, 1, 0), (400, 0, 1), (500, 0, 1)])
 def test_what_is_put_off_is_kept_and_what_is_refused_ends_it(status: int, kept: int, failures: int) -> None:
     edges, told = fleet(), []
-    turn = Turn(edges, Spoken((status, b"")), asyncio.Event(), told)
+    turn = EdgeTurn(edges, Spoken((status, b"")), asyncio.Event(), told)
     turn.begin(edges.edges[0], 0.0)
     assert (edges.waiting, len(told), edges.counts.windows) == (kept, failures, 0)
     assert turn.done.is_set()
@@ -168,7 +168,7 @@ class Wire:
 @pytest.mark.parametrize("cut", range(1, 60, 7))
 def test_a_line_reads_answers_however_they_come(cut: int) -> None:
     broken, answers = [], []
-    line, wire = Line(broken.append), Wire()
+    line, wire = HttpConnection(broken.append), Wire()
     line._transport = wire
     assert not line.closed
     whole = b"HTTP/1.1 201 Created\r\ncontent-type: x\r\nContent-Length: 5\r\n\r\nhello"
@@ -207,13 +207,13 @@ def test_processes_are_seen_by_what_they_use() -> None:
     assert used(process.pid) is None
 
 
-def watched(*samples: Sample) -> Watch:
-    return Watch(1, 2, lambda: (0, 0.0), list(samples))
+def watched(*samples: ResourceSample) -> ResourceWatch:
+    return ResourceWatch(1, 2, lambda: (0, 0.0), list(samples))
 
 
 def test_cores_and_memory_of_a_role() -> None:
-    def at(time: float, cpu: float, memory: int) -> Sample:
-        return Sample(time, {EDGES: Used(cpu, memory)}, 0, 0.0)
+    def at(time: float, cpu: float, memory: int) -> ResourceSample:
+        return ResourceSample(time, {EDGES: ProcessUsage(cpu, memory)}, 0, 0.0)
 
     watch = watched(at(0.0, 1.0, 10), at(1.0, 1.2, 30), at(4.0, 3.0, 20))
     assert watch.cores(EDGES) == pytest.approx(0.5)
@@ -245,7 +245,7 @@ def test_the_store_tells_how_long_windows_waited(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_small_fleet_with_real_processes(tmp_path: Path, monkeypatch) -> None:
-    kept: list[Ran] = []
+    kept: list[FleetRun] = []
     monkeypatch.setattr(
         "benchmarks.fleet.command.show", lambda _scale, alone, whole, _console: kept.extend((alone, whole))
     )

@@ -83,7 +83,9 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
 
         lender.acquire = one_by_one
         running = asyncio.create_task(dispatcher.run())
-        await asyncio.wait_for(lender.through.wait(), 30.0)
+        through = asyncio.create_task(lender.through.wait())
+        await asyncio.wait({through, running}, timeout=30.0, return_when=asyncio.FIRST_COMPLETED)
+        assert through.done() or running.result()  # the dispatcher ended: raise what ended it
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         await dispatcher.stop()
