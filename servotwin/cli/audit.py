@@ -1,4 +1,4 @@
-"""`servotwin audit`: the evidence chain of a servo, asked of a twin's store or of its service."""
+"""`servotwin audit` and `servos`: the evidence chain of a servo, from a twin's store or its service."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 
 import msgspec
 
-from servotwin.cli.audit_text import SERVOS, Told, lines_of, servo_line
+from servotwin.cli.audit_report import SERVOS, JsonObject, lines_of, servo_line
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
 from servotwin.twin_service.auth import read_secret
@@ -25,12 +25,12 @@ from servotwin.twin_service.twin_file import service_of
 
 TIMEOUT_S = 30.0
 BEFORE_S = 60.0
-"""Of what belongs to no window, so much is shown from before the first one."""
+"""Events of no window are shown from this long before the first window, s."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Whom to ask: the store of a twin's file, or, where there is a URL, a service.
+    """Source of the evidence: the store of a twin's file, or, where there is a URL, a service.
 
     Attributes
     ----------
@@ -48,12 +48,12 @@ class Source:
     ca: Path | None = None
 
 
-class Story(NamedTuple):
-    """What is known of a servo, as the API tells it: as it stands, its windows, what belongs to none."""
+class ServoEvidence(NamedTuple):
+    """A servo, its windows and the events of no window, as the API returns them."""
 
-    servo: Told
-    links: list[Told]
-    events: list[Told]
+    servo: JsonObject
+    links: list[JsonObject]
+    events: list[JsonObject]
 
 
 def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> None:
@@ -73,7 +73,7 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     Raises
     ------
     InvalidInput
-        Nothing is known of the servo, or whoever should know cannot be asked.
+        No window of the servo is stored, or the source cannot be read.
     """
     story = _of_store(servo, source.config, limit) if source.url is None else _of_service(servo, source, limit)
     if not story.links:
@@ -86,12 +86,12 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
 
 
 def servos(source: Source, json: bool) -> None:
-    """Print every servo that was heard of, at a glance.
+    """Print every servo that has sent a message.
 
     Raises
     ------
     InvalidInput
-        Whoever should know cannot be asked.
+        The source cannot be read.
     """
     if source.url is not None:
         ask = _asking(source)
@@ -110,35 +110,37 @@ def servos(source: Source, json: bool) -> None:
         print(servo_line(each))
 
 
-def _pages(page: Callable[[str], list[Told]]) -> list[Told]:
+def _pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
     """All servos; a page holds those after a name."""
-    found: list[Told] = []
+    found: list[JsonObject] = []
     while more := page(found[-1]["servo"] if found else ""):
         found += more
     return found
 
 
-def _of_store(servo: str, config: Path, limit: int) -> Story:
+def _of_store(servo: str, config: Path, limit: int) -> ServoEvidence:
     store = open_existing_store(service_of(config))
     try:
         links, found = store.audit(servo, limit=limit), store.servo(servo)
         if found is None or not links:
-            return Story({}, [], [])
+            return ServoEvidence({}, [], [])
         events = store.events(servo, _since(links[-1].window.received), MAX_ROWS)
-        return Story(
+        return ServoEvidence(
             found._asdict(), [trace_as_json(link) for link in links], [evidence_as_json(each) for each in events]
         )
     finally:
         store.close()
 
 
-def _of_service(servo: str, source: Source, limit: int) -> Story:
+def _of_service(servo: str, source: Source, limit: int) -> ServoEvidence:
     ask, name = _asking(source), quote(servo, safe="")
     links = ask(f"/v1/servos/{name}/audit?limit={limit}")
     if not links:
-        return Story({}, [], [])
+        return ServoEvidence({}, [], [])
     since = _since(links[-1]["window"]["received"])
-    return Story(ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}"))
+    return ServoEvidence(
+        ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
+    )
 
 
 def _since(oldest: float) -> float:
@@ -147,7 +149,7 @@ def _since(oldest: float) -> float:
 
 
 def _asking(source: Source) -> Callable[[str], Any]:
-    """Asks the service for JSON; raises InvalidInput."""
+    """Function that requests JSON from the service; raises InvalidInput."""
     url, headers = str(source.url).rstrip("/"), {}
     if not _is_address(url):
         raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
@@ -157,7 +159,7 @@ def _asking(source: Source) -> Callable[[str], Any]:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
     # What goes to this machine itself goes through no proxy: it would read the token.
     way = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
-    opener = build_opener(_Stay, way)
+    opener = build_opener(_NoRedirect, way)
 
     def ask(path: str) -> Any:
         try:
@@ -179,11 +181,11 @@ def _is_address(url: str) -> bool:
         return False
 
 
-class _Stay(HTTPRedirectHandler):
-    """Goes nowhere else: the token is for this service alone."""
+class _NoRedirect(HTTPRedirectHandler):
+    """Follows no redirect: the token is for this service alone."""
 
     def redirect_request(self, *_args: Any) -> None:
-        """Nothing: the answer that says where to go is a refusal."""
+        """Follow none: a redirect is a refusal."""
 
 
 def _context(ca: Path | None) -> ssl.SSLContext:
@@ -194,7 +196,7 @@ def _context(ca: Path | None) -> ssl.SSLContext:
 
 
 def _refusal(error: HTTPError) -> str:
-    """What a refusal says."""
+    """Reason in a refusing response."""
     with error:
         try:
             return str(jsons.load(error)["detail"])

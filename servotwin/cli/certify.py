@@ -1,4 +1,4 @@
-"""`servotwin certify`: settings proved beforehand, cell by cell, for the twins that look them up."""
+"""`servotwin certify`: verify settings beforehand, cell by cell, for twins that look them up."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from servotwin.twin.settings import TwinSettings
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A table to be proved: for which model, with which policy, into which file."""
+class TableJob:
+    """A table to verify: name of its model, policy and file."""
 
     name: str
     policy: CertifiedPolicy
@@ -39,7 +39,7 @@ def certify(
     grid: Grid | None = None,
     console: Console | None = None,
 ) -> tuple[CertifiedTable, ...]:
-    """Prove the tables that a twin's file or a scenario names, or go on with them.
+    """Verify the tables that a twin's file or a scenario names, or go on with them.
 
     Parameters
     ----------
@@ -55,13 +55,13 @@ def certify(
     Raises
     ------
     InvalidInput
-        There is nothing to be proved, a file belongs to another model or grid or cannot be written, or there is no
+        There is nothing to verify, a file belongs to another model or grid or cannot be written, or there is no
         fallback set.
     KeyboardInterrupt
         With a sentence on what is finished and how to go on.
     """
     console = console or Console()
-    return tuple(_proved(wanted, grid or Grid(), console) for wanted in _wanted(file, model, out))
+    return tuple(_verified(job, grid or Grid(), console) for job in _jobs(file, model, out))
 
 
 def grid_of(finest_deg: float, bias_mv: str, noise_um: str) -> Grid:
@@ -83,8 +83,8 @@ def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:
         raise InvalidInput(f"{option} {text!r}: give VALUE,VALUE,...") from None
 
 
-def _wanted(file: Path, model: str | None, out: Path | None) -> list[Wanted]:
-    """What a file asks for."""
+def _jobs(file: Path, model: str | None, out: Path | None) -> list[TableJob]:
+    """Tables that a file names."""
     table = read_toml(file)
     known = _described(table, file)
     if model is not None and model not in known:
@@ -111,38 +111,38 @@ def _described(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 
-def _one(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> Wanted:
+def _one(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> TableJob:
     if settings.policy != "certified":
-        raise InvalidInput(f"model {name!r}: policy {settings.policy!r} proves nothing; only 'certified' does")
-    return Wanted(name, certified_policy(servo, settings), out or Path(settings.table or ""))
+        raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
+    return TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
 
 
-def _proved(wanted: Wanted, grid: Grid, console: Console) -> CertifiedTable:
+def _verified(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
     """One table, under a progress bar."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     done = total = 0
     try:
         with (
             Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress,
-            closing(build(wanted.path, wanted.policy, grid)) as steps,
+            closing(build(job.path, job.policy, grid)) as steps,
         ):
-            bar = progress.add_task(f"proving {wanted.name}", total=None)
+            bar = progress.add_task(f"verifying {job.name}", total=None)
             for done, total in steps:
                 progress.update(bar, completed=done, total=total)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted: {done} of {total} cells are in {wanted.path}; the same command goes on from there"
+            f"interrupted: {done} of {total} cells are in {job.path}; the same command goes on from there"
         ) from None
-    found = load(wanted.path, wanted.policy)
-    console.print(_summary(wanted, found), soft_wrap=True, highlight=False)
+    found = load(job.path, job.policy)
+    console.print(_summary(job, found), soft_wrap=True, highlight=False)
     return found
 
 
-def _summary(wanted: Wanted, found: CertifiedTable) -> str:
+def _summary(job: TableJob, found: CertifiedTable) -> str:
     shares = Counter(cell is not None for cell in found.cells.values())
     settings = {cell.setting for cell in found.cells.values() if cell is not None}
     low, high = (math.degrees(gap) for gap in found.stated)
     return (
-        f"written: {wanted.path}: {shares[True]} of {len(found.cells)} cells of gaps from {low:g} to {high:g} deg are"
-        f" proved, with {len(settings)} different settings; where none is, the fallback set is sent"
+        f"written: {job.path}: {shares[True]} of {len(found.cells)} cells of gaps from {low:g} to {high:g} deg are"
+        f" verified, with {len(settings)} different settings; in the others the twin sends the fallback set"
     )

@@ -39,7 +39,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class DemoStep:
     """One step alone, with the published twin and with the certified one; what the twins made of its window."""
 
     number: int
@@ -77,7 +77,7 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
     published, certified = scenarios(preset)
     files.make_directory(out)
     found = compare(published, certified, console)
-    rows = verdicts(found)
+    rows = demo_steps(found)
     _tell(rows, console)
     with style.look():
         vector = style.save(plot(found), out, NAME)
@@ -114,12 +114,12 @@ def compare(published: st.Scenario, certified: st.Scenario, console: Console) ->
         return Comparison(published.servo, *runs)
 
 
-def verdicts(found: Comparison) -> list[Verdict]:
+def demo_steps(found: Comparison) -> list[DemoStep]:
     """One row per step; the estimates are those from that step's window."""
     steps = zip(found.alone.trace.steps, found.published.trace.steps, found.twinned.trace.steps, strict=True)
     estimates = zip(found.published.estimates, found.twinned.estimates, strict=True)
     parts = enumerate(zip(steps, estimates, strict=True), start=1)
-    return [Verdict(i, *three, *two, abs(three[2].bias) + three[2].amplitude) for i, (three, two) in parts]
+    return [DemoStep(i, *three, *two, abs(three[2].bias) + three[2].amplitude) for i, (three, two) in parts]
 
 
 def plot(found: Comparison) -> Figure:
@@ -144,10 +144,10 @@ HEADS = (
     "off by, um",
 )
 MORE = ("published: estimate, deg",)
-SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "proved on", "settled", "worst error, um", "Ms")
+SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled", "worst error, um", "Ms")
 
 
-def cells(row: Verdict) -> tuple[str, ...]:
+def cells(row: DemoStep) -> tuple[str, ...]:
     """A verdict as texts, in the order of `HEADS`."""
     swings = (f"{word(step)} {step.amplitude * MM:.3f}" for step in (row.alone, row.published, row.twinned))
     truth = f"{math.degrees(row.estimate.truth):.2f}"
@@ -169,11 +169,11 @@ def _estimate(one: EstimateRecord) -> str:
 
 
 def word(step: MeasuredStep) -> str:
-    """Whether a step came to rest."""
+    """Verdict on a step: it rests or it swings."""
     return "rests" if step.settled else "swings"
 
 
-def summary(rows: Sequence[Verdict]) -> tuple[str, str]:
+def summary(rows: Sequence[DemoStep]) -> tuple[str, str]:
     """One sentence on the servo, one on the estimates."""
     alone, published, twinned = (
         sum(getattr(row, n).settled for row in rows) for n in ("alone", "published", "twinned")
@@ -183,19 +183,19 @@ def summary(rows: Sequence[Verdict]) -> tuple[str, str]:
 
 
 def _accuracy(estimates: Sequence[EstimateRecord]) -> str:
-    """How many estimates were made, and how far they are off at most."""
+    """Number of estimates, and their largest error."""
     errors = [abs(math.degrees(one.error)) for one in estimates if one.ok]
     worst = f", off by {max(errors):.2g} deg at most" if errors else ""
     return f"Estimates from {len(errors)} of {len(estimates)} windows{worst}."
 
 
 def definition() -> str:
-    """What settled means."""
+    """Definition of settled."""
     share, length = f"{100 * SETTLED:g} % of 1 mm", f"{TAIL:g} s"
     return f"A step settles, and rests, when its swing, half the peak-to-peak over the last {length}, is below {share}."
 
 
-def _tell(rows: Sequence[Verdict], console: Console) -> None:
+def _tell(rows: Sequence[DemoStep], console: Console) -> None:
     table = Table(*(head.replace(", ", "\n") for head in HEADS), box=None, pad_edge=False)
     for row in rows:
         table.add_row(*(_colored(cell) for cell in cells(row)))
@@ -211,12 +211,12 @@ def _colored(cell: str) -> str:
     return cell
 
 
-def _report(found: Comparison, rows: Sequence[Verdict], vector: bytes, preset: str) -> str:
+def _report(found: Comparison, rows: Sequence[DemoStep], vector: bytes, preset: str) -> str:
     caption = (
         f"Preset {preset}: a square wave of ±1 mm while the gap wears from 0 to 20 deg in 200 s, with a bias of "
         f"{BIAS * MM:g} mV on the motor's input. (a) The servo's own controller; (b) the paper's twin: after each step "
         "a dead zone as wide as the gap it estimates; (c) the certified twin: the loop begins on a setting that is "
-        "proved for every gap of the stated range, and gets the settings proved for what the twin has learnt; (d) the "
+        "verified for every gap of the stated range, and gets settings verified for what the twin has learnt; (d) the "
         "gap and the certified twin's estimates."
     )
     published = _accuracy([row.published_estimate for row in rows]).replace(
@@ -230,10 +230,11 @@ def _report(found: Comparison, rows: Sequence[Verdict], vector: bytes, preset: s
             page.figure(vector, "The same servo three times.", caption),
             "<h2>Step by step</h2>",
             page.table((*HEADS, *MORE), [(*cells(row), _estimate(row.published_estimate)) for row in rows]),
-            f"<p>Off by: what is left of the error in the end, at most. {escape(published)}</p>",
+            f"<p>Off by: largest error that remains at the end of the step. {escape(published)}</p>",
             "<h2>What the certified twin sent</h2>",
             page.table(SENT, [sent(update, found.servo) for update in found.twinned.updates]),
-            "<p>Gains in the servo's own; tried on machines that model and estimate allow.</p>",
+            "<p>Gains are relative to the servo's own. Each setting was verified on simulated machines within the "
+            "uncertainty of model and estimate.</p>",
             "<p class='soft small'>Every figure and claim of the paper: <code>servotwin reproduce</code>.</p>",
         ],
     )

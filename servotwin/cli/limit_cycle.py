@@ -23,7 +23,7 @@ _SAME = 1e-6
 
 @dataclass(frozen=True)
 class Findings:
-    """What the command found.
+    """Findings of the command.
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ BAD = (OTHER, UNREADABLE)
 
 
 class Again(NamedTuple):
-    """What came of one window.
+    """Result of estimating one window again.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ def replayed(store: Store, servo: str, model: ServoModel | None, only: tuple[str
 
 
 def summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
-    """How many of which, and what differs since."""
+    """Counts by result, and what differs since."""
     lines = [f"servo {servo}: {_windows(sum(counts.values()))}"]
     lines += [f"  {number:6d} {result}" for result, number in counts.most_common()]
     lines += [f"  otherwise since {_windows(number)}: {part}" for part, number in sorted(differing.items())]

@@ -1,4 +1,4 @@
-"""Commands that simulate, estimate and measure, each on what it is given."""
+"""Commands that simulate, estimate and measure."""
 
 from __future__ import annotations
 
@@ -11,22 +11,26 @@ from servotwin.errors import InvalidInput
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Where the report goes.")] = Path("servotwin-demo"),
+    out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("servotwin-demo"),
     preset: Annotated[str, typer.Option(help="paper, table1 or paper-gain2.")] = "paper",
 ) -> None:
-    """A servo wears out twice: once alone, once watched over by its twin."""
+    """Simulate a servo that wears out: alone, with the published twin and with the certified twin."""
     from servotwin.cli.demo import demo as run
 
     run(out, preset)
 
 
 def reproduce(
-    only: Annotated[list[str] | None, typer.Option(help="Only these figures and claims: fig12, crossover ...")] = None,
-    out: Annotated[Path, typer.Option(help="Where figures, claims.json and report.html go.")] = Path("reproduction"),
-    preset: Annotated[str, typer.Option(help="The preset of the figures; claims are measured in all three.")] = "paper",
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only these figures and claims, such as fig12 or crossover.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the figures, claims.json and report.html.")] = Path(
+        "reproduction"
+    ),
+    preset: Annotated[str, typer.Option(help="Preset of the figures; claims are measured in all three.")] = "paper",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
 ) -> None:
-    """Every figure and claim of the paper beside what we measure."""
+    """Reproduce every figure and claim of the paper beside our measurements."""
     from servotwin.reproduction.reproduce import reproduce as run
 
     run(out, only=tuple(only or ()), preset=preset, workers=workers)

@@ -22,7 +22,7 @@ _FAR = 1e3
 
 
 @dataclass(frozen=True)
-class Request:
+class TuneOptions:
     """The command's arguments, in its units."""
 
     servo: str
@@ -36,7 +36,7 @@ class Request:
     c: float | None
 
 
-def tell(request: Request, as_json: bool) -> None:
+def tell(request: TuneOptions, as_json: bool) -> None:
     """The command: a table, or one JSON object, on the standard output."""
     servo = Servo.resolve(request.servo)
     servo = servo.replace(sample_rate=None)

@@ -30,7 +30,7 @@ from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Sett
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
-from servotwin.simulation.splice import shifted
+from servotwin.simulation.inputs import shifted
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.step import TwinModel

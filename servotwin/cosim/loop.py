@@ -1,4 +1,4 @@
-"""What a co-simulation returns: the trajectory, and everything that crossed the link."""
+"""Result of a co-simulation: the trajectory, and everything that crossed the link."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class Transmission:
 
     @property
     def message(self) -> Message:
-        """What the bytes say."""
+        """The decoded message."""
         return decode(self.data)
 
 
 @dataclass(frozen=True, repr=False)
 class Loop:
-    """What a co-simulation returns.
+    """Result of a co-simulation.
 
     Attributes
     ----------
@@ -120,12 +120,12 @@ class Loop:
 
     @property
     def trend(self) -> Trend | None:
-        """What is known of the wear in the end."""
+        """Gap and wear rate at the end; None before the first accepted estimate."""
         return self.trends[-1] if self.trends else None
 
     @property
     def until_limit(self) -> Passage | None:
-        """How long after `trend.time` the gap reaches the scenario's `gap_limit`; None without limit or trend."""
+        """Time from `trend.time` until the gap reaches the scenario's `gap_limit`; None without limit or trend."""
         limit = self.scenario.twin.gap_limit
         return None if limit is None or self.trend is None else self.trend.time_until(limit)
 

@@ -7,7 +7,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import Simulation, simulate
-from servotwin.simulation.endless import FOREVER, Endless, first_stretch
+from servotwin.simulation.endless import FOREVER, UnboundedSimulation, first_stretch
 
 
 def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
@@ -16,7 +16,7 @@ def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
     return _simulation(scenario, scenario.servo if plant is None else plant)
 
 
-def endless(scenario: Scenario, keep: int) -> Endless:
+def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
     """The same, running on after the scenario's end and remembering `keep` samples.
 
     Raises
@@ -26,7 +26,7 @@ def endless(scenario: Scenario, keep: int) -> Endless:
     """
     if scenario.law.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a machine that runs on needs a rate in Hz")
-    return Endless(_simulation(scenario, scenario.servo, keep), scenario.reference)
+    return UnboundedSimulation(_simulation(scenario, scenario.servo, keep), scenario.reference)
 
 
 def compile_ahead(scenario: Scenario) -> None:

@@ -1,4 +1,4 @@
-"""What sending windows as int16 does to the estimates that are made from them."""
+"""Effect of the int16 channels of messages on the estimates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from servotwin.twin.wear import Expectation
 
 @dataclass(frozen=True)
 class Quantisation:
-    """What the int16 channels of one window did to its estimate.
+    """Effect of the int16 channels of one window on its estimate.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Quantisation:
 
 
 def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
-    """What sending int16 did to each estimate: every window is estimated once more from the unquantised samples.
+    """Effect of the int16 channels on each estimate: every window is estimated again from the unquantised samples.
 
     Both estimates start from the same previous gap, that of the window before (as the twin does while windows arrive in
     order).

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from servotwin.edge.guard import Instant
 from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
-from servotwin.messages import Answer, LongerWindow, Outcome, Probe, Request
+from servotwin.messages import Answer, LongerWindow, Probe, Request, RequestOutcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +67,10 @@ def decide(
         return RequestDecision(state, state.answer)
     outcome = _judge(request, state, settings, here, at_rest)
     answer = Answer(here.servo, here.boot, request.serial, here.sample, outcome, state.newest)
-    if outcome.passing or not _is_for(request, here) or outcome is Outcome.DUPLICATE:
+    if outcome.passing or not _is_for(request, here) or outcome is RequestOutcome.DUPLICATE:
         return RequestDecision(state, answer)
     state = replace(state, answer=Answer(here.servo, here.boot, request.serial, here.sample, outcome, request.serial))
-    state = _grant(request, state, settings, here) if outcome is Outcome.TAKEN else state
+    state = _grant(request, state, settings, here) if outcome is RequestOutcome.TAKEN else state
     assert state.answer is not None
     return RequestDecision(state, state.answer)
 
@@ -80,39 +80,43 @@ def _is_for(request: Request, here: Instant) -> bool:
     return request.servo == here.servo and request.boot == here.boot
 
 
-def _judge(request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool) -> Outcome:
+def _judge(
+    request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+) -> RequestOutcome:
     checks = (
-        (request.servo == here.servo, Outcome.WRONG_SERVO),
-        (request.boot == here.boot, Outcome.OTHER_BOOT),
-        (request.serial > state.newest, Outcome.DUPLICATE),
-        (here.time < request.not_after, Outcome.EXPIRED),
+        (request.servo == here.servo, RequestOutcome.WRONG_SERVO),
+        (request.boot == here.boot, RequestOutcome.OTHER_BOOT),
+        (request.serial > state.newest, RequestOutcome.DUPLICATE),
+        (here.time < request.not_after, RequestOutcome.EXPIRED),
     )
-    outcome = next((outcome for passed, outcome in checks if not passed), Outcome.TAKEN)
-    if outcome is not Outcome.TAKEN:
+    outcome = next((outcome for passed, outcome in checks if not passed), RequestOutcome.TAKEN)
+    if outcome is not RequestOutcome.TAKEN:
         return outcome
     if isinstance(request.ask, LongerWindow):
         return _judge_window(request.ask, settings)
     return _judge_probe(request.ask, state, settings, here, at_rest)
 
 
-def _judge_window(ask: LongerWindow, settings: AgentSettings) -> Outcome:
+def _judge_window(ask: LongerWindow, settings: AgentSettings) -> RequestOutcome:
     longest, earliest = settings.longest_samples, settings.longest_pre_trigger_samples
     window, before = (round(seconds * settings.sample_rate) for seconds in (ask.window_s, ask.pre_trigger_s))
-    return Outcome.TAKEN if window <= longest and before <= earliest else Outcome.TOO_LARGE
+    return RequestOutcome.TAKEN if window <= longest and before <= earliest else RequestOutcome.TOO_LARGE
 
 
-def _judge_probe(ask: Probe, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool) -> Outcome:
+def _judge_probe(
+    ask: Probe, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+) -> RequestOutcome:
     limits = settings.probe
     if limits is None:
-        return Outcome.NOT_ALLOWED
+        return RequestOutcome.NOT_ALLOWED
     move = ProbingMove.of(ask, here.sample, here.rate)
     checks = (
-        (abs(ask.size) <= limits.size, Outcome.TOO_LARGE),
-        (state.pre_trigger + move.last - move.first <= settings.longest_samples, Outcome.TOO_LARGE),
-        (_rested(state, limits, here), Outcome.TOO_SOON),
-        (at_rest and state.probe is None, Outcome.BUSY),
+        (abs(ask.size) <= limits.size, RequestOutcome.TOO_LARGE),
+        (state.pre_trigger + move.last - move.first <= settings.longest_samples, RequestOutcome.TOO_LARGE),
+        (_rested(state, limits, here), RequestOutcome.TOO_SOON),
+        (at_rest and state.probe is None, RequestOutcome.BUSY),
     )
-    return next((outcome for passed, outcome in checks if not passed), Outcome.TAKEN)
+    return next((outcome for passed, outcome in checks if not passed), RequestOutcome.TAKEN)
 
 
 def _rested(state: RequestState, limits: ProbeLimits, here: Instant) -> bool:

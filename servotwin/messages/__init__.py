@@ -1,5 +1,4 @@
-"""What crosses the link, as bytes: windows, receipts, answers and hellos to the twin; updates, requests and
-acknowledgements to the edge.
+"""Messages between edge and twin: windows, receipts, answers and hellos up; updates, requests, acknowledgements down.
 
 MessagePack with a tag that carries the schema's version ("window/1"); an unknown tag is refused, unknown fields of a
 known tag are ignored. A window's channels are planar int16 with a scale and an offset each. Parameter messages may be
@@ -7,17 +6,47 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 """
 
 from servotwin.messages.channels import FINE, Channel, checksum, pack_channel, pack_finely, unpack_channel
-from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, finite
+from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
-from servotwin.messages.refusals import Refusal
-from servotwin.messages.requests import Answer, Ask, LongerWindow, Outcome, Probe, Request
+from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome
 from servotwin.messages.setting import Band, Gains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
 from servotwin.messages.windows import Acknowledge, Hello, WindowMessage
 
 __all__ = [
-    "FINE", "MAX_BYTES", "NAME_PATTERN", "Acknowledge", "Answer", "Ask", "Band", "Cause", "Channel", "Fallback",
-    "Gains", "Hello", "InvalidMessage", "LongerWindow", "Message", "Outcome", "ParameterMessage", "Probe", "Reason",
-    "Receipt", "Refusal", "Request", "Setting", "Update", "Verification", "WindowMessage", "checksum", "decode",
-    "decode_json", "encode", "encode_json", "finite", "pack_channel", "pack_finely", "unpack_channel",
+    "FINE",
+    "MAX_BYTES",
+    "NAME_PATTERN",
+    "Acknowledge",
+    "Answer",
+    "Ask",
+    "Band",
+    "Cause",
+    "Channel",
+    "Fallback",
+    "Gains",
+    "Hello",
+    "InvalidMessage",
+    "LongerWindow",
+    "Message",
+    "ParameterMessage",
+    "Probe",
+    "Reason",
+    "Receipt",
+    "Refusal",
+    "Request",
+    "RequestOutcome",
+    "Setting",
+    "Update",
+    "Verification",
+    "WindowMessage",
+    "checksum",
+    "decode",
+    "decode_json",
+    "encode",
+    "encode_json",
+    "finite",
+    "pack_channel",
+    "pack_finely",
+    "unpack_channel",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from msgspec import Struct
 from servotwin.messages.checks import InvalidMessage, Name, Text, all_finite, require
 
 FINE = "_fine"
-"""The name of a channel ends with this where it holds what the rounding of another one left."""
+"""Suffix of a channel that holds the rounding errors of another one."""
 _LOWEST, _STEPS = -32768, 65535
 
 
@@ -79,9 +79,9 @@ def pack_channel(name: str, unit: str, samples: Iterable[float]) -> Channel:
 
 
 def pack_finely(name: str, unit: str, samples: Iterable[float]) -> tuple[Channel, Channel]:
-    """The channel as `pack_channel` packs it, and what the rounding left as a second one, `name` + `FINE`.
+    """Pack a channel as `pack_channel` does, and its rounding errors as a second one, `name` + `FINE`.
 
-    Who does not know the second one loses what the rounding always lost.
+    A reader that ignores the second one has the usual resolution.
     """
     values = samples if isinstance(samples, array) else array("d", samples)
     coarse = pack_channel(name, unit, values)

@@ -1,12 +1,11 @@
-"""What every message is checked against."""
+"""Checks of messages, and the codes under which they are refused."""
 
 from collections.abc import Iterable
+from enum import StrEnum
 from math import isfinite
 from typing import Annotated
 
 from msgspec import Meta
-
-from servotwin.messages.refusals import Refusal
 
 NAME_PATTERN = r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z"
 Name = Annotated[str, Meta(pattern=NAME_PATTERN)]
@@ -14,8 +13,35 @@ Text = Annotated[str, Meta(max_length=256)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 
 
+class Refusal(StrEnum):
+    """Reason code of a message that the twin refused, in answers, metrics and the edge's counts."""
+
+    TOO_LARGE = "too_large"
+    NOT_UNDERSTOOD = "not_understood"
+    UNKNOWN_SCHEMA = "unknown_schema"
+    BAD_CHECKSUM = "bad_checksum"
+    OTHER_NAME = "other_name"
+    CONFLICT = "conflict"
+    UNKNOWN_SERVO = "unknown_servo"
+    BAD_TOKEN = "bad_token"
+    FUTURE = "future"
+    TOO_MANY = "too_many"
+    UNAVAILABLE = "unavailable"
+
+    @property
+    def passing(self) -> bool:
+        """True where the same message may be taken later: the edge keeps it; otherwise it drops and counts it."""
+        return self in (
+            Refusal.BAD_TOKEN,
+            Refusal.FUTURE,
+            Refusal.TOO_MANY,
+            Refusal.UNAVAILABLE,
+            Refusal.UNKNOWN_SERVO,
+        )
+
+
 class InvalidMessage(ValueError):
-    """A message that must not be used, and what is wrong with it.
+    """A message that must not be used, with the reason.
 
     Parameters
     ----------
@@ -30,16 +56,16 @@ class InvalidMessage(ValueError):
 
 
 def finite(value: float) -> float | None:
-    """`value`, or None (unknown, unbounded) when it is not finite: how estimates are written into an update."""
+    """`value`, or None (unknown, unbounded) when it is not finite, as messages carry it."""
     return value if isfinite(value) else None
 
 
 def all_finite(values: Iterable[float]) -> bool:
-    """Whether none is infinite or NaN."""
+    """True where none is infinite or NaN."""
     return all(map(isfinite, values))
 
 
 def require(condition: bool, otherwise: str, refusal: Refusal = Refusal.NOT_UNDERSTOOD) -> None:
-    """InvalidMessage with that text and code unless the condition holds."""
+    """Raise InvalidMessage with that text and code unless the condition holds."""
     if not condition:
         raise InvalidMessage(otherwise, refusal)

@@ -1,19 +1,18 @@
-"""Messages to bytes and back, with every way in which bytes can be wrong turned into InvalidMessage."""
+"""Encoding and decoding of messages; anything wrong with the bytes raises InvalidMessage."""
 
 from typing import TypeVar, get_args
 
 import msgspec
 
 from servotwin.messages.channels import checksum
-from servotwin.messages.checks import InvalidMessage, require
+from servotwin.messages.checks import InvalidMessage, Refusal, require
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
-from servotwin.messages.refusals import Refusal
 from servotwin.messages.requests import Answer, Request
 from servotwin.messages.updates import Fallback, Receipt, Update
 from servotwin.messages.windows import Acknowledge, Hello, WindowMessage
 
 MAX_BYTES = 4 * 1024 * 1024
-"""Largest message that is looked at: 1 s of four channels at 5 kHz takes 40 kB."""
+"""Largest message that is decoded: 1 s of four channels at 5 kHz takes 40 kB."""
 
 ParameterMessage = Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge
 Message = WindowMessage | ParameterMessage
@@ -21,7 +20,7 @@ _Decoded = TypeVar("_Decoded")
 
 
 class _Tagged(msgspec.Struct):
-    """What every message has."""
+    """Tag of a message."""
 
     type: str
 
@@ -35,12 +34,12 @@ _json_decoder: msgspec.json.Decoder[ParameterMessage] = msgspec.json.Decoder(Par
 
 
 def encode(message: Message) -> bytes:
-    """The bytes that are sent (MessagePack)."""
+    """Encode a message as it is sent (MessagePack)."""
     return _encoder.encode(message)
 
 
 def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
-    """The message in these bytes.
+    """Decode a message.
 
     Raises
     ------
@@ -55,19 +54,19 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
 
 
 def encode_json(message: ParameterMessage) -> bytes:
-    """A parameter message as JSON."""
+    """Encode a parameter message as JSON."""
     return _json_encoder.encode(message)
 
 
 def decode_json(data: bytes, limit: int = MAX_BYTES) -> ParameterMessage:
-    """The parameter message in this JSON text; raises InvalidMessage as `decode` does."""
+    """Decode a parameter message from JSON; raises InvalidMessage as `decode` does."""
     return _guarded(_json_decoder, data, limit)
 
 
 def _guarded(
     decoder: "msgspec.msgpack.Decoder[_Decoded] | msgspec.json.Decoder[_Decoded]", data: bytes, limit: int
 ) -> _Decoded:
-    """Decode, with every way in which bytes can be wrong turned into InvalidMessage."""
+    """Decode; anything wrong with the bytes raises InvalidMessage."""
     require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed", Refusal.TOO_LARGE)
     try:
         return decoder.decode(data)

@@ -1,9 +1,8 @@
-"""Bodies compressed on their way: what comes back is bounded before it is made."""
+"""Compression of message bodies; the size after decompression is bounded in advance."""
 
 import zlib
 
-from servotwin.messages.checks import InvalidMessage, require
-from servotwin.messages.refusals import Refusal
+from servotwin.messages.checks import InvalidMessage, Refusal, require
 
 IDENTITY, DEFLATE, ZSTD = "", "deflate", "zstd"
 ENCODINGS = (IDENTITY, DEFLATE, ZSTD)
@@ -13,7 +12,7 @@ ZSTD_WINDOW = 8 * 1024 * 1024
 
 
 def compress(data: bytes, encoding: str) -> bytes:
-    """`data` in that encoding; "zstd" needs zstandard."""
+    """Compress with an encoding; "zstd" needs zstandard."""
     if encoding == DEFLATE:
         return zlib.compress(data, 6)
     if encoding == ZSTD:
@@ -24,7 +23,7 @@ def compress(data: bytes, encoding: str) -> bytes:
 
 
 def decompress(data: bytes, encoding: str, limit: int) -> bytes:
-    """What was compressed; never more than `limit` bytes are made of it.
+    """Decompress; never more than `limit` bytes are produced.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""To the edge: requests for windows that tell more; back: answers."""
+"""Requests for more informative windows, to the edge, and answers, back."""
 
 from enum import StrEnum
 from math import isfinite
@@ -9,11 +9,11 @@ from msgspec import Meta, Struct
 from servotwin.messages.checks import Count, Name, Text, require
 
 MAX_SECONDS = 600.0
-"""Longest window, or time of one probe, that a request may name; an edge's own limits are tighter."""
+"""Longest window or probe that a request may name, s; an edge's own limits are tighter."""
 
 
 class LongerWindow(Struct, frozen=True, tag="window"):
-    """From the next change of the reference on, windows of this length.
+    """Request for longer windows, from the next change of the reference on.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class LongerWindow(Struct, frozen=True, tag="window"):
 
 
 class Probe(Struct, frozen=True, tag="probe"):
-    """Once, while the reference rests, a move of it there and back.
+    """Request for one probing move of the reference, there and back, while it rests.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ Ask = LongerWindow | Probe
 
 
 class Request(Struct, frozen=True, tag="request/1"):
-    """The twin asks for windows that tell more of the gap.
+    """Request for windows that show the gap better.
 
     Attributes
     ----------
@@ -89,8 +89,8 @@ class Request(Struct, frozen=True, tag="request/1"):
         require(isfinite(self.not_after), f"request not_after {self.not_after} s is not finite")
 
 
-class Outcome(StrEnum):
-    """What the edge did with a request."""
+class RequestOutcome(StrEnum):
+    """Decision of the edge about a request."""
 
     TAKEN = "taken"
     WRONG_SERVO = "wrong servo"
@@ -104,12 +104,12 @@ class Outcome(StrEnum):
 
     @property
     def passing(self) -> bool:
-        """Whether the same request may be taken later."""
-        return self in (Outcome.BUSY, Outcome.TOO_SOON)
+        """True where the same request may be taken later."""
+        return self in (RequestOutcome.BUSY, RequestOutcome.TOO_SOON)
 
 
 class Answer(Struct, frozen=True, tag="answer/1"):
-    """What the edge did with a request.
+    """Answer of the edge to a request.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Answer(Struct, frozen=True, tag="answer/1"):
         The request's.
     sample : int
         First sample at which it counts, or at which it was refused.
-    outcome : Outcome
+    outcome : RequestOutcome
     newest : int
         Highest serial decided so far: a twin that forgot goes on from there.
     """
@@ -126,10 +126,10 @@ class Answer(Struct, frozen=True, tag="answer/1"):
     boot: Name
     serial: Count
     sample: Count
-    outcome: Outcome
+    outcome: RequestOutcome
     newest: Count
 
     @property
     def taken(self) -> bool:
-        """Whether the edge does what it was asked for."""
-        return self.outcome is Outcome.TAKEN
+        """True where the edge does what was requested."""
+        return self.outcome is RequestOutcome.TAKEN

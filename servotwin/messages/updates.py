@@ -1,4 +1,4 @@
-"""To the edge: updates; back: receipts, and word of a fallback."""
+"""Updates of the parameters, to the edge; receipts and fallbacks, back."""
 
 from enum import StrEnum
 from math import isfinite
@@ -11,7 +11,7 @@ from servotwin.messages.setting import Setting
 
 
 class Reason(StrEnum):
-    """What the edge did with an update."""
+    """Decision of the edge about an update."""
 
     APPLIED = "applied"
     WRONG_SERVO = "wrong servo"
@@ -32,7 +32,7 @@ class Reason(StrEnum):
 
 
 class Cause(StrEnum):
-    """Why the edge left the twin's parameters."""
+    """Cause of a fallback."""
 
     LIMIT_CYCLE = "limit cycle"
     ERROR = "error outside the predicted band"
@@ -76,7 +76,7 @@ class Verification(Struct, frozen=True):
 
 
 class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
-    """New parameters for the edge, and what they stand on.
+    """New parameters for the edge, and the estimate that they are based on.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
 
 
 class Receipt(Struct, frozen=True, tag="receipt/1"):
-    """What the edge did with an update.
+    """Receipt for an update: applied or refused.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Receipt(Struct, frozen=True, tag="receipt/1"):
 
 
 class Fallback(Struct, frozen=True, tag="fallback/2"):
-    """The edge left the parameters in force for its own fallback set, on its own evidence.
+    """Notice that the edge left the parameters in force for its fallback set, on its own evidence.
 
     Attributes
     ----------

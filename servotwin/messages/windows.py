@@ -1,4 +1,4 @@
-"""To the twin: windows and hellos; back: acknowledgements."""
+"""Windows and hellos, to the twin; acknowledgements, back."""
 
 from math import isfinite
 from typing import Annotated
@@ -11,7 +11,7 @@ from servotwin.messages.setting import Setting
 
 
 class WindowMessage(Struct, frozen=True, tag="window/1"):
-    """A stretch of recorded samples, known by (servo, boot, sequence).
+    """Recorded samples, identified by (servo, boot, sequence).
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class WindowMessage(Struct, frozen=True, tag="window/1"):
 
 
 class Hello(Struct, frozen=True, tag="hello/2"):
-    """The edge introduces itself after a start or a reconnection.
+    """Introduction of an edge after a start or a reconnection.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Hello(Struct, frozen=True, tag="hello/2"):
 
 
 class Acknowledge(Struct, frozen=True, tag="ack/1"):
-    """The twin has this window safe; the edge may forget it."""
+    """Acknowledgement of a window that the twin has stored; the edge may delete it."""
 
     servo: Name
     boot: Name

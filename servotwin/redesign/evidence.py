@@ -1,4 +1,4 @@
-"""What a policy decides on."""
+"""Evidence on which a policy decides."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOT_OBSERVED = nothing_known(float("nan"), "not observed")
 
 @dataclass(frozen=True)
 class Evidence:
-    """One window's answer, and what is known beside it.
+    """Estimate of one window, and what is known beside it.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Evidence:
 
     @property
     def unusable(self) -> str:
-        """Why nothing may stand on the estimate; empty where it may."""
+        """Reason why nothing may stand on the estimate; empty where it may."""
         if self.why_not or self.estimate.ok:
             return self.why_not
         reasons = "; ".join(self.estimate.reasons)

@@ -1,4 +1,4 @@
-"""When windows tell too little of the gap: ask for longer ones first, and only then for a probing move.
+"""Excitation: where windows tell too little of the gap, longer ones are requested, and only then a probing move.
 
 The calmer a loop, the less its windows tell (dual control). A window with a pre-trigger costs nothing but bytes; a move
 of the reference costs the machine's rest, and is asked for only where the configuration allows it, no larger than
@@ -15,7 +15,7 @@ from typing import Annotated
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
-from servotwin.messages import Ask, LongerWindow, Outcome, Probe
+from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 
 _ROUNDING = 1e-6  # s: windows are whole numbers of samples
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
@@ -65,7 +65,7 @@ class ExcitationSettings:
 
 
 class Stage(StrEnum):
-    """How far a request for something came."""
+    """Stage of a request."""
 
     OPEN = "not asked for"
     ASKED = "asked for"
@@ -75,7 +75,7 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class WindowSummary:
-    """What one window said, and what is known when it did.
+    """Information in one window, and what is known with it.
 
     Attributes
     ----------
@@ -117,22 +117,22 @@ class ExcitationState:
     probed: float = -math.inf
 
     def rebooted(self) -> ExcitationState:
-        """What is left of it after a boot of the edge: its windows are as configured again."""
+        """State after a boot of the edge: its windows are as configured again."""
         return ExcitationState(probed=self.probed)
 
-    def answered(self, ask: Ask, outcome: Outcome | None) -> ExcitationState:
+    def answered(self, ask: Ask, outcome: RequestOutcome | None) -> ExcitationState:
         """After the edge's last word on a request; None: it never said anything.
 
         What it does not allow is not asked for again.
         """
-        refused = outcome in (Outcome.NOT_ALLOWED, Outcome.TOO_LARGE)
-        stage = Stage.REFUSED if refused else Stage.TAKEN if outcome is Outcome.TAKEN else Stage.OPEN
+        refused = outcome in (RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE)
+        stage = Stage.REFUSED if refused else Stage.TAKEN if outcome is RequestOutcome.TAKEN else Stage.OPEN
         return replace(self, window=stage) if isinstance(ask, LongerWindow) else replace(self, probing=stage)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to ask for, and why, or why nothing."""
+    """Decision to request something, with the reason, or the reason why not."""
 
     state: ExcitationState
     ask: Ask | None
@@ -201,7 +201,7 @@ class ExcitationPolicy:
         return Decision(asked, Probe(needed, s.hold, s.strokes), why)
 
     def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
-        """Why no probing move is asked for; empty where it may be."""
+        """Reason against a probing move; empty where there is none."""
         s, since = self.settings, window.time - state.probed
         if s.probe == 0.0:
             return "a probing move is not allowed"
@@ -217,7 +217,7 @@ class ExcitationPolicy:
 
 
 def long_enough(length: float, pre_trigger: float, settings: ExcitationSettings) -> bool:
-    """Whether a window is what would be asked for (s)."""
+    """True where a window (s) is as long as would be requested."""
     return length >= settings.window - _ROUNDING and pre_trigger >= settings.pre_trigger - _ROUNDING
 
 

@@ -1,4 +1,4 @@
-"""What a policy is, and the paper's: a dead zone as wide as the estimated gap (Eq 21)."""
+"""Policies: their protocol, and the paper's, a dead zone as wide as the estimated gap (Eq 21)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servotwin.redesign.evidence import Evidence
 
 @dataclass(frozen=True)
 class Redesign:
-    """What a policy decided.
+    """Decision of a policy.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Policy(Protocol):
     def needs_estimate(self) -> bool: ...
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """What to do."""
+        """Decide on the evidence of one window."""
         ...
 
 

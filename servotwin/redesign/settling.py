@@ -1,4 +1,4 @@
-"""How wide a dead zone must be before the loop settles: the map behind the policy `margin`.
+"""Map of the dead zones for which the loop settles, behind the policy `margin`.
 
 Settling is not monotone in the tolerance; what is told is therefore the least tolerance from which on every wider one
 settled too.
@@ -29,7 +29,7 @@ _STARTS, _DURATION, _LAST = 4, 60.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class SettlingMap:
-    """Which dead zones settle.
+    """Dead zones for which the loop settles.
 
     Attributes
     ----------

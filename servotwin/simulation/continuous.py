@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +15,7 @@ from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_
 from servotwin.plant.noise import NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.simulation.run import Inputs, quantised
-from servotwin.simulation.splice import about
-from servotwin.simulation.swap import Place, swapped
+from servotwin.simulation.inputs import RunInputs, about, quantised
 
 _NOISE_BLOCK = 4096
 
@@ -28,7 +26,7 @@ class ContinuousEngine:
 
     servo: Servo
     controller: Controller
-    inputs: Inputs
+    inputs: RunInputs
     theta_d0: float = 0.0
     refine: int = 1
     noise: NoiseSource | None = None
@@ -120,8 +118,8 @@ class ContinuousEngine:
         if tolerance is not None:
             names = [name for name in self.loop.automaton.names if name.startswith("tolerance")]
             values |= dict.fromkeys(names, 0.0) | {"tolerance": tolerance}
-        now, index = Place(self.loop, self.trajectory.state, self.trajectory.mode), self.index
-        place = swapped(now, controller, values, lambda offset: self._automaton(controller, offset))
+        now, index = LoopState(self.loop, self.trajectory.state, self.trajectory.mode), self.index
+        place = change_controller(now, controller, values, lambda offset: self._automaton(controller, offset))
         self.past.append((self.loop, self.trajectory))
         self.controller, self.loop = controller, place.loop
         step = 1.0 / self.inputs.sample_rate
@@ -188,3 +186,74 @@ def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float)
 def at_zero(pieces: PiecewiseCubic) -> Array:
     """Ascending coefficients, about time 0, of the piece in force there."""
     return about(pieces, 0.0)
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """Automaton, state and mode of a continuous loop at one instant."""
+
+    loop: ServoAutomaton
+    state: Array
+    mode: int
+
+    @property
+    def zone(self) -> str:
+        """The controller's zone."""
+        return self.loop.zones[self.mode % len(self.loop.zones)]
+
+    def output(self, name: str) -> float:
+        """An output at this instant."""
+        return float(self.loop.rows[name][self.mode] @ self.state)
+
+    def value(self, name: str) -> float:
+        """A state by name."""
+        return float(self.state[self.loop.automaton.index(name)])
+
+
+def change_controller(
+    now: LoopState, controller: Controller, values: Mapping[str, float], loop: Callable[[bool], ServoAutomaton]
+) -> LoopState:
+    """Replace the controller in the running loop: common states go on, the voltage does not jump.
+
+    As `control.law.transfer` does for the sampled law: the difference to the old controller's voltage at this instant
+    becomes an offset that fades exponentially. Voltage beyond the old controller's limit is forgotten.
+
+    Parameters
+    ----------
+    now : LoopState
+    controller : Controller
+        The new controller.
+    values : dict
+        States by name that the change sets.
+    loop : callable
+        The automaton with the new controller, with or without a state "offset".
+    """
+    place = _with_states(now, controller, loop(False), values)
+    offset = now.output("voltage") - place.output("voltage")
+    if offset == 0.0:
+        return place
+    return _with_states(now, controller, loop(True), {**values, "offset": offset})
+
+
+def _with_states(
+    now: LoopState, controller: Controller, loop: ServoAutomaton, values: Mapping[str, float]
+) -> LoopState:
+    """States by name. Without integral action nothing would ever correct the integral: it goes into the offset."""
+    kept = {name: now.value(name) for name in now.loop.automaton.names if name != "offset"}
+    kept |= {"integral": 0.0} if controller.Ki == 0.0 else {}
+    kept = {"filtered": now.output("measured_position")} | kept | dict(values)
+    state = np.array([kept.get(name, 0.0) for name in loop.automaton.names])
+    zone = now.zone.split()[0]
+    if zone != "on":
+        error, tolerance = float(loop.rows["error"][0] @ state), kept["tolerance"]
+        zone = _zone_after(zone, error, controller.enter * tolerance, controller.leave * tolerance)
+    mechanics = now.mode // len(now.loop.zones)
+    return LoopState(loop, state, mechanics * len(loop.zones) + loop.zones.index(zone))
+
+
+def _zone_after(zone: str, error: float, enter: float, leave: float) -> str:
+    """The dead zone's mode for new thresholds, by the hysteresis of the law."""
+    side = "+" if error > 0.0 else "-"
+    if zone == "inside":
+        return side if abs(error) > leave else zone
+    return "inside" if abs(error) < enter else (side if error else zone)

@@ -5,42 +5,46 @@ Sample by sample it is the `Simulation` with an end, bit for bit.
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 
 from servotwin.control.controller import Controller
+from servotwin.control.law import LawParameters, start
+from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, SquareWave, as_pieces
+from servotwin.simulation.inputs import recent, spliced
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.simulate import Simulation
-from servotwin.simulation.splice import recent, spliced
 
 FOREVER = 1e9
-"""s, some thirty years: the horizon of a simulation that is to be endless."""
+"""Horizon of a simulation without an end, s: some thirty years."""
 
-STRETCH, MARGIN = 3600.0, 1.0  # s of the reference that are laid out at a time, and beyond what is then asked for
+STRETCH, MARGIN = 3600.0, 1.0  # s: length of reference laid out at a time, and its overlap with the next
 
 
 def first_stretch(reference: SignalLike) -> PiecewiseCubic:
-    """What an endless simulation's reference begins with."""
+    """First stretch of an unbounded simulation's reference."""
     return _between(reference, 0.0, STRETCH + MARGIN)
 
 
-class Endless:
-    """A machine that runs on.
+class UnboundedSimulation:
+    """A simulation without an end.
 
     Parameters
     ----------
     simulation : Simulation
         Sampled, with `keep`, over `FOREVER`; its reference begins as `first_stretch` of `reference`.
     reference : number or signal
-        m, what the machine wants by itself.
+        m, the machine's own reference, without the offsets of `move`.
     """
 
     def __init__(self, simulation: Simulation, reference: SignalLike) -> None:
         assert isinstance(simulation.engine, SampledEngine)
         self.simulation, self.engine = simulation, simulation.engine
         self.rate = simulation.inputs.sample_rate
-        self._wanted, self._offset = reference, 0.0
+        self._reference_signal, self._offset = reference, 0.0
         self._until = int(STRETCH * self.rate) if isinstance(reference, SquareWave) else None
 
     @property
@@ -65,7 +69,7 @@ class Endless:
         time = self.simulation.time
         if self._until is not None:
             self._until = self.index + int(STRETCH * self.rate)
-        wanted = _between(self._wanted, time, time + STRETCH + MARGIN)
+        wanted = _between(self._reference_signal, time, time + STRETCH + MARGIN)
         self._set_reference(wanted if self._offset == 0.0 else _raised(wanted, self._offset))
 
     def move(self, offset: float) -> None:
@@ -93,7 +97,7 @@ class Endless:
         return self.engine.oldest / self.rate
 
     def _forget(self) -> None:
-        """What the dead zone was before the oldest sample remembered."""
+        """Forget the dead zone before the oldest sample remembered."""
         inputs = self.simulation.inputs
         assert inputs.tolerance is not None
         inputs.tolerance = recent(inputs.tolerance, self._oldest)
@@ -109,3 +113,82 @@ def _between(reference: SignalLike, begin: float, end: float) -> PiecewiseCubic:
 
 def _raised(pieces: PiecewiseCubic, offset: float) -> PiecewiseCubic:
     return PiecewiseCubic(pieces.times, pieces.coeffs + np.array([offset, 0.0, 0.0, 0.0]))
+
+
+CHUNK = 4096
+_VOLTAGE_ONLY = LawParameters(0.0, 0.0, 0.0, 0.0, -1.0, -1.0, inf, inf, 1.0, 0.0, 0.0, 1.0)
+
+
+class OpenLoopPlant:
+    """The plant of a sampled simulation with the voltage given from outside, sample by sample.
+
+    It runs the sampled loop's own compiled step with a law that has no gains and whose feedforward is the voltage: the
+    plant is the same, bit for bit. Inputs are laid out for many samples at a time.
+
+    Parameters
+    ----------
+    machine : UnboundedSimulation
+        Its samples are its ticks, and it has no dead zone: its own controller never runs.
+
+    Raises
+    ------
+    InvalidInput
+        Samples and ticks are at different rates.
+    """
+
+    def __init__(self, machine: UnboundedSimulation) -> None:
+        engine = machine.engine
+        if engine.tick_every != 1 or engine.record_every != 1:
+            raise InvalidInput(
+                f"controller sample_rate = {engine.tick_rate} Hz: must be the recording's, {machine.rate} Hz, where "
+                "the voltage comes from outside"
+            )
+        self._machine, self._engine = machine, engine
+        engine.law_state = start(0.0)
+        engine.parameters = _VOLTAGE_ONLY
+        self._theta_m = int(np.argmax(engine.plant.rows["theta_m"][0]))
+        self._position = engine.port.position
+        self._finest = engine.servo.encoder_resolution, engine.servo.position_resolution
+        self._lay_out()
+
+    @property
+    def index(self) -> int:
+        """The present sample."""
+        return self._engine.base
+
+    def sample(self) -> tuple[float, float, float]:
+        """Reference (m), motor angle (rad) and measured position (m) of the present sample."""
+        here, state = self._engine.base - self._first, self._engine.state
+        angle, position = float(state[self._theta_m]), float(state[self._position]) + self._noise[here]
+        return self._reference[here], _rounded(angle, self._finest[0]), _rounded(position, self._finest[1])
+
+    def hold(self, voltage: float) -> None:
+        """Let the plant flow to the next sample under a voltage (V)."""
+        engine = self._engine
+        base = engine.base
+        engine.parameters = _VOLTAGE_ONLY._replace(feedforward=voltage)
+        engine.make_room(base + 1)
+        if base in self._changes:
+            engine.draws.put_back(self._tick_inputs.noise[base - self._first :])
+            engine.advance(base + 1)
+            self._lay_out()
+            return
+        engine.flow(base + 1, self._tick_inputs)
+        if engine.base == self._last:
+            self._lay_out()
+
+    def _lay_out(self) -> None:
+        """RunInputs of the samples to come."""
+        first, until = self._engine.base, self._machine.laid_out
+        if until is not None and until <= first:
+            self._machine.lay_out()
+            until = self._machine.laid_out
+        last = first + CHUNK if until is None else min(first + CHUNK, until)
+        self._first, self._last = first, last
+        self._tick_inputs = self._engine.tick_inputs(first, last)
+        self._changes = {base for base, _ in self._engine.knots(last)}
+        self._reference, self._noise = self._tick_inputs.reference.tolist(), self._tick_inputs.noise.tolist()
+
+
+def _rounded(value: float, resolution: float) -> float:
+    return value if resolution == 0.0 else round(value / resolution) * resolution

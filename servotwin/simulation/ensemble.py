@@ -3,18 +3,113 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.ensemble import FigureOptions, figures_of_family, run_family
+from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family, run_family
 from servotwin.hybrid.members import Figures
+from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, without_feedforward
 from servotwin.plant.servo import Servo
-from servotwin.simulation.cases import Cases, Crowd, crowd
+from servotwin.plant.signals import check_gap
+from servotwin.simulation.continuous import controller_constants
+
+NOT_NEGATIVE = ("gap", "tolerance", "friction")
+
+
+class Cases(NamedTuple):
+    """Constants of each run, any shapes that broadcast.
+
+    Attributes
+    ----------
+    reference, gap, tolerance, theta_d0 : array_like
+        m, rad (total), m, rad. A tolerance of 0 is no dead zone, a gap of 0 no backlash.
+    input_bias, friction : array_like
+        V behind the controller, N m on the motor's shaft.
+    """
+
+    reference: ArrayLike = 0.0
+    gap: ArrayLike = 0.0
+    tolerance: ArrayLike = 0.0
+    theta_d0: ArrayLike = 0.0
+    input_bias: ArrayLike = 0.0
+    friction: ArrayLike = 0.0
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members of one structure.
+
+    Attributes
+    ----------
+    which : (k,) array
+        Their places among all members.
+    automata : list of Automaton
+        Each different one once.
+    rows : (A, O, M, n) array
+        Outputs of each automaton.
+    members : Members
+    """
+
+    which: NDArray[np.int64]
+    automata: list[Automaton]
+    rows: Array
+    members: Members
+
+
+@dataclass(frozen=True)
+class EnsembleMembers:
+    """All members, flat.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        What servos, controllers and constants broadcast to.
+    """
+
+    shape: tuple[int, ...]
+    servos: list[Servo]
+    controllers: list[Controller]
+    constants: dict[str, Array]
+
+    def groups(self, outputs: Sequence[str], dead_zone: bool | None = None) -> list[Group]:
+        """Members by structure; with `dead_zone` given all of them have one, or none."""
+        found: dict[object, list[int]] = {}
+        shapes = [self._shape_of(member, dead_zone) for member in range(len(self.servos))]
+        for member, shape in enumerate(shapes):
+            found.setdefault((shape, *_sort_of(self.servos[member], self.controllers[member])), []).append(member)
+        return [self._group(np.array(which), shapes[which[0]], outputs) for which in found.values()]
+
+    def _shape_of(self, member: int, dead_zone: bool | None) -> Shape:
+        return Shape(
+            dead_zone=self.constants["tolerance"][member] > 0.0 if dead_zone is None else dead_zone,
+            bias=self.constants["input_bias"][member] != 0.0,
+            friction=self.constants["friction"][member] > 0.0,
+            feedforward=self.controllers[member].feedforward != 0.0,
+        )
+
+    def _group(self, which: NDArray[np.int64], shape: Shape, outputs: Sequence[str]) -> Group:
+        servos, laws = ([values[member] for member in which] for values in (self.servos, self.controllers))
+        places: dict[tuple[Servo, Controller], int] = {}
+        pairs = [(servo, without_feedforward(law)) for servo, law in zip(servos, laws, strict=True)]
+        automaton = np.array([places.setdefault(pair, len(places)) for pair in pairs])
+        loops = [continuous_loop(servo, law, shape) for servo, law in places]
+        constants = {name: values[which] for name, values in self.constants.items()}
+        states = np.zeros((len(which), len(loops[0].automaton.names)))
+        modes = np.zeros(len(which), dtype=np.int64)
+        for k, (loop, (servo, _)) in enumerate(zip(loops, places, strict=True)):
+            mine = np.flatnonzero(automaton == k)
+            own = {name: values[mine] for name, values in constants.items()}
+            own |= _constants_of([laws[member] for member in mine])
+            states[mine] = _starts(servo, loop, own)
+            modes[mine] = start_modes(loop, states[mine], laws[mine[0]].enter)
+        rows = np.array([[_row(loop, name) for name in outputs] for loop in loops])
+        return Group(which, [loop.automaton for loop in loops], rows, Members(automaton, modes, states))
 
 
 def simulate_ensemble(
@@ -50,7 +145,7 @@ def simulate_ensemble(
     (*S, N) array
         m, ``N = round(duration * sample_rate) + 1``.
     """
-    members = crowd(servo, controller, Cases(reference, gap, tolerance, theta_d0))
+    members = members_of(servo, controller, Cases(reference, gap, tolerance, theta_d0))
     return _traces(members, ("position",), duration, sample_rate, threads, dead_zone=True)[:, 0].reshape(
         *members.shape, -1
     )
@@ -99,7 +194,7 @@ def simulate_members(
     InvalidInput
         A controller that is not continuous, a constant out of its range, an output that does not exist.
     """
-    members = crowd(servos, controllers, Cases(reference, gap, tolerance, theta_d0, input_bias, friction))
+    members = members_of(servos, controllers, Cases(reference, gap, tolerance, theta_d0, input_bias, friction))
     traces = _traces(members, outputs, duration, sample_rate, threads)
     return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
@@ -138,7 +233,7 @@ def summarise_members(
     InvalidInput
         As `simulate_members`; also for limits of what is not asked for, or a `last` longer than the run.
     """
-    members, judged = crowd(servos, controllers, cases), round(last * sample_rate)
+    members, judged = members_of(servos, controllers, cases), round(last * sample_rate)
     bounds = np.full((len(members.servos), len(outputs)), np.inf)
     for name, limit in (limits or {}).items():
         if name not in outputs:
@@ -168,7 +263,7 @@ def _samples(duration: float, sample_rate: float) -> int:
 
 
 def _traces(
-    members: Crowd,
+    members: EnsembleMembers,
     outputs: Sequence[str],
     duration: float,
     sample_rate: float,
@@ -187,3 +282,76 @@ def _traces(
     for group, run in zip(groups, runs, strict=True):
         found[group.which] = run
     return found
+
+
+def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
+    """Members from what broadcasts to them.
+
+    Raises
+    ------
+    InvalidInput
+        A controller that is not continuous or limits the rate, a constant that is not finite or negative.
+    """
+    plants, laws = np.asarray(servos, dtype=object), np.asarray(controllers, dtype=object)
+    values = [np.asarray(value, dtype=float) for value in cases]
+    shape = np.broadcast_shapes(plants.shape, laws.shape, *(value.shape for value in values))
+    constants = {name: np.broadcast_to(value, shape).ravel() for name, value in zip(Cases._fields, values, strict=True)}
+    _check(constants)
+    every_servo = list(np.broadcast_to(plants, shape).ravel())
+    given = np.broadcast_to(laws, shape).ravel()
+    every_law = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
+    for law in {id(law): law for law in every_law}.values():
+        if law.sample_rate is not None or law.rate_limit is not None:
+            raise InvalidInput("an ensemble needs continuous controllers: without sample_rate and rate_limit")
+    return EnsembleMembers(shape, every_servo, every_law, constants)
+
+
+def _check(constants: dict[str, Array]) -> None:
+    for name, values in constants.items():
+        allowed = "finite and 0 or more" if name in NOT_NEGATIVE else "finite"
+        if not np.isfinite(values).all() or (name in NOT_NEGATIVE and values.min(initial=0.0) < 0.0):
+            raise InvalidInput(f"{name}: every value of an ensemble must be {allowed}")
+    check_gap(float(constants["gap"].max(initial=0.0)))
+
+
+def _sort_of(servo: Servo, law: Controller) -> tuple[object, ...]:
+    return servo.n, servo.rigid, law.voltage_limit is None, law.loop_filter_hz is None
+
+
+def _row(loop: ServoAutomaton, name: str) -> Array:
+    if name not in loop.rows:
+        raise InvalidInput(f"an ensemble has no output {name!r}; allowed are {', '.join(loop.rows)}")
+    return loop.rows[name]
+
+
+def _constants_of(laws: list[Controller]) -> dict[str, Array]:
+    """(k,) states that hold numbers of the controllers."""
+    names = controller_constants(laws[0])
+    return {name: np.array([controller_constants(law)[name] for law in laws]) for name in names}
+
+
+def _starts(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> Array:
+    """(k, n) states at rest: as `plant_start` says of one."""
+    names, index = loop.automaton.names, loop.automaton.index
+    states = np.zeros((len(constants["gap"]), len(names)))
+    for name, values in constants.items():
+        key = name.replace("_", " ")
+        if key in names:
+            states[:, index(key)] = values
+    half = 0.5 * constants["gap"]
+    screw, first = np.clip(constants["theta_d0"], -half, half), index("chain0")
+    rest = servo.chain().equilibrium(servo.p)
+    states[:, index("theta_d")] = screw
+    states[:, first : first + rest.size] = screw[:, None] * rest
+    if "filtered" in names:
+        states[:, index("filtered")] = states @ loop.rows["measured_position"][0]
+    return states
+
+
+def start_modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np.int64]:
+    """(k,) modes: as `start_zone` says of one."""
+    if "inside" not in loop.zones:
+        return np.full(len(states), loop.mode("on"))
+    error = states @ loop.rows["error"][0]
+    inside = np.abs(error) <= enter * states[:, loop.automaton.index("tolerance")]
+    return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))

@@ -1,4 +1,4 @@
-"""What a simulation returns: channels at the samples, evaluated when asked for, and the table of events."""
+"""Result of a simulation: channels at the samples, evaluated when asked for, and the table of events."""
 
 from __future__ import annotations
 
@@ -10,50 +10,14 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import PiecewiseCubic
 from servotwin.runtime.notebook import html_table
+from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVENT_TYPE = np.dtype([("time", float), ("kind", "U10"), ("side", np.int8), ("state_triggered", bool)])
-
-
-@dataclass
-class Inputs:
-    """The inputs of a run as piecewise cubics, the rate of its samples, and what disturbs the plant all along (V
-    behind the controller, N m on the motor's shaft)."""
-
-    reference: PiecewiseCubic
-    gap: PiecewiseCubic
-    tolerance: PiecewiseCubic | None
-    sample_rate: float
-    input_bias: float = 0.0
-    friction: float = 0.0
-
-    def times(self, first: int, last: int) -> Array:
-        """Times of samples first .. last - 1, s."""
-        return np.arange(first, last) / self.sample_rate
-
-    def retune(self, time: float, tolerance: float) -> None:
-        """From `time` on the tolerance is a constant."""
-        assert self.tolerance is not None
-        keep = self.tolerance.times < time
-        times, coeffs = self.tolerance.times[keep], self.tolerance.coeffs[keep]
-        self.tolerance = PiecewiseCubic(np.append(times, time), np.vstack([coeffs, [[tolerance, 0.0, 0.0, 0.0]]]))
-
-    def jumps(self, until: float) -> list[tuple[float, str]]:
-        """Times and kinds (reference, parameter) of the inputs' jumps in (0, until]."""
-        found = [(float(t), "reference") for t in self.reference.jumps]
-        found += [(float(t), "parameter") for t in self.gap.jumps]
-        found += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
-        return sorted((time, kind) for time, kind in found if 0.0 < time <= until)
-
-
-def quantised(values: Array, resolution: float) -> Array:
-    """The nearest whole counts; resolution 0 is an ideal sensor."""
-    return values if resolution == 0.0 else np.round(values / resolution) * resolution
 
 
 @dataclass(repr=False)
@@ -64,7 +28,7 @@ class Run:
     """
 
     servo: Servo
-    inputs: Inputs
+    inputs: RunInputs
     samples: int
     channel: Callable[[str, int, int], Array] = field(repr=False)
     list_events: Callable[[], list[tuple[float, str, int, bool]]] = field(repr=False)
@@ -133,7 +97,7 @@ class Run:
 
     @property
     def measured_position(self) -> Array:
-        """What the position sensor gave, noise and quantisation included, m."""
+        """Output of the position sensor, noise and quantisation included, m."""
         return self._column("measured_position")
 
     @property

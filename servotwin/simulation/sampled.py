@@ -5,7 +5,7 @@ Contacts of the gap inside a sample are located.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,13 +26,12 @@ from servotwin.hybrid.kernel import (
 from servotwin.hybrid.tables import search_step
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import degree, sampled_plant
-from servotwin.plant.noise import Noise
+from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.simulation import kept
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
-from servotwin.simulation.run import Inputs, quantised
-from servotwin.simulation.ticks import Drive, Port, run_ticks, tick_and_record
+from servotwin.simulation.inputs import RunInputs, quantised
+from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
 _CHUNK = 1 << 15
 _RECORDED = ("theta_m", "theta_d", "voltage")
@@ -45,7 +44,7 @@ class SampledEngine:
 
     servo: Servo
     controller: Controller
-    inputs: Inputs
+    inputs: RunInputs
     theta_d0: float
     samples: int
     noise: Noise | None
@@ -70,10 +69,10 @@ class SampledEngine:
         self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
         self.parameters = self.controller.law(None)
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
-        self.draws = kept.Draws(source, ahead=0 if self.keep is None else _CHUNK)
+        self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
-        self.output = kept.new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
+        self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
@@ -114,16 +113,16 @@ class SampledEngine:
             self._run_through(base, jumps)
         self._run(end)
         if index == self.samples - 1:
-            drive = self.drive(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
+            tick_inputs = self.tick_inputs(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
             self.law_state = tick_and_record(
-                self.base, self.state, self.parameters, self.law_state, self.port, drive, self.output
+                self.base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
             )
             self.finished = True
 
     def make_room(self, index: int) -> None:
         """Forget what is too old, where samples up to `index` would not fit."""
         if self.keep is not None and index - self.oldest > 2 * self.keep:
-            self.output = kept.moved_on(self.output, self.index - self.keep, self.tick_every, self.record_every)
+            self.output = _shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
             self.record.size[1] = 0
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
@@ -137,8 +136,8 @@ class SampledEngine:
             found.setdefault(int(bases[piece]), []).append(jump)
         return sorted(found.items())
 
-    def drive(self, first: int, last: int) -> Drive:
-        """Inputs of ticks first .. last - 1."""
+    def tick_inputs(self, first: int, last: int) -> TickInputs:
+        """RunInputs of ticks first .. last - 1."""
         count = max(last - first, 0)
         times = np.arange(first, first + count) / self.tick_rate
         if self.inputs.tolerance is None:
@@ -148,15 +147,15 @@ class SampledEngine:
             zero = tolerance == 0.0
             enter = np.where(zero, -1.0, self.controller.enter * tolerance)
             leave = np.where(zero, -1.0, self.controller.leave * tolerance)
-        return Drive(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
+        return TickInputs(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
 
     def _run(self, end: int) -> None:
         while self.base < end:
             stop = min(end, self.base + _CHUNK)
-            self.flow(stop, self.drive(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
+            self.flow(stop, self.tick_inputs(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
 
-    def flow(self, end: int, drive: Drive) -> None:
-        """Go on to a base step; `drive` covers the ticks on the way, on which the gap's cubic does not change."""
+    def flow(self, end: int, tick_inputs: TickInputs) -> None:
+        """Go on to a base step; `tick_inputs` covers the ticks on the way, on which the gap's cubic does not change."""
         while self.base < end:
             status, self.base, self.mode, self.law_state = run_ticks(
                 self.tables,
@@ -167,7 +166,7 @@ class SampledEngine:
                 self.parameters,
                 self.law_state,
                 self.port,
-                drive,
+                tick_inputs,
                 self.output,
                 self.record,
                 self.scratch,
@@ -176,9 +175,9 @@ class SampledEngine:
 
     def _run_through(self, base: int, jumps: list[Jump]) -> None:
         """One base step in which the gap's cubic changes."""
-        drive = self.drive(-(-base // self.tick_every), base // self.tick_every + 1)
+        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
         self.law_state = tick_and_record(
-            base, self.state, self.parameters, self.law_state, self.port, drive, self.output
+            base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
         )
         at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
         schedule = schedule_of(jumps, self.step, self.plant.automaton, (base + 1) * self.port.searches)
@@ -286,3 +285,44 @@ def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
             "one must be a whole multiple of the other"
         )
     return (1, whole) if tick_rate >= sample_rate else (whole, 1)
+
+
+def _new_output(rows: int, samples: int, tick_every: int, record_every: int) -> Output:
+    """Buffers for so many samples of `rows` states, and for their ticks."""
+    ticks = -(-((samples - 1) * record_every + 1) // tick_every)
+    return Output(np.empty((rows, samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8), 0, 0)
+
+
+def _shifted_output(output: Output, sample: int, tick_every: int, record_every: int) -> Output:
+    """Shift the buffers to begin at `sample`; older samples are forgotten."""
+    tick = sample * record_every // tick_every
+    for values, by in (
+        (output.states, sample - output.first_sample),
+        (output.measured, tick - output.first_tick),
+        (output.active, tick - output.first_tick),
+    ):
+        values[..., : values.shape[-1] - by] = values[..., by:].copy()
+    return output._replace(first_sample=sample, first_tick=tick)
+
+
+@dataclass
+class NoiseBuffer:
+    """Noise for tick after tick, drawn at least `ahead` values at a time; the block size changes no value."""
+
+    source: NoiseSource | None
+    ahead: int
+    drawn: Array = field(default_factory=lambda: np.zeros(0))
+
+    def take(self, count: int) -> Array:
+        """Noise (m) of the next ticks."""
+        if self.source is None:
+            return np.zeros(count)
+        if (missing := count - self.drawn.size) > 0:
+            self.drawn = np.concatenate([self.drawn, self.source.block(max(missing, self.ahead))])
+        values, self.drawn = self.drawn[:count], self.drawn[count:]
+        return values
+
+    def put_back(self, values: Array) -> None:
+        """Return noise that was taken for ticks that are still to come."""
+        if self.source is not None:
+            self.drawn = np.concatenate([values, self.drawn])

@@ -14,9 +14,9 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.run import Inputs, Run, quantised
+from servotwin.simulation.inputs import RunInputs, quantised, spliced
+from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
-from servotwin.simulation.splice import spliced
 
 SAMPLE_RATE = 5000.0
 
@@ -92,7 +92,7 @@ class Simulation:
         self.servo = servo
         self.controller = servo.controller if controller is None else controller
         self.samples = round(duration * sample_rate) + 1
-        self.inputs = Inputs(
+        self.inputs = RunInputs(
             as_pieces(reference, duration),
             as_gap(gap, duration),
             None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
@@ -130,28 +130,28 @@ class Simulation:
             self.engine.advance(index)
 
     def set_tolerance(self, tolerance: float) -> None:
-        """A new dead-zone half-width (m) from the present sample on; it replaces whatever was planned."""
+        """Set the dead-zone half-width (m) from the present sample on; it replaces whatever was planned."""
         self._check_tolerance(tolerance)
         self.inputs.retune(self.time, tolerance)
         self.engine.set_tolerance(tolerance)
 
     def set_reference(self, reference: SignalLike) -> None:
-        """Another reference (m, number or signal on the run's own time) from the present sample on.
+        """Set the reference (m, number or signal on the run's own time) from the present sample on.
 
-        It replaces whatever was planned; what it does before the present sample does not matter.
+        It replaces whatever was planned; its values before the present sample do not matter.
         """
         horizon = (self.samples - 1) / self.inputs.sample_rate
         self.inputs.reference = spliced(self.inputs.reference, as_pieces(reference, horizon), self.time)
         self.engine.set_reference(self.inputs.reference)
 
     def set_controller(self, controller: Controller, tolerance: float | None = None) -> None:
-        """Another controller from the present sample on, without a jump of the voltage.
+        """Change the controller from the present sample on, without a jump of the voltage.
 
         Parameters
         ----------
         controller : Controller
-            As continuous or sampled as the one before, at the same rate. What it would give less or more at this
-            instant becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
+            As continuous or sampled as the one before, at the same rate. Its difference to the voltage at this instant
+            becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
         tolerance : float, optional
             m, a new dead-zone half-width, which replaces whatever was planned; None keeps that.
 
@@ -183,7 +183,7 @@ class Simulation:
             raise InvalidInput(f"tolerance = {tolerance} m: must be finite and 0 or more")
 
     def measured(self, name: str, first: int, last: int) -> Array:
-        """What a sensor or the law gave at samples first .. last - 1.
+        """Output of a sensor or of the law at samples first .. last - 1.
 
         Parameters
         ----------

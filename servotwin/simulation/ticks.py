@@ -19,7 +19,7 @@ tick = verbatim(law.tick)
 
 
 class Port(NamedTuple):
-    """Where the sampled loop reads and writes the plant's state, and how its steps divide."""
+    """Indices of the plant states that the sampled loop reads and writes, and the division of its steps."""
 
     voltage: int
     position: int
@@ -31,8 +31,8 @@ class Port(NamedTuple):
     room: int  # events after which the record counts as full
 
 
-class Drive(NamedTuple):
-    """What the tick is given, from tick `first` on."""
+class TickInputs(NamedTuple):
+    """Inputs of the ticks from tick `first` on."""
 
     first: int
     reference: Array
@@ -42,7 +42,7 @@ class Drive(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What is recorded, from a sample and a tick on."""
+    """Buffers of what is recorded, from a sample and a tick on."""
 
     states: Array  # (recorded, samples)
     measured: Array  # (ticks,)
@@ -53,11 +53,11 @@ class Output(NamedTuple):
 
 @inlined
 def take_tick(
-    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, tick_inputs: TickInputs, output: Output
 ) -> LawState:
     """Measure, tick, hold the voltage."""
-    k = i - drive.first
-    y = x[port.position] + drive.noise[k]
+    k = i - tick_inputs.first
+    y = x[port.position] + tick_inputs.noise[k]
     if port.resolution > 0.0:
         y = np.round(y / port.resolution) * port.resolution
     now = LawParameters(
@@ -65,8 +65,8 @@ def take_tick(
         parameters.integral_step,
         parameters.derivative_gain,
         parameters.filter_step,
-        drive.enter[k],
-        drive.leave[k],
+        tick_inputs.enter[k],
+        tick_inputs.leave[k],
         parameters.voltage_limit,
         parameters.rate_step,
         parameters.loop_step,
@@ -74,7 +74,7 @@ def take_tick(
         parameters.feedforward,
         parameters.release_step,
     )
-    state = tick(now, state, drive.reference[k], y)
+    state = tick(now, state, tick_inputs.reference[k], y)
     x[port.voltage] = state.voltage
     output.measured[i - output.first_tick] = y
     output.active[i - output.first_tick] = 1 if state.active > 0.5 else 0
@@ -90,11 +90,11 @@ def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
 
 @bare
 def tick_and_record(
-    base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, drive: Drive, output: Output
+    base: int, x: Array, parameters: LawParameters, state: LawState, port: Port, tick_inputs: TickInputs, output: Output
 ) -> LawState:
-    """What happens at a base step before the plant flows on."""
+    """Tick and record where they are due at a base step, before the plant flows on."""
     if base % port.tick_every == 0:
-        state = take_tick(base // port.tick_every, x, parameters, state, port, drive, output)
+        state = take_tick(base // port.tick_every, x, parameters, state, port, tick_inputs, output)
     if base % port.record_every == 0:
         write_sample(base // port.record_every, x, port, output)
     return state
@@ -110,7 +110,7 @@ def run_ticks(
     parameters: LawParameters,
     state: LawState,
     port: Port,
-    drive: Drive,
+    tick_inputs: TickInputs,
     output: Output,
     record: RunRecord,
     scratch: Scratch,
@@ -124,7 +124,7 @@ def run_ticks(
         if record.size[1] > port.room:
             return FULL, base, mode, state
         if to_tick == 0:
-            state = take_tick(i, x, parameters, state, port, drive, output)
+            state = take_tick(i, x, parameters, state, port, tick_inputs, output)
             to_tick = port.tick_every
             i += 1
         if to_record == 0:

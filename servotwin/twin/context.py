@@ -1,4 +1,4 @@
-"""What an estimate was computed under: versions, model and settings, as text under its digest.
+"""Context of an estimate: versions, model and settings under which it was computed, as text under its digest.
 
 Under an equal context an equal window with an equal prior gives an equal estimate, bit for bit. Under another one it
 need not: then the parts that differ are named. Model and settings can be made again from the text.
@@ -61,7 +61,7 @@ def parts_of(context: str) -> dict[str, str]:
 
 
 def differing(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...]:
-    """What two contexts do not agree on, each part with both values."""
+    """Parts in which two contexts differ, each with both values."""
     keys = (key for key in sorted({*then, *now}) if then.get(key) != now.get(key))
     return tuple(f"{key} {then.get(key, 'unknown')} then, {now.get(key, 'unknown')} now" for key in keys)
 

@@ -1,4 +1,4 @@
-"""Which model and which settings the twin of each servo has; many servos share one model.
+"""Registry of models: model and settings of the twin of each servo; many servos share one model.
 
 In a file::
 
@@ -44,7 +44,7 @@ MAX_MODELS = 256
 
 @dataclass(frozen=True)
 class ServoModel:
-    """What the twins of equal servos have in common.
+    """Model and settings of the twins of equal servos.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class ModelRegistry:
 
     @classmethod
     def read(cls, table: Table, folder: Path) -> ModelRegistry:
-        """What [models] and [servos] of a twin's file say; paths are relative to `folder`.
+        """Read [models] and [servos] of a twin's file; paths are relative to `folder`.
 
         Other keys of the table are left to others, who have to ask for them before `table.done()`.
 
@@ -199,7 +199,7 @@ def _servo(table: Table, folder: Path) -> Servo:
 
 
 def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
-    """What an edge begins with, as `Scenario.start` has it; `own`: the gains are the servo's own."""
+    """First setting of an edge, as in `Scenario.start`; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
         return None if own else Setting(0.0, gains_of(law))
     k_dz = 1.0 if settings.k_dz is None else settings.k_dz

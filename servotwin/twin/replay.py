@@ -17,7 +17,7 @@ from servotwin.twin.models import ServoModel
 
 
 class Replayed(NamedTuple):
-    """What came of it.
+    """Result of a replay.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import Answer, Outcome, Probe, Request, Setting, WindowMessage
+from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
@@ -46,7 +46,7 @@ class RequestState(Struct, frozen=True):
             excitation = changed(excitation, probed=now)
         return replace(self, attempts=self.attempts.not_after(now), excitation=excitation)
 
-    def closed(self, outcome: Outcome | None) -> RequestState:
+    def closed(self, outcome: RequestOutcome | None) -> RequestState:
         """With the pending request over; outcome None: the edge never answered."""
         assert self.pending is not None
         return replace(self, excitation=self.excitation.answered(self.pending.ask, outcome), pending=None)
@@ -126,7 +126,7 @@ class Requests:
         pending = state.pending
         if pending is None or (answer.boot, answer.serial) != (pending.boot, pending.serial) or answer.outcome.passing:
             return state, None
-        if answer.outcome is not Outcome.DUPLICATE:
+        if answer.outcome is not RequestOutcome.DUPLICATE:
             return state.closed(answer.outcome), None
         serial = max(state.serial, answer.newest) + 1
         again = replace(pending, serial=serial)

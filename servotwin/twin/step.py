@@ -283,7 +283,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
 
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
-    """What the policy makes of the evidence; nothing, and why, where it is not consulted or finds nothing."""
+    """Consult the policy; no setting, with the reason, where it is not consulted or finds none."""
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)

@@ -79,7 +79,7 @@ class TriageState(Struct, frozen=True):
 
 
 class Glance(Struct, frozen=True):
-    """What a glance saw.
+    """Result of a glance.
 
     Attributes
     ----------
@@ -90,9 +90,9 @@ class Glance(Struct, frozen=True):
     bias, bias_std : float
         V; NaN and inf where nothing rests.
     moved : bool
-        Whether the window is to be estimated.
+        True where the window is to be estimated.
     why : str
-        Why, in words; where it is not, what was found.
+        The reason, in words; where it is not, what was found.
     """
 
     gap: float
@@ -105,7 +105,7 @@ class Glance(Struct, frozen=True):
 
 
 def due(message: WindowMessage, state: TriageState, settings: TriageSettings) -> str:
-    """Why a window is estimated whatever it shows; empty: a glance may be enough."""
+    """Reason to estimate a window whatever it shows; empty: a glance may be enough."""
     if state.doubt:
         return state.doubt
     if message.boot != state.boot:
@@ -120,7 +120,7 @@ def due(message: WindowMessage, state: TriageState, settings: TriageSettings) ->
 
 
 def in_vain(message: WindowMessage, state: TriageState) -> str:
-    """Why a window is not even looked at: estimates of such windows have said nothing lately; empty: it is.
+    """Reason to skip a window without a glance: estimates of such windows have not counted lately; empty: none.
 
     A loop that always shows one contact, of an encoder whose offset is not known, would be estimated for ever.
     """
@@ -138,7 +138,7 @@ def glance(
     offset: tuple[float, float] | None = None,
     settings: TriageSettings | None = None,
 ) -> Glance:
-    """Whether a window has to be estimated.
+    """Glance at a window: does it have to be estimated?
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def _blind(why: str, moved: bool = True) -> Glance:
 
 
 def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
-    """Why a glance cannot say whether the gap moved."""
+    """Reason why a glance cannot decide whether the gap moved; empty: none."""
     if not seen.settled:
         return "the plain fit did not converge"
     if not seen.std <= settings.widest:
@@ -180,7 +180,7 @@ def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
 
 
 def _moved(seen: Glance, state: TriageState, settings: TriageSettings) -> str:
-    """What moved since the last estimate, in words; empty: nothing."""
+    """Change since the last estimate, in words; empty: none."""
     off = abs(seen.gap - state.gap)
     if not off <= allowed(math.hypot(seen.std, state.std), settings):
         now, before = math.degrees(seen.gap), math.degrees(state.gap)

@@ -34,7 +34,7 @@ def test_the_report_stands_alone(shown):
 
 def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does():
     found = demo.compare(*demo.scenarios("paper"), Console(file=io.StringIO()))
-    rows = demo.verdicts(found)
+    rows = demo.demo_steps(found)
     assert [row.twinned.settled for row in rows] == [True] * 10
     assert max(row.left for row in rows) < 5e-6
     # Wear from 2 deg on: alone every step oscillates, and more the larger the gap; the published dead zone hunts too.

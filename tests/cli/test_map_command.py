@@ -18,13 +18,13 @@ from servotwin.analysis.maps.measures import measured
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.analysis.maps.store import MapStore
 from servotwin.cli import app as cli
-from servotwin.cli.map import table
+from servotwin.cli.map import summary
 from servotwin.cli.map.command import stability_map
-from servotwin.cli.map.request import Request, parsed
+from servotwin.cli.map.options import MapOptions, parsed
 from servotwin.errors import InvalidInput
 
 SMALL = ("--tolerance", "0.5:3:6", "--amplitude", "1:100:6:log", "--members", "3", "--duration", "40", "--window", "20")
-REQUEST = Request("paper", "0.5:3:6", "1:100:6:log", members=3, duration=40.0, window=20.0)
+REQUEST = MapOptions("paper", "0.5:3:6", "1:100:6:log", members=3, duration=40.0, window=20.0)
 FILES = ("map.npz", "map.csv", "map.txt")
 
 
@@ -71,7 +71,7 @@ def test_the_files_hold_the_map(finished):
 def test_the_table_is_what_the_cells_say(finished):
     settings = REQUEST.settings()
     whole = StabilityMap(settings, measured(settings, range(settings.count)))
-    value, numbers = table.rows(whole)[2]
+    value, numbers = summary.rows(whole)[2]
     settled = whole.grid("settled")[2]
     assert value == pytest.approx(1.5)
     assert numbers[:2] == pytest.approx([100.0 * np.mean(settled == 1.0), 100.0 * np.mean(settled)])
@@ -238,7 +238,7 @@ def test_a_scheduler_out_of_reach_is_one_sentence(tmp_path):
     ],
 )
 def test_as_many_axes_as_vary_are_drawn(tmp_path, axes, size):
-    found = stability_map(Request("table1", members=1, duration=12.0, window=10.0, **axes), tmp_path, workers=1)
+    found = stability_map(MapOptions("table1", members=1, duration=12.0, window=10.0, **axes), tmp_path, workers=1)
     assert sum(len(values) > 1 for _, values in found.axes) == size
     assert image.imread(tmp_path / "map.png").std() > 0.05
 

@@ -12,7 +12,7 @@ from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.link.simulated import LinkSettings
-from servotwin.messages import LongerWindow, Outcome, Probe, Request
+from servotwin.messages import LongerWindow, Probe, Request, RequestOutcome
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Samples, SignalLike, SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
@@ -47,7 +47,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
     assert [status for _, status in kinds(loop)][:2] == [GapStatus.UNIDENTIFIABLE] * 2
     (request,) = loop.requests
     assert request.ask == LongerWindow(2.0, 0.3)
-    assert [answer.outcome for answer in loop.answers] == [Outcome.TAKEN]
+    assert [answer.outcome for answer in loop.answers] == [RequestOutcome.TAKEN]
     (found,) = loop.estimates[2:]
     assert (found.status, loop.windows[2].samples) == (GapStatus.OK, 10_000)
     assert error(loop, 2) < 1e-3
@@ -57,7 +57,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
 def test_an_edge_that_sends_no_longer_windows_says_so_and_is_not_asked_again() -> None:
     short = Recording(window=1.0, pre_trigger=0.0)
     loop = cosimulate(calm(ExcitationSettings(), recording=short, reference=SquareWave(1e-3, 20.0), duration=50.0))
-    assert [answer.outcome for answer in loop.answers] == [Outcome.TOO_LARGE]
+    assert [answer.outcome for answer in loop.answers] == [RequestOutcome.TOO_LARGE]
     assert not any(estimate.ok for estimate in loop.estimates)
     last = loop.excitations[-1].reason
     assert last.endswith("longer ones are refused, and a probing move is not allowed")
@@ -144,7 +144,7 @@ def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
         loop = cosimulate(scenario.replace(downlink=bad, recording=recording, twin=twin, duration=60.0))
         sent = [m.message for m in loop.messages if m.direction == "down" and isinstance(m.message, Request)]
         assert {request.serial for request in sent} == {request.serial for request in loop.requests}
-        assert {answer.outcome for answer in loop.answers} == {Outcome.TAKEN}
+        assert {answer.outcome for answer in loop.answers} == {RequestOutcome.TAKEN}
         assert len(set(loop.answers)) == len({answer.serial for answer in loop.answers})
         assert loop.windows[-1].samples == 10_000
         assert loop.digest() == cosimulate(loop.scenario).digest()

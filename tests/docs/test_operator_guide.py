@@ -19,11 +19,11 @@ import typer.main
 from service_system import twin_file
 
 from servotwin.cli.app import app
-from servotwin.cli.audit_text import HEAD
+from servotwin.cli.audit_report import HEAD
 from servotwin.edge import outlet
 from servotwin.edge_process import outlet as pipe_outlet
 from servotwin.link import outbox, sqlite_outbox
-from servotwin.messages import Cause, Outcome, Reason, Refusal
+from servotwin.messages import Cause, Reason, Refusal, RequestOutcome
 from servotwin.store.records import Backlog
 from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import ALARMS
@@ -107,7 +107,7 @@ def test_every_refusal_is_explained_with_what_becomes_of_the_message() -> None:
         assert table[refusal.value][2] == ("kept" if refusal.passing else "dropped"), refusal
 
 
-@pytest.mark.parametrize(("title", "names"), [("Updates", Reason), ("Requests", Outcome), ("Fallbacks", Cause)])
+@pytest.mark.parametrize(("title", "names"), [("Updates", Reason), ("Requests", RequestOutcome), ("Fallbacks", Cause)])
 def test_every_answer_and_every_cause_is_explained(title: str, names: Any) -> None:
     assert sorted(named(title)) == sorted(each.value for each in names)
 

@@ -27,7 +27,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Setting
 from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.simulation import Run, Simulation
-from servotwin.simulation.splice import shifted
+from servotwin.simulation.inputs import shifted
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
 SOFTER = {"Kp": 1000.0, "Ki": 9000.0, "leave": 1.4, "feedforward": 0.02}

@@ -20,9 +20,9 @@ from servotwin.messages import (
     Fallback,
     LongerWindow,
     Message,
-    Outcome,
     Probe,
     Request,
+    RequestOutcome,
     Setting,
     WindowMessage,
     unpack_channel,
@@ -72,7 +72,7 @@ def windows(sent: list[Message]) -> list[WindowMessage]:
 def test_a_longer_window_counts_from_the_next_change_on() -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 9 + [1e-3])
-    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer("axis-1", "b0", 1, 10, Outcome.TAKEN, 1)
+    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer("axis-1", "b0", 1, 10, RequestOutcome.TAKEN, 1)
     (short,) = windows(feed(agent, [1e-3] * 20))
     (longer,) = windows(feed(agent, [0.0] * 20))
     assert (short.start, short.samples) == (0.9, 8)
@@ -89,7 +89,7 @@ def test_windows_never_get_shorter_than_configured() -> None:
 def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> None:
     agent = Agent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
-    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, Outcome.TAKEN, 1)
+    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, RequestOutcome.TAKEN, 1)
     sent = feed(agent, [2e-3] * 40)
     (window,) = windows(sent)
     assert (window.reason, window.start, window.samples) == ("probe", 2.8, 18)
@@ -132,32 +132,32 @@ def test_a_law_that_ignores_the_offset_ends_the_move() -> None:
 def test_without_permission_no_move() -> None:
     agent = Agent(settings(probe=None))
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()) == Answer("axis-1", "b0", 1, 30, Outcome.NOT_ALLOWED, 1)
+    assert answer(agent, request()) == Answer("axis-1", "b0", 1, 30, RequestOutcome.NOT_ALLOWED, 1)
     assert agent.offset == 0.0
 
 
 @pytest.mark.parametrize(
     ("message", "outcome"),
     [
-        (request(servo="axis-2"), Outcome.WRONG_SERVO),
-        (request(boot="b1"), Outcome.OTHER_BOOT),
-        (request(not_after=3.0), Outcome.EXPIRED),
-        (request(ask=Probe(1.001e-3, 0.4)), Outcome.TOO_LARGE),
-        (request(ask=Probe(-1.001e-3, 0.4)), Outcome.TOO_LARGE),
-        (request(ask=Probe(1e-3, 1.1)), Outcome.TOO_LARGE),
-        (request(ask=Probe(1e-3, 0.4, 3)), Outcome.TOO_LARGE),
-        (request(ask=LongerWindow(2.1, 0.3)), Outcome.TOO_LARGE),
-        (request(ask=LongerWindow(2.0, 0.6)), Outcome.TOO_LARGE),
-        (request(ask=Probe(-1e-3, 1.0)), Outcome.TAKEN),
-        (request(ask=LongerWindow(2.0, 0.5)), Outcome.TAKEN),
+        (request(servo="axis-2"), RequestOutcome.WRONG_SERVO),
+        (request(boot="b1"), RequestOutcome.OTHER_BOOT),
+        (request(not_after=3.0), RequestOutcome.EXPIRED),
+        (request(ask=Probe(1.001e-3, 0.4)), RequestOutcome.TOO_LARGE),
+        (request(ask=Probe(-1.001e-3, 0.4)), RequestOutcome.TOO_LARGE),
+        (request(ask=Probe(1e-3, 1.1)), RequestOutcome.TOO_LARGE),
+        (request(ask=Probe(1e-3, 0.4, 3)), RequestOutcome.TOO_LARGE),
+        (request(ask=LongerWindow(2.1, 0.3)), RequestOutcome.TOO_LARGE),
+        (request(ask=LongerWindow(2.0, 0.6)), RequestOutcome.TOO_LARGE),
+        (request(ask=Probe(-1e-3, 1.0)), RequestOutcome.TAKEN),
+        (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.TAKEN),
     ],
 )
-def test_what_is_refused_and_why(message: Request, outcome: Outcome) -> None:
+def test_what_is_refused_and_why(message: Request, outcome: RequestOutcome) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
     before = agent._requests
     assert answer(agent, message).outcome is outcome
-    assert (replace(agent._requests, answer=None) == before) == (outcome is not Outcome.TAKEN)
+    assert (replace(agent._requests, answer=None) == before) == (outcome is not RequestOutcome.TAKEN)
 
 
 def test_a_request_counts_once_and_is_answered_again() -> None:
@@ -169,7 +169,7 @@ def test_a_request_counts_once_and_is_answered_again() -> None:
     assert agent.probe is None
     assert answer(agent, request(serial=4, ask=LongerWindow(1.5, 0.3))).taken
     late = answer(agent, request(serial=2))
-    assert (late.outcome, late.newest) == (Outcome.DUPLICATE, 4)
+    assert (late.outcome, late.newest) == (RequestOutcome.DUPLICATE, 4)
 
 
 @pytest.mark.parametrize("fed", [0, 3, 31, 35])
@@ -177,7 +177,7 @@ def test_only_at_rest(fed: int) -> None:
     """Before anything rested, and while a window is recorded."""
     agent = Agent(settings())
     feed(agent, ([0.0] * 30 + [1e-3] * 10)[:fed])
-    assert answer(agent, request()) == Answer("axis-1", "b0", 1, fed, Outcome.BUSY, 0)
+    assert answer(agent, request()) == Answer("axis-1", "b0", 1, fed, RequestOutcome.BUSY, 0)
     feed(agent, [1e-3] * 30)
     assert answer(agent, request()).taken
 
@@ -187,7 +187,7 @@ def test_moves_keep_their_distance_and_the_same_request_may_come_again() -> None
     feed(agent, [0.0] * 30)
     assert answer(agent, request()).taken
     feed(agent, [0.0] * 49)
-    assert answer(agent, request(serial=2)).outcome is Outcome.TOO_SOON
+    assert answer(agent, request(serial=2)).outcome is RequestOutcome.TOO_SOON
     feed(agent, [0.0])
     assert answer(agent, request(serial=2)).taken
 

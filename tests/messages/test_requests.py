@@ -13,9 +13,9 @@ from servotwin.messages import (
     Ask,
     InvalidMessage,
     LongerWindow,
-    Outcome,
     Probe,
     Request,
+    RequestOutcome,
     decode,
     decode_json,
     encode,
@@ -42,9 +42,9 @@ def test_requests_survive_the_bytes(
     assert len(encode(request)) < 1500
 
 
-@given(NAMES, NAMES, COUNTS, COUNTS, st.sampled_from(Outcome), COUNTS)
+@given(NAMES, NAMES, COUNTS, COUNTS, st.sampled_from(RequestOutcome), COUNTS)
 def test_answers_survive_the_bytes(
-    servo: str, boot: str, serial: int, sample: int, outcome: Outcome, newest: int
+    servo: str, boot: str, serial: int, sample: int, outcome: RequestOutcome, newest: int
 ) -> None:
     answer = Answer(servo, boot, serial, sample, outcome, newest)
     assert decode(encode(answer)) == answer
@@ -93,4 +93,4 @@ def test_cut_and_random_bytes_are_refused(noise: bytes) -> None:
 
 
 def test_what_may_be_taken_later() -> None:
-    assert {outcome for outcome in Outcome if outcome.passing} == {Outcome.BUSY, Outcome.TOO_SOON}
+    assert {outcome for outcome in RequestOutcome if outcome.passing} == {RequestOutcome.BUSY, RequestOutcome.TOO_SOON}

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
-from servotwin.messages import Ask, LongerWindow, Outcome, Probe
+from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 from servotwin.redesign.excitation import (
     Decision,
     ExcitationPolicy,
@@ -59,7 +59,7 @@ def test_what_is_known_and_what_no_motion_cures_begin_the_count_anew(status: Gap
 
 
 def test_a_probe_comes_only_after_long_windows_have_failed_as_often() -> None:
-    taken = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), Outcome.TAKEN)
+    taken = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), RequestOutcome.TAKEN)
     found = asks(ALLOWED, [SHORT, LONG, LONG], taken)
     assert found[:2] == [None, None]
     assert found[2] == Probe(PITCH * 25.0 * DEG, 0.85, 1)
@@ -70,7 +70,7 @@ def test_where_windows_are_long_already_nothing_else_is_asked_for_first() -> Non
 
 
 def test_where_long_windows_are_refused_the_probe_is_what_is_left() -> None:
-    refused = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), Outcome.TOO_LARGE)
+    refused = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), RequestOutcome.TOO_LARGE)
     assert isinstance(asks(ALLOWED, [SHORT, SHORT], refused)[-1], Probe)
 
 
@@ -106,8 +106,8 @@ def test_what_is_not_bounded_is_not_probed(change: dict[str, float]) -> None:
     assert "bounded" in found.reason
 
 
-@pytest.mark.parametrize("outcome", [Outcome.NOT_ALLOWED, Outcome.TOO_LARGE])
-def test_an_edge_that_refuses_is_not_asked_again_before_it_boots(outcome: Outcome) -> None:
+@pytest.mark.parametrize("outcome", [RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE])
+def test_an_edge_that_refuses_is_not_asked_again_before_it_boots(outcome: RequestOutcome) -> None:
     late = replace(LONG, time=1e6)
     refused = run(ALLOWED, [LONG, LONG])[-1].state.answered(Probe(1e-4, 0.85), outcome)
     assert asks(ALLOWED, [late] * 5, refused) == [None] * 5

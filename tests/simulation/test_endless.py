@@ -14,7 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Simulation
-from servotwin.simulation.held import Held
+from servotwin.simulation.endless import OpenLoopPlant
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
 DEGREE = np.pi / 180.0
@@ -104,7 +104,7 @@ def test_a_held_voltage_is_the_law_s_own_run(monkeypatch: pytest.MonkeyPatch) ->
     """Across stretches of the reference, the gap's knots and chunks of the inputs."""
     monkeypatch.setattr("servotwin.simulation.endless.STRETCH", 11.0)
     scenario = worn(30.0)
-    whole, held = simulation_of(scenario), Held(endless(scenario, keep=64))
+    whole, held = simulation_of(scenario), OpenLoopPlant(endless(scenario, keep=64))
     whole.advance(whole.samples - 1)
     run, state = whole.run(), law.start(0.0)
     parameters = scenario.start_law.law(scenario.start_tolerance)
@@ -121,7 +121,7 @@ def test_a_held_voltage_is_the_law_s_own_run(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_must_be_ticks_where_the_voltage_comes_from_outside() -> None:
     with pytest.raises(InvalidInput, match=r"controller sample_rate = 500\.0 Hz: must be the recording's, 1000\.0 Hz"):
-        Held(endless(worn(20.0, 1000.0, 500.0), keep=64))
+        OpenLoopPlant(endless(worn(20.0, 1000.0, 500.0), keep=64))
 
 
 def test_a_pace_catches_up_and_gives_up_what_is_beyond_its_slack() -> None:

@@ -9,8 +9,7 @@ from servotwin.hybrid.ensemble import Members, run_ensemble, run_family
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.servo import Servo
 from servotwin.simulation import simulate
-from servotwin.simulation.cases import Cases
-from servotwin.simulation.ensemble import simulate_ensemble, simulate_members, summarise_members
+from servotwin.simulation.ensemble import Cases, simulate_ensemble, simulate_members, summarise_members
 
 DEGREE = np.pi / 180.0
 TABLE1 = Servo.preset("table1")

@@ -15,7 +15,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave, as_pieces
 from servotwin.simulation import simulate
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.run import Inputs
+from servotwin.simulation.inputs import RunInputs
 
 DEGREE = math.pi / 180.0
 RATE = 1000.0
@@ -27,7 +27,7 @@ def engine(
     pieces = {"reference": 0.0, "gap": 0.0, **signals}
     inputs = {name: as_pieces(value, duration) for name, value in pieces.items()}
     made = ContinuousEngine(
-        servo, servo.controller, Inputs(**{"tolerance": None, **inputs}, sample_rate=RATE), theta_d0, refine
+        servo, servo.controller, RunInputs(**{"tolerance": None, **inputs}, sample_rate=RATE), theta_d0, refine
     )
     made.advance(round(duration * RATE))
     return made

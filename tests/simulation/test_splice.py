@@ -12,7 +12,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SignalLike, SquareWave, Step
 from servotwin.simulation import Run, Simulation, simulate
-from servotwin.simulation.splice import about, shifted, spliced
+from servotwin.simulation.inputs import about, shifted, spliced
 
 PAPER = Servo.preset("paper")
 RATES = [None, 1000.0, 200.0]

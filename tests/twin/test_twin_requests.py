@@ -8,7 +8,7 @@ import pytest
 from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
-from servotwin.messages import Answer, LongerWindow, Outcome, Probe, Setting, pack_channel
+from servotwin.messages import Answer, LongerWindow, Probe, RequestOutcome, Setting, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.evidence import EvidenceLog
@@ -65,7 +65,7 @@ def asked(twin: Twin, *windows) -> list[messages.Request]:
     return requests([message for each in windows for message in twin.receive(each, each.start + 3.0)])
 
 
-def answer(request, outcome=Outcome.TAKEN, newest=None) -> Answer:
+def answer(request, outcome=RequestOutcome.TAKEN, newest=None) -> Answer:
     return Answer("axis", request.boot, request.serial, 1000, outcome, request.serial if newest is None else newest)
 
 
@@ -99,8 +99,8 @@ def test_it_is_given_up_and_made_again_after_more_windows() -> None:
     assert len(store.requests) == 2
 
 
-@pytest.mark.parametrize("outcome", [Outcome.BUSY, Outcome.TOO_SOON])
-def test_a_bad_moment_is_no_answer(outcome: Outcome) -> None:
+@pytest.mark.parametrize("outcome", [RequestOutcome.BUSY, RequestOutcome.TOO_SOON])
+def test_a_bad_moment_is_no_answer(outcome: RequestOutcome) -> None:
     twin, _ = make()
     (request,) = asked(twin, long(0), long(1))
     assert isinstance(request.ask, Probe)
@@ -111,10 +111,10 @@ def test_a_bad_moment_is_no_answer(outcome: Outcome) -> None:
 def test_a_twin_that_forgot_its_numbers_goes_on_from_the_edges() -> None:
     twin, store = make()
     (request,) = asked(twin, window(0), window(1))
-    (renumbered,) = requests(twin.receive(answer(request, Outcome.DUPLICATE, newest=7), 19.0))
+    (renumbered,) = requests(twin.receive(answer(request, RequestOutcome.DUPLICATE, newest=7), 19.0))
     assert (renumbered.serial, renumbered.ask) == (8, request.ask)
     assert store.requests == [request, renumbered]
-    assert twin.receive(answer(request, Outcome.DUPLICATE, newest=7), 19.5) == []
+    assert twin.receive(answer(request, RequestOutcome.DUPLICATE, newest=7), 19.5) == []
 
 
 def test_a_probe_that_is_not_needed_any_more_is_not_repeated() -> None:
@@ -182,6 +182,6 @@ def test_without_settings_answers_are_kept_and_nothing_is_asked() -> None:
     twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), START, Says()))
     store = twin.log
     assert asked(twin, window(0), window(1), window(2)) == []
-    late = Answer("axis", "b0", 1, 0, Outcome.TAKEN, 1)
+    late = Answer("axis", "b0", 1, 0, RequestOutcome.TAKEN, 1)
     assert twin.receive(late, 50.0) == []
     assert store.answers == [late]

@@ -8,15 +8,15 @@ from rich.console import Console
 
 from servotwin.analysis.maps.result import StabilityMap, write_numbers
 from servotwin.analysis.maps.store import MapStore, collected, compute
-from servotwin.cli.map import table
-from servotwin.cli.map.request import Request
+from servotwin.cli.map import summary
+from servotwin.cli.map.options import MapOptions
 from servotwin.errors import InvalidInput
 from servotwin.runtime import files
 from servotwin.runtime.extras import check_extra
 
 
 def stability_map(
-    request: Request,
+    request: MapOptions,
     out: Path,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -26,7 +26,7 @@ def stability_map(
 
     Parameters
     ----------
-    request : Request
+    request : MapOptions
     out : Path
         Made if missing. Gets settings.json and chunks/, from which an interrupted map goes on; map.npz, map.csv,
         map.txt and map.png.
@@ -57,8 +57,8 @@ def stability_map(
     compute(store, workers, scheduler, console)
     found = StabilityMap(settings, collected(store))
     write_numbers(found, out)
-    files.write_text(out / "map.txt", table.text(found))
-    table.tell(found, console)
+    files.write_text(out / "map.txt", summary.text(found))
+    summary.tell(found, console)
     from servotwin.cli.map import figure
 
     path = figure.save(found, out)

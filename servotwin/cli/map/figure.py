@@ -35,7 +35,7 @@ _ACROSS = ("tolerance", "k_dz", "estimate", "gap", "amplitude")
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class PictureAxis:
     """An axis of the picture: its name, its label and its values in the label's unit."""
 
     name: str
@@ -44,7 +44,7 @@ class Line:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the values grow by ratios rather than by differences."""
+        """True where the values grow by ratios rather than by differences."""
         if self.values.size < 3 or self.values.min() <= 0.0:
             return False
         steps, ratios = np.diff(self.values), np.diff(np.log(self.values))
@@ -71,31 +71,31 @@ def draw(found: StabilityMap) -> Figure:
     return _sheet(found, varying)
 
 
-def lines(found: StabilityMap) -> list[Line]:
+def lines(found: StabilityMap) -> list[PictureAxis]:
     """The axes that vary."""
     labels = _RATIO_LABELS if isinstance(found.settings.axes, RatioAxes) else _LABELS
     return [
-        Line(name, labels[name][0], np.array(values) * labels[name][1])
+        PictureAxis(name, labels[name][0], np.array(values) * labels[name][1])
         for name, values in found.axes
         if len(values) > 1
     ]
 
 
-def _order(pair: Sequence[Line]) -> tuple[Line, Line]:
+def _order(pair: Sequence[PictureAxis]) -> tuple[PictureAxis, PictureAxis]:
     """Across, up."""
     across, up = sorted(pair, key=lambda line: _ACROSS.index(line.name))
     return across, up
 
 
 def _unit(found: StabilityMap) -> tuple[float, str]:
-    """What lengths are divided by, and its name."""
+    """Unit of lengths and its name."""
     axes = found.settings.axes
     if isinstance(axes, RatioAxes):
         return 0.5 * found.settings.servo.p * axes.gap, "p b"
     return 1e-3, "mm"
 
 
-def _panels(found: StabilityMap, across: Line, up: Line) -> Figure:
+def _panels(found: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure:
     figure = style.sheet(7.2, 7.8)
     axes = figure.subplots(3, 2, sharex=True)
     unit, name = _unit(found)
@@ -146,7 +146,7 @@ def _norm(values: Array, least: float = 0.0) -> Normalize:
     return LogNorm(low, high, clip=True) if low < high else Normalize()
 
 
-def _colour(axes: Axes, across: Line, up: Line, values: Array, norm: Normalize) -> None:
+def _colour(axes: Axes, across: PictureAxis, up: PictureAxis, values: Array, norm: Normalize) -> None:
     image = axes.pcolormesh(
         across.values, up.values, np.where(np.isfinite(values), values, np.nan), norm=norm, rasterized=True,
         shading="nearest",
@@ -161,7 +161,7 @@ def _colour(axes: Axes, across: Line, up: Line, values: Array, norm: Normalize) 
     _scales(axes, across, up)
 
 
-def _scales(axes: Axes, across: Line, up: Line | None = None) -> None:
+def _scales(axes: Axes, across: PictureAxis, up: PictureAxis | None = None) -> None:
     axes.grid(False)
     if across.logarithmic:
         axes.set_xscale("log")
@@ -169,7 +169,7 @@ def _scales(axes: Axes, across: Line, up: Line | None = None) -> None:
         axes.set_yscale("log")
 
 
-def _rule(axes: Axes, across: Line) -> None:
+def _rule(axes: Axes, across: PictureAxis) -> None:
     """The paper's k_DZ along the top, for a gap that is known exactly."""
     if across.name != "tolerance" or across.logarithmic:
         return
@@ -178,13 +178,13 @@ def _rule(axes: Axes, across: Line) -> None:
     above.tick_params(labelsize=7.5)
 
 
-def _mark(axes: Axes, across: Line, up: Line, where: NDArray[np.bool_]) -> None:
+def _mark(axes: Axes, across: PictureAxis, up: PictureAxis, where: NDArray[np.bool_]) -> None:
     """Cells in which the conventional ten seconds would mislead."""
     rows, columns = np.nonzero(where)
     axes.plot(across.values[columns], up.values[rows], **_DOT)
 
 
-def _shares(axes: Axes, across: Line, settled: Array, marked: bool) -> None:
+def _shares(axes: Axes, across: PictureAxis, settled: Array, marked: bool) -> None:
     axes.plot(across.values, 100.0 * settled.mean(axis=0), color=style.BLUE, label="runs that settle")
     full = 100.0 * np.mean(settled == 1.0, axis=0)
     axes.plot(across.values, full, color=style.RED, label="cells in which all do")
@@ -196,7 +196,7 @@ def _shares(axes: Axes, across: Line, settled: Array, marked: bool) -> None:
     axes.grid(True)
 
 
-def _curves(found: StabilityMap, across: Line) -> Figure:
+def _curves(found: StabilityMap, across: PictureAxis) -> Figure:
     figure, axes = style.panels(4, 1, height=1.7)
     unit, name = _unit(found)
     flat = {measure: found.grid(measure).ravel() for measure in ("settled", "error", "swing", "settling", "effort")}
@@ -216,7 +216,7 @@ def _curves(found: StabilityMap, across: Line) -> Figure:
     return figure
 
 
-def _sheet(found: StabilityMap, varying: Sequence[Line]) -> Figure:
+def _sheet(found: StabilityMap, varying: Sequence[PictureAxis]) -> Figure:
     """The share that settles, over the two longest axes, once for each value of the others."""
     longest = sorted(varying, key=lambda line: -line.values.size)[:2]
     across, up = _order(longest)

@@ -16,7 +16,7 @@ from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.messages import Gains
-from servotwin.simulation.held import Held
+from servotwin.simulation.endless import OpenLoopPlant
 
 KEPT = 1024
 """Samples that a machine without a controller remembers: nobody asks for them."""
@@ -33,7 +33,7 @@ class ControlledPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._held = Held(machine.endless(settings.present, KEPT))
+        self._held = OpenLoopPlant(machine.endless(settings.present, KEPT))
         self._end, self._patience = settings.end, settings.watchdog * settings.rate
         self._voltage, self._unattended = 0.0, 0
         self.sample: Callable[[], tuple[float, float, float]] = self._held.sample

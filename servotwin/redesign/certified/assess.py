@@ -13,8 +13,7 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
-from servotwin.simulation.cases import Cases
-from servotwin.simulation.ensemble import summarise_members
+from servotwin.simulation.ensemble import Cases, summarise_members
 
 STILL = 1e-6
 """m: half peak-to-peak of the error below which a loop counts as settled."""

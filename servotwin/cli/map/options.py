@@ -1,4 +1,4 @@
-"""What was asked for on the command line, made into settings."""
+"""Options of `servotwin map`, parsed into settings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLERANCE, AMPLITUDE = "0:5:64", "0.5:500:64:log"
 
 
 @dataclass(frozen=True)
-class Request:
+class MapOptions:
     """The options of `servotwin map` that the numbers depend on; None: not given."""
 
     servo: str

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from servotwin.cli.audit_text import HEAD, lines_of
+from servotwin.cli.audit_report import HEAD, lines_of
 from servotwin.messages import Cause
 
 SERVO = {
@@ -58,13 +58,13 @@ def test_the_head_says_how_it_stands() -> None:
     trend = found("trend", body={"mean": [0.1, math.radians(0.5) / 3600.0, 0.0], "covariance": [0.0] * 9})
     head = told(link(1, estimate(), trend, found("disturbance", body={"bias": 0.02, "noise": 2e-6})))[:3]
     assert head == [
-        "servo ax-1: gap 7.500 ± 0.020 deg (ok), version 3 (applied)",
-        "  windows: 42 stored, 1 messages wait, last heard of 1970-01-01 00:00:00 UTC",
-        "  wear 0.5 ± 0 deg/h, input bias 20.0 mV, noise 2.0 um",
+        "servo ax-1: gap 7.500 ± 0.039 deg (95 %; ok), version 3 (applied)",
+        "  windows: 42 stored, 1 messages pending, last message 1970-01-01 00:00:00 UTC",
+        "  wear 0.5 ± 0 deg/h (95 %), input bias 20.0 mV, noise 2.0 um",
     ]
     assert told(link(1), gap=None, version=None, receipt="", heard=None)[:2] == [
         "servo ax-1: no gap known, no version sent",
-        "  windows: 42 stored, 1 messages wait",
+        "  windows: 42 stored, 1 messages pending",
     ]
 
 
@@ -77,8 +77,8 @@ def test_a_version_from_its_window_to_its_effect() -> None:
     lines = chain(first, link(2, after, found("redesign", "what was proved is in force already")))
     assert lines[0] == "boot b1"
     assert [line[HEAD.index("what followed") :] for line in lines[1:]] == [
-        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, proved on 256 "
-        "machines",
+        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, verified on 256 "
+        "simulated machines",
         "version 3 applied at sample 5000",
         "version 3 in window 2: error 12.3 -> 5.0 um",
         "what was proved is in force already",
@@ -89,19 +89,19 @@ def test_a_version_from_its_window_to_its_effect() -> None:
 @pytest.mark.parametrize(
     ("of", "said"),
     [
-        (link(1, done=None), "waits to be worked on"),
+        (link(1, done=None), "waits to be processed"),
         (link(1, found("estimate", "failed: ValueError: no")), "failed: ValueError: no"),
-        (link(1, found("glance", "nothing moved", gap=0.1)), "a glance was enough: nothing moved"),
+        (link(1, found("glance", "nothing moved", gap=0.1)), "screening was enough: no new information"),
         (link(1, found("glance", "it moved"), estimate()), ""),
         (link(1, estimate("lower bound", body={"estimate": {"reasons": ["one side"]}})), "lower bound: one side"),
         (link(1, estimate("lower bound")), "lower bound: no reason noted"),
         (link(1, estimate("lower bound"), found("redesign", "it is a lower bound")), "it is a lower bound"),
         (link(1, estimate(), found("trend", "an outlier")), "trend: an outlier"),
-        (link(1, estimate(), found("redesign", "")), "a setting was found, and waits to be sent"),
+        (link(1, estimate(), found("redesign", "")), "a setting was found and waits to be sent"),
         (link(1, estimate(), found("excitation", "the window shows the gap")), ""),
         (link(1, estimate(), found("request", "windows tell too little")), "request: windows tell too little"),
-        (link(1, estimate(), found("proof", "", version=3)), "version 3 is proved for this evidence"),
-        (link(1, estimate(), found("proof", "two fail", version=3)), "version 3 FAILED its proof: two fail"),
+        (link(1, estimate(), found("proof", "", version=3)), "version 3 is verified for this evidence"),
+        (link(1, estimate(), found("proof", "two fail", version=3)), "version 3 FAILED its verification: two fail"),
         (link(1, estimate(), found("withdrawn", "two fail", version=3)), "version 3 WITHDRAWN: two fail"),
     ],
 )  # fmt: skip

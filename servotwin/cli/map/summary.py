@@ -1,4 +1,4 @@
-"""What a map says, in words and as a table along its first axis."""
+"""A stability map in words and as a table along its first axis."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _numbers(found: StabilityMap, axis: int, place: int) -> Array:
 
 
 def sentences(found: StabilityMap) -> tuple[str, ...]:
-    """What was run, what settled means, and what the map says on the whole."""
+    """Runs, definition of settled, and the shares over the whole map."""
     s, settled = found.settings, found.grid("settled")
     slow = int(found.slow.sum())
     return (

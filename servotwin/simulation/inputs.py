@@ -1,11 +1,49 @@
-"""Inputs that become others while a simulation runs."""
+"""RunInputs of a run as piecewise cubics, and how they become others while it runs."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.signals import PiecewiseCubic
+
+
+@dataclass
+class RunInputs:
+    """The inputs of a run as piecewise cubics, the rate of its samples, and what disturbs the plant all along (V
+    behind the controller, N m on the motor's shaft)."""
+
+    reference: PiecewiseCubic
+    gap: PiecewiseCubic
+    tolerance: PiecewiseCubic | None
+    sample_rate: float
+    input_bias: float = 0.0
+    friction: float = 0.0
+
+    def times(self, first: int, last: int) -> Array:
+        """Times of samples first .. last - 1, s."""
+        return np.arange(first, last) / self.sample_rate
+
+    def retune(self, time: float, tolerance: float) -> None:
+        """From `time` on the tolerance is a constant."""
+        assert self.tolerance is not None
+        keep = self.tolerance.times < time
+        times, coeffs = self.tolerance.times[keep], self.tolerance.coeffs[keep]
+        self.tolerance = PiecewiseCubic(np.append(times, time), np.vstack([coeffs, [[tolerance, 0.0, 0.0, 0.0]]]))
+
+    def jumps(self, until: float) -> list[tuple[float, str]]:
+        """Times and kinds (reference, parameter) of the inputs' jumps in (0, until]."""
+        found = [(float(t), "reference") for t in self.reference.jumps]
+        found += [(float(t), "parameter") for t in self.gap.jumps]
+        found += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
+        return sorted((time, kind) for time, kind in found if 0.0 < time <= until)
+
+
+def quantised(values: Array, resolution: float) -> Array:
+    """The nearest whole counts; resolution 0 is an ideal sensor."""
+    return values if resolution == 0.0 else np.round(values / resolution) * resolution
 
 
 def about(pieces: PiecewiseCubic, time: float) -> Array:

@@ -7,27 +7,32 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from servotwin.estimation.estimate import NORMAL_95
 from servotwin.messages import Cause
 
 DEG = 180.0 / math.pi
 HOUR = 3600.0
-SERVOS = f"{'servo':24}  {'gap, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'waits':>5}  last heard, UTC"
-"""Above `servos_line`."""
-HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap, deg':>15}  {'error, um':>9}  {'version':>7}  what followed"
-_OPEN = "a setting was found, and waits to be sent"
-Told = Mapping[str, Any]
-"""As the API tells it: a servo, a link of the chain, a piece of evidence."""
+_STATUS_HEADS = f"{'gap ± 95 %, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'pending':>7}"
+SERVOS = f"{'servo':24}  {_STATUS_HEADS}  last message, UTC"
+"""Head of the table of `servo_line`."""
+HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap ± 95 %, deg':>15}  {'error, um':>9}  {'version':>7}  what followed"
+_OPEN = "a setting was found and waits to be sent"
+_UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
+JsonObject = Mapping[str, Any]
+"""A servo, a link of the evidence chain or a piece of evidence, as the API returns it."""
 Entry = tuple[float, str, str]
-"""When (s since the epoch), the boot that it belongs to (empty: to none), and the line."""
+"""Time (s since the epoch), boot (empty: of none), and the line."""
 
 
-def lines_of(servo: Told, links: Sequence[Told], events: Iterable[Told], changes: bool = False) -> Iterator[str]:
+def lines_of(
+    servo: JsonObject, links: Sequence[JsonObject], events: Iterable[JsonObject], changes: bool = False
+) -> Iterator[str]:
     """All lines, oldest first.
 
     Parameters
     ----------
     servo : mapping
-        A `store.rows.Summary`.
+        A `store.records` summary.
     links : sequence of mappings
         Of `store.links.Link`, newest first.
     events : iterable of mappings
@@ -48,55 +53,60 @@ def lines_of(servo: Told, links: Sequence[Told], events: Iterable[Told], changes
         yield line
 
 
-def servo_line(servo: Told) -> str:
-    """One servo at a glance."""
+def servo_line(servo: JsonObject) -> str:
+    """One row of the table of servos."""
     version = "-" if servo["version"] is None else servo["version"]
     heard = "never" if servo["heard"] is None else _time(servo["heard"])
     receipt = servo["receipt"][:12] or "-"
-    status = f"{_gap(servo) or '-':>15}  {servo['status'][:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>5}"
+    status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
     return f"{servo['servo']:24}  {status}  {heard}"
 
 
-def _head(servo: Told, links: Sequence[Told]) -> Iterator[str]:
+def _status(servo: JsonObject) -> str:
+    """Status of the newest window; a healthy machine's estimate is unchanged most of the time."""
+    return "unchanged" if servo["status"] == _UNCHANGED else str(servo["status"])
+
+
+def _head(servo: JsonObject, links: Sequence[JsonObject]) -> Iterator[str]:
     """The servo as it stands, and what its newest window with a trend says."""
-    gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg ({servo['status'] or 'by a glance'})"
+    gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
     receipt = f" ({servo['receipt']})" if servo["receipt"] else ""
-    heard = "" if servo["heard"] is None else f", last heard of {_time(servo['heard'])} UTC"
+    heard = "" if servo["heard"] is None else f", last message {_time(servo['heard'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
-    yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages wait{heard}"
+    yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{heard}"
     newest = [line for line in (_wear(_of(links, "trend")), _disturbance(_of(links, "disturbance"))) if line]
     if newest:
         yield f"  {', '.join(newest)}"
 
 
-def _of(links: Sequence[Told], kind: str) -> Told:
-    """What the newest evidence of a kind holds."""
+def _of(links: Sequence[JsonObject], kind: str) -> JsonObject:
+    """Body of the newest evidence of a kind."""
     found = (one["body"] for link in links for one in reversed(link["found"]) if one["kind"] == kind and one["body"])
     return next(found, {})
 
 
-def _wear(trend: Told) -> str:
+def _wear(trend: JsonObject) -> str:
     try:
         rate, spread = trend["mean"][1] * DEG * HOUR, math.sqrt(trend["covariance"][4]) * DEG * HOUR
-        return f"wear {rate:.3g} ± {spread:.2g} deg/h"
+        return f"wear {rate:.3g} ± {NORMAL_95 * spread:.3g} deg/h (95 %)"
     except (KeyError, TypeError, ValueError, IndexError):
         return ""
 
 
-def _disturbance(found: Told) -> str:
+def _disturbance(found: JsonObject) -> str:
     known = (("bias", "input bias {:.1f} mV", 1e3), ("noise", "noise {:.1f} um", 1e6))
     given = ((text, scale, found.get(name)) for name, text, scale in known)
     return ", ".join(text.format(x * scale) for text, scale, x in given if isinstance(x, float) and math.isfinite(x))
 
 
-def _matters(link: Told) -> bool:
-    """Whether more came of it than an estimate."""
+def _matters(link: JsonObject) -> bool:
+    """True where more followed from the window than an estimate."""
     quiet = all(one["kind"] in _REMARKS for one in link["found"])
     return bool(link["steps"]) or not quiet or any(_failed(one) for one in link["found"])
 
 
-def _window(link: Told) -> Iterator[Entry]:
+def _window(link: JsonObject) -> Iterator[Entry]:
     window, seen = link["window"], _seen(link)
     remarks = [*_remarks(link)] or [""]
     of_version = "" if seen is None or seen["version"] is None else seen["version"]
@@ -107,17 +117,17 @@ def _window(link: Told) -> Iterator[Entry]:
         yield window["received"], window["boot"], f"{'':{len(HEAD) - len('what followed')}}{remark}"
 
 
-def _seen(link: Told) -> Told | None:
+def _seen(link: JsonObject) -> JsonObject | None:
     """The estimate, or the glance where there is none."""
     found = [one for one in link["found"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
     return found[-1] if found else None
 
 
-def _remarks(link: Told) -> Iterator[str]:
-    """What is to be said of a window."""
+def _remarks(link: JsonObject) -> Iterator[str]:
+    """Remarks on a window."""
     window = link["window"]
     if window["done"] is None:
-        yield "waits to be worked on"
+        yield "waits to be processed"
     later = {"glance": "estimate", "estimate": "redesign"}  # which says it all once more
     said = {one["kind"] for one in link["found"] if one["status"]}
     for one in link["found"]:
@@ -135,41 +145,43 @@ def _remarks(link: Told) -> Iterator[str]:
 
 
 _REMARKS = {
-    "glance": "a glance was enough: {}",
+    "glance": "screening was enough: {}",
     "estimate": "",
     "disturbance": "",
     "trend": "trend: {}",
     "redesign": "{}",
     "excitation": "",
 }
-"""What comes with windows from which nothing else follows, and what is said of it."""
+"""Kinds of evidence of windows from which nothing else follows, and the remark on each."""
 
 
-def _said(one: Told) -> Iterator[str]:
+def _said(one: JsonObject) -> Iterator[str]:
     """Of a piece of evidence that is no update; nothing where it says nothing."""
     kind, status, version = one["kind"], one["status"], one["version"]
     if kind in _REMARKS:
         if kind == "estimate" and status != "ok":
             yield f"{status}: {'; '.join(_reasons(one))}"
         elif status and _REMARKS[kind]:
-            yield _REMARKS[kind].format(status)
+            yield _REMARKS[kind].format("no new information" if status == _UNCHANGED else status)
     elif kind == "proof":
-        yield f"version {version} " + (f"FAILED its proof: {status}" if status else "is proved for this evidence")
+        yield f"version {version} " + (
+            f"FAILED its verification: {status}" if status else "is verified for this evidence"
+        )
     elif kind == "withdrawn":
         yield f"version {version} WITHDRAWN: {status}"
     else:
         yield f"{kind}: {status}"
 
 
-def _reasons(one: Told) -> Sequence[str]:
+def _reasons(one: JsonObject) -> Sequence[str]:
     try:
         return tuple(map(str, one["body"]["estimate"]["reasons"])) or ("no reason noted",)
     except (KeyError, TypeError):
         return ("no reason noted",)
 
 
-def _sent(update: Told) -> str:
-    """What an update sets, and what it was proved on."""
+def _sent(update: JsonObject) -> str:
+    """Contents of an update, and its verification."""
     body = update["body"] or {}
     setting = body.get("setting") or {}
     tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
@@ -179,24 +191,24 @@ def _sent(update: Told) -> str:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
     if proof:
-        parts.append(f"proved on {proof['members']} machines")
+        parts.append(f"verified on {proof['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"
 
 
-def _received(receipt: Told) -> str:
+def _received(receipt: JsonObject) -> str:
     body = receipt["body"] or {}
     if body.get("applied"):
         return f"version {receipt['version']} applied at sample {body.get('sample')}"
     return f"version {receipt['version']} REFUSED by the edge: {receipt['status']}"
 
 
-def _effect(effect: Told) -> str:
+def _effect(effect: JsonObject) -> str:
     """The largest error at the window's end, before and under the version."""
     window, before, after = effect["window"], effect["before"], effect["after"]
     return f"version {after['version']} in window {window['sequence']}: error {_error(before)} -> {_error(after)} um"
 
 
-def _event(one: Told) -> Entry:
+def _event(one: JsonObject) -> Entry:
     kind, body = one["kind"], one["body"] or {}
     if kind == "hello":
         text = f"edge in touch: boot {one['status']}, version {one['version']} in force"
@@ -209,10 +221,8 @@ def _event(one: Told) -> Entry:
     return one["made"], "", f"{_time(one['made'])}  {text}"
 
 
-def _measured(body: Told) -> str:
-    """What was seen and what was allowed, in the cause's unit."""
-    if body.get("cause") == Cause.DRIVE:
-        return ""
+def _measured(body: JsonObject) -> str:
+    """Measured and allowed value, in the cause's unit."""
     if body.get("cause") == Cause.DRIVE:
         return ""
     scale, unit = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, "V")}.get(body.get("cause", ""), (1e6, "um"))
@@ -222,18 +232,18 @@ def _measured(body: Told) -> str:
         return ""
 
 
-def _failed(one: Told) -> bool:
+def _failed(one: JsonObject) -> bool:
     return str(one["status"]).startswith("failed: ")
 
 
-def _gap(found: Told | None) -> str:
+def _gap(found: JsonObject | None) -> str:
     if found is None or found["gap"] is None:
         return ""
-    spread = "" if found["std"] is None else f" ± {found['std'] * DEG:.3f}"
+    spread = "" if found["std"] is None else f" ± {NORMAL_95 * found['std'] * DEG:.3f}"
     return f"{found['gap'] * DEG:.3f}{spread}"
 
 
-def _error(found: Told | None) -> str:
+def _error(found: JsonObject | None) -> str:
     return "?" if found is None or found["tail"] is None else f"{found['tail'] * 1e6:.1f}"
 
 
