@@ -68,7 +68,7 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
 
 
 class Machine(Protocol):
-    """What is controlled, with its controller: a `Simulation`, or a stub in a test."""
+    """Controlled machine with its controller: a `Simulation`, or a stub in a test."""
 
     samples: int
 
@@ -93,10 +93,10 @@ class Machine(Protocol):
 
 
 class Remote(Protocol):
-    """What answers the edge: a `Twin`, or one that means harm in a test."""
+    """Twin that answers the edge, or a hostile one in a test."""
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """What to send after a message that arrived at `now` (s)."""
+        """Return the answers to a message that arrived at `now` (s)."""
 
     def next_wake(self) -> float | None:
         """When `wake` is due, s; None: nothing is waited for."""
@@ -143,12 +143,12 @@ class Cosimulation:
 
     @property
     def done(self) -> bool:
-        """Whether the last sample is reached."""
+        """The last sample is reached."""
         return self.machine.index == self.machine.samples - 1
 
     @property
     def share(self) -> float:
-        """How much is done, 0 .. 1."""
+        """Share of the samples that is done, 0 .. 1."""
         return self.machine.index / (self.machine.samples - 1)
 
     def advance(self) -> None:

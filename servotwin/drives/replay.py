@@ -90,7 +90,7 @@ class Replay:
 
     @property
     def patient(self) -> bool:
-        """Where it is read as fast as it goes."""
+        """The log is read as fast as possible."""
         return self._speed == 0.0
 
     @property
@@ -165,7 +165,7 @@ def opened(path: Path) -> TextIO:
 
 
 def extent(path: Path) -> Extent:
-    """How many samples a log has and at which rate, after a look at every one of them."""
+    """Return the number of samples of a log and their rate, after a check of every one."""
     with opened(path) as file:
         times = array("d", (row[0] for row in rows(path, file)))
     if len(times) < 2:
@@ -197,7 +197,7 @@ def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
 
 
 def _places(path: Path, names: list[str]) -> list[int]:
-    """Where each column is."""
+    """Indices of the columns."""
     places = []
     for wanted in COLUMNS:
         allowed = (wanted,) if isinstance(wanted, str) else wanted

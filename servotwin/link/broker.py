@@ -31,7 +31,7 @@ LINGER_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Broker:
-    """Where the broker is, and how one is known to it.
+    """Address of a broker, and the credentials there.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Broker:
 
     @property
     def tls(self) -> bool:
-        """Whether the connection is encrypted."""
+        """The connection is encrypted."""
         return urlsplit(self.url).scheme == "mqtts"
 
     @property
@@ -68,7 +68,7 @@ class Broker:
 
 
 def is_mqtt(url: str) -> bool:
-    """Whether this is a broker's address: mqtt(s)://host[:port]."""
+    """True for a broker's address: mqtt(s)://host[:port]."""
     try:
         parts = urlsplit(url)
         plain = parts.path in ("", "/") and not (parts.query or parts.fragment) and parts.username is None
@@ -77,8 +77,8 @@ def is_mqtt(url: str) -> bool:
         return False
 
 
-class Wanted(NamedTuple):
-    """What a connection is for.
+class MqttSession(NamedTuple):
+    """Session at a broker: client, topics, expiry.
 
     Attributes
     ----------
@@ -101,8 +101,8 @@ class Wanted(NamedTuple):
     will: str = ""
 
 
-class Events(NamedTuple):
-    """What is told, on the connection's own thread.
+class MqttCallbacks(NamedTuple):
+    """Callbacks of a connection, called on its own thread.
 
     Attributes
     ----------
@@ -128,21 +128,21 @@ class Connection:
     Parameters
     ----------
     broker : Broker
-    wanted : Wanted
-    events : Events
+    session : MqttSession
+    events : MqttCallbacks
     """
 
-    def __init__(self, broker: Broker, wanted: Wanted, events: Events) -> None:
-        self._wanted, self._events = wanted, events
+    def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
+        self._wanted, self._events = session, events
         self._number, self._fresh, self._up, self._closing = 0, True, False, False
-        self._client = _client(broker, wanted)
+        self._client = _client(broker, session)
         self._client.on_socket_open = _no_delay
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_subscribe, self._client.on_message = self._subscribed, self._message
         self._client.on_publish = self._published
         self._client.on_connect_fail = self._failed
         self._client.connect_async(
-            *broker.address, keepalive=KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(wanted)
+            *broker.address, keepalive=KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(session)
         )
         self._client.loop_start()
 
@@ -207,22 +207,22 @@ _NO_CONNECTION = 4
 """paho's code: the message is kept and sent when there is a connection."""
 
 
-def _client(broker: Broker, wanted: Wanted) -> Client:
+def _client(broker: Broker, session: MqttSession) -> Client:
     try:
         from paho.mqtt.client import Client, MQTTv5
         from paho.mqtt.enums import CallbackAPIVersion
     except ModuleNotFoundError:
         raise missing_extra("paho", "the link over MQTT") from None
-    client = Client(CallbackAPIVersion.VERSION2, wanted.client_id, protocol=MQTTv5, manual_ack=True)
+    client = Client(CallbackAPIVersion.VERSION2, session.client_id, protocol=MQTTv5, manual_ack=True)
     client.max_queued_messages_set(QUEUED)
-    client.max_inflight_messages_set(wanted.receive)
+    client.max_inflight_messages_set(session.receive)
     client.reconnect_delay_set(1, 4)
     if broker.user is not None:
         client.username_pw_set(broker.user, broker.password)
     if broker.tls:
         client.tls_set_context(_context(broker.ca_file))
-    if wanted.will:
-        client.will_set(wanted.will, b"", qos=1)
+    if session.will:
+        client.will_set(session.will, b"", qos=1)
     return client
 
 
@@ -233,8 +233,8 @@ def _context(ca_file: str | None) -> ssl.SSLContext:
         raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({error})") from None
 
 
-def _connect_properties(wanted: Wanted) -> Any:
-    return _properties("CONNECT", SessionExpiryInterval=wanted.session_s, ReceiveMaximum=wanted.receive)
+def _connect_properties(session: MqttSession) -> Any:
+    return _properties("CONNECT", SessionExpiryInterval=session.session_s, ReceiveMaximum=session.receive)
 
 
 def _properties(packet: str, **values: int) -> Any:

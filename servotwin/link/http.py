@@ -23,22 +23,22 @@ _PIECE = 65536
 _ANSWER, _ERROR = 64 * 1024, 8 * 1024
 
 
-class _Said(msgspec.Struct, frozen=True):
+class _RefusalBody(msgspec.Struct, frozen=True):
     """The body of a refusal."""
 
     code: Refusal
     detail: str = ""
 
 
-class Answer(msgspec.Struct, frozen=True):
-    """What came back."""
+class HttpReply(msgspec.Struct, frozen=True):
+    """Status, body and Retry-After of a response."""
 
     status: int
     body: bytes
     retry_after: str
 
 
-class Line:
+class HttpLine:
     """One connection, kept open from request to request; opened again when the other side has closed it.
 
     Parameters
@@ -67,12 +67,12 @@ class Line:
         self._connection: HTTPConnection | None = None
         self._closed, self._busy = False, Lock()
 
-    def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:
+    def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
         """One request and its answer, of `limit` bytes at most; raises Unreachable."""
         with self._busy:
             return self._ask(method, path, body, headers, limit)
 
-    def _ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:
+    def _ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
         fresh = self._connection is None
         try:
             return self._once(method, path, body, headers, limit)
@@ -98,13 +98,13 @@ class Line:
         elif connection is not None and connection.sock is not None:
             _shut(connection)
 
-    def _once(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> Answer:
+    def _once(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
         connection = self._connection or self._open()
         deadline = self._clock() + self._timeout
         connection.request(method, self._parts.path.rstrip("/") + path, body, {**self._headers, **headers})
         response = connection.getresponse()
         data = self._read(response, limit, deadline)
-        answer = Answer(response.status, data, response.headers.get("Retry-After", ""))
+        answer = HttpReply(response.status, data, response.headers.get("Retry-After", ""))
         if response.will_close:
             self.drop()
         return answer
@@ -161,8 +161,8 @@ class HttpTransport:
     ) -> None:
         context = _context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
-        self._up = Line(url, token, timeout_s, context)
-        self._down = Line(url, token, timeout_s + wait_s, context)
+        self._up = HttpLine(url, token, timeout_s, context)
+        self._down = HttpLine(url, token, timeout_s + wait_s, context)
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
@@ -204,7 +204,7 @@ def _shut(connection: HTTPConnection) -> None:
         return
 
 
-def _checked(answer: Answer, good: tuple[int, ...]) -> Answer:
+def _checked(answer: HttpReply, good: tuple[int, ...]) -> HttpReply:
     """The answer, if it is a good one.
 
     Only a reason code of the twin's own refuses a message; whatever else stands in between makes it unreachable.
@@ -212,7 +212,7 @@ def _checked(answer: Answer, good: tuple[int, ...]) -> Answer:
     if answer.status in good:
         return answer
     try:
-        said = msgspec.json.decode(answer.body[:_ERROR], type=_Said)
+        said = msgspec.json.decode(answer.body[:_ERROR], type=_RefusalBody)
     except (msgspec.MsgspecError, UnicodeDecodeError):
         raise Unreachable(f"HTTP status {answer.status}, without a reason code of the twin's") from None
     raise Refused(said.code, said.detail[:200], _seconds(answer.retry_after))

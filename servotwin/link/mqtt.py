@@ -1,4 +1,4 @@
-"""The link over an MQTT 5 broker: the same promises as over HTTP, whatever the broker forgets.
+"""Link over an MQTT 5 broker: the same guarantees as over HTTP, whatever the broker forgets.
 
 A window counts as delivered when a twin has answered that it is committed; that the broker has it means nothing. What
 is not answered is asked again by whoever keeps the windows. The twin's messages are asked for by serial, so that
@@ -13,28 +13,28 @@ from concurrent.futures import Future, InvalidStateError
 from itertools import count
 from threading import Event, Lock
 
-from servotwin.link.broker import Broker, Connection, Events, Wanted
-from servotwin.link.exchange import (
-    GONE,
-    Answer,
-    Carry,
-    Heard,
-    Listen,
-    NotTaken,
-    Question,
-    Stranger,
-    Taken,
-    answered,
-    ask,
-    down,
-    up,
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.link.mqtt_messages import (
+    TWIN_GONE,
+    MqttRequest,
+    MqttResponse,
+    PollRequest,
+    PollResponse,
+    PutRequest,
+    PutResponse,
+    RefusedResponse,
+    UnknownPeer,
+    decode_response,
+    encode_request,
+    request_topic,
+    response_topic,
 )
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
 
 SESSION_S = 3600
-ALONE = "no twin listens at the broker"
+NO_SUBSCRIBER = "no twin listens at the broker"
 
 
 class MqttTransport:
@@ -56,27 +56,29 @@ class MqttTransport:
         self._timeout, self._wait = timeout_s, wait_s
         # Beginning anywhere, so that no answer to an earlier process is taken for one to this.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
-        self._waiting: dict[int, Future[Answer | Stranger]] = {}
-        self._sent: dict[int, Future[Answer | Stranger]] = {}
+        self._waiting: dict[int, Future[MqttResponse | UnknownPeer]] = {}
+        self._sent: dict[int, Future[MqttResponse | UnknownPeer]] = {}
         self._unheard: set[int] = set()
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
-        wanted = Wanted(f"servotwin-edge-{servo}", (down(servo), GONE), SESSION_S)
-        self._connection = Connection(broker, wanted, Events(self._message, self._connected, self._lost, self._alone))
+        session = MqttSession(f"servotwin-edge-{servo}", (response_topic(servo), TWIN_GONE), SESSION_S)
+        self._connection = Connection(
+            broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._no_subscriber)
+        )
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when a twin has the message safe; see `Transport`."""
         if len(parcel.body) > MAX_BYTES:
             raise Refused(Refusal.TOO_LARGE, f"a message of {len(parcel.body)} bytes: at most {MAX_BYTES} are allowed")
-        said = self._asked(Carry(parcel.body, parcel.encoding), self._timeout)
-        if not isinstance(said, Taken):
+        response = self._request(PutRequest(parcel.body, parcel.encoding), self._timeout)
+        if not isinstance(response, PutResponse):
             raise Unreachable("the answer to a message does not acknowledge it")
 
     def listen(self, after: int) -> list[bytes]:
         """The twin's messages with serials above `after`; see `Transport`."""
-        said = self._asked(Listen(after, self._wait), self._wait + self._timeout)
-        if not isinstance(said, Heard):
+        response = self._request(PollRequest(after, self._wait), self._wait + self._timeout)
+        if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a poll holds no messages")
-        return said.messages
+        return response.messages
 
     def close(self) -> None:
         """Let go of the connection."""
@@ -85,68 +87,68 @@ class MqttTransport:
         self._ready.set()
         self._connection.close()
 
-    def _asked(self, question: Question, patience: float) -> Answer:
+    def _request(self, request: MqttRequest, patience: float) -> MqttResponse:
         """The answer to a question; raises Refused and Unreachable."""
         if not self._ready.wait(self._timeout):
             raise Unreachable(self._why)
         serial, future = self._expect()
         number = 0
         try:
-            number = self._send(ask(self._key, self._servo, serial, question), patience, future)
-            said = future.result(patience)
+            number = self._send(encode_request(self._key, self._servo, serial, request), patience, future)
+            response = future.result(patience)
         except TimeoutError:
             raise Unreachable(f"no answer of a twin within {patience:g} s") from None
         finally:
             with self._lock:
                 del self._waiting[serial]
                 self._sent.pop(number, None)
-        if isinstance(said, Stranger):
+        if isinstance(response, UnknownPeer):
             raise Refused(Refusal.BAD_TOKEN, "the twin knows the servo by another token")
-        if isinstance(said, NotTaken):
-            raise Refused(said.code, said.detail, said.after_s)
-        return said
+        if isinstance(response, RefusedResponse):
+            raise Refused(response.code, response.detail, response.after_s)
+        return response
 
-    def _expect(self) -> tuple[int, Future[Answer | Stranger]]:
-        serial, future = next(self._serials), Future[Answer | Stranger]()
+    def _expect(self) -> tuple[int, Future[MqttResponse | UnknownPeer]]:
+        serial, future = next(self._serials), Future[MqttResponse | UnknownPeer]()
         with self._lock:
             self._waiting[serial] = future
         return serial, future
 
-    def _send(self, data: bytes, patience: float, future: Future[Answer | Stranger]) -> int:
-        """Publish a question; the broker may have said that nobody hears it before its number is known here."""
-        number = None if self._closed else self._connection.publish(up(self._servo), data, patience)
+    def _send(self, data: bytes, patience: float, future: Future[MqttResponse | UnknownPeer]) -> int:
+        """Publish a question; the broker may have response that nobody hears it before its number is known here."""
+        number = None if self._closed else self._connection.publish(request_topic(self._servo), data, patience)
         if number is None:
             raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
         with self._lock:
             self._sent[number] = future
-            alone = number in self._unheard
+            unheard = number in self._unheard
             self._unheard.discard(number)
-        if alone:
-            _settle(future, Unreachable(ALONE))
+        if unheard:
+            _set_result(future, Unreachable(NO_SUBSCRIBER))
         return number
 
-    def _alone(self, number: int) -> None:
+    def _no_subscriber(self, number: int) -> None:
         with self._lock:
             future = self._sent.get(number)
             if future is None:
                 self._unheard.add(number)
         if future is not None:
-            _settle(future, Unreachable(ALONE))
+            _set_result(future, Unreachable(NO_SUBSCRIBER))
 
     def _message(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         """Something came: an answer, or word that a twin is gone; what cannot be used is as if it had not come."""
         acknowledge()
-        if topic == GONE:
+        if topic == TWIN_GONE:
             self._give_up("a twin is gone")
             return
         try:
-            serial, said = answered(self._key, self._servo, payload)
+            serial, response = decode_response(self._key, self._servo, payload)
         except InvalidMessage:
             return
         with self._lock:
             future = self._waiting.get(serial)
         if future is not None:
-            _settle(future, said)
+            _set_result(future, response)
 
     def _connected(self, forgotten: bool) -> None:
         """A broker that has forgotten the session has forgotten the questions too."""
@@ -164,10 +166,10 @@ class MqttTransport:
         with self._lock:
             waiting = list(self._waiting.values())
         for future in waiting:
-            _settle(future, Unreachable(why))
+            _set_result(future, Unreachable(why))
 
 
-def _settle(future: Future[Answer | Stranger], result: Answer | Stranger | Exception) -> None:
+def _set_result(future: Future[MqttResponse | UnknownPeer], result: MqttResponse | UnknownPeer | Exception) -> None:
     """The first answer counts."""
     try:
         if isinstance(result, Exception):

@@ -44,7 +44,7 @@ _decoder = msgspec.msgpack.Decoder(Sealed)
 
 
 def verifier_of(token: str) -> bytes:
-    """What the twin keeps of a token: enough to check it and to seal, not to send it elsewhere."""
+    """Verifier of a token, which the twin keeps: enough to check it and to seal, not to send it elsewhere."""
     return sha256(b"servotwin token\0" + token.encode()).digest()
 
 

@@ -56,7 +56,7 @@ class Session:
 
     @property
     def next_time(self) -> float | None:
-        """When something is due next, s; None: the outbox is empty."""
+        """Time at which something is due next, s; None: the outbox is empty."""
         dues = [self._due_time(item) for item in self._items()]
         return max(self._not_before, min(dues)) if dues else None
 

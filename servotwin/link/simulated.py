@@ -26,7 +26,7 @@ def outage_table(
 @settings("link")
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """How a link treats messages; both directions alike."""
+    """Delays and losses of a link, the same in both directions."""
 
     delay_s: Annotated[float, key(minimum=0.0, help="Time that every message takes.")] = 0.0
     jitter_s: Annotated[float, key(minimum=0.0, help="A message takes up to this much longer, evenly distributed.")] = (
@@ -55,12 +55,12 @@ class LinkSettings:
                 raise InvalidInput(f"link outage from {begin!r} s to {end!r} s: must end after it begins")
 
     def out(self, time: float) -> bool:
-        """Whether the link is cut at that time."""
+        """True where the link is cut at that time (s)."""
         return any(begin <= time < end for begin, end in self.outages)
 
 
 class Fate(StrEnum):
-    """What became of a copy of a message."""
+    """Fate of a copy of a message."""
 
     IN_FLIGHT = "in flight"
     DELIVERED = "delivered"
@@ -69,8 +69,8 @@ class Fate(StrEnum):
 
 
 @dataclass(slots=True)
-class Record:
-    """One copy of one message: which, when, and what became of it.
+class SentCopy:
+    """One copy of one message, with its times and its fate.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Record:
     fate: Fate = Fate.IN_FLIGHT
 
 
-class Line:
+class LinkDirection:
     """One direction of a link.
 
     Parameters
@@ -109,7 +109,7 @@ class Line:
     ) -> None:
         self.name, self.settings = name, settings
         self.offered = 0
-        self.records: list[Record] = []
+        self.records: list[SentCopy] = []
         self._clock, self._deliver = clock, deliver
         self._random = Random(derive_seed(seed, name))
 
@@ -117,15 +117,15 @@ class Line:
         """Offer a message at the clock's time."""
         serial, self.offered = self.offered, self.offered + 1
         first, second, lost, twice = self._delay(), self._delay(), self._chance("loss"), self._chance("duplicate")
-        self._launch(Record(serial, 0, data, self._clock.now, self._clock.now + first), lost)
+        self._launch(SentCopy(serial, 0, data, self._clock.now, self._clock.now + first), lost)
         if twice and not lost:
-            self._launch(Record(serial, 1, data, self._clock.now, self._clock.now + second), lost=False)
+            self._launch(SentCopy(serial, 1, data, self._clock.now, self._clock.now + second), lost=False)
 
     def tally(self) -> Counter[Fate]:
-        """How many copies met which fate."""
+        """Count the copies by fate."""
         return Counter(record.fate for record in self.records)
 
-    def _launch(self, record: Record, lost: bool) -> None:
+    def _launch(self, record: SentCopy, lost: bool) -> None:
         self.records.append(record)
         if lost:
             record.fate = Fate.LOST
@@ -134,7 +134,7 @@ class Line:
         else:
             self._clock.schedule(record.arrival, partial(self._arrive, record))
 
-    def _arrive(self, record: Record) -> None:
+    def _arrive(self, record: SentCopy) -> None:
         if self.settings.out(record.arrival):
             record.fate = Fate.OUTAGE
             return
@@ -174,8 +174,8 @@ class SimulatedLink:
         down: LinkSettings,
         seed: int,
     ) -> None:
-        self.up = Line(f"{servo}/up", clock, to_twin, up, seed)
-        self.down = Line(f"{servo}/down", clock, to_edge, down, seed)
+        self.up = LinkDirection(f"{servo}/up", clock, to_twin, up, seed)
+        self.down = LinkDirection(f"{servo}/down", clock, to_edge, down, seed)
 
 
 def derive_seed(root: int, *names: str) -> int:

@@ -30,19 +30,19 @@ _BESIDE = ("-wal", "-shm")
 
 
 class Statement(NamedTuple):
-    """What is to be written."""
+    """SQL statement and its values, to be executed."""
 
     text: str
     values: tuple[Any, ...]
 
 
 def is_broken(error: sqlite3.Error) -> bool:
-    """Whether the file holds nonsense; otherwise it cannot be written or read just now."""
+    """True where the file is corrupt; otherwise it cannot be written or read just now."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _BROKEN
 
 
 def was_read_only(error: Exception) -> bool:
-    """Whether the file was opened on a disk that was read-only: a connection to it stays so."""
+    """True where the disk was read-only when the file was opened: the connection stays so."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY
 
 

@@ -254,7 +254,7 @@ class SqliteOutbox:
         self.trouble = ""
 
     def _load(self, connection: sqlite3.Connection) -> None:
-        """What the file holds, before what is to be written to it."""
+        """Load the file's index, before what is to be written to it."""
         windows = connection.execute("SELECT boot, sequence, reason, length(body) FROM windows ORDER BY place")
         found = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]

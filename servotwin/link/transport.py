@@ -1,4 +1,4 @@
-"""What carries an edge's messages to the twin and the twin's back: the protocol, and what can go wrong.
+"""Transport of an edge's messages to the twin and back: the protocol, and its errors.
 
 A transport knows bytes only. It may lose, delay and repeat; it says "delivered" only when the twin has said so.
 """
@@ -39,7 +39,7 @@ class Parcel(NamedTuple):
 
     @property
     def is_window(self) -> bool:
-        """Whether it is a window; otherwise it is a letter."""
+        """It is a window; otherwise it is a letter."""
         return self.boot != ""
 
 

@@ -1,4 +1,4 @@
-"""What an address tells of the way to it."""
+"""Properties of a URL: local, encrypted, in clear."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 
 def is_here(host: str) -> bool:
-    """Whether a host's name or number means this machine itself."""
+    """True where a host's name or number means this machine."""
     if host == "localhost":
         return True
     try:
@@ -17,11 +17,11 @@ def is_here(host: str) -> bool:
 
 
 def is_encrypted(url: str) -> bool:
-    """Whether the way there is, however the scheme is written."""
+    """True where the connection is encrypted, however the scheme is written."""
     return urlsplit(url).scheme in ("https", "mqtts")
 
 
 def in_clear(url: str) -> bool:
-    """Whether a network carries what is sent there unencrypted: a token would be read by everybody on it."""
+    """True where a network carries data unencrypted: everybody on it could read a token."""
     parts = urlsplit(url)
     return parts.scheme == "http" and not is_here(parts.hostname or "")

@@ -40,7 +40,7 @@ class VirtualClock:
 
     @property
     def next_time(self) -> float | None:
-        """When the next event is due, s; None: nothing is scheduled."""
+        """Time at which the next event is due, s; None: nothing is scheduled."""
         return self._queue[0].time if self._queue else None
 
     def schedule(self, time: float, action: Action, priority: int = 0) -> Event:
@@ -102,7 +102,7 @@ class WallClock:
 
     @property
     def next_time(self) -> float | None:
-        """When the next event is due, s; None: nothing is scheduled."""
+        """Time at which the next event is due, s; None: nothing is scheduled."""
         return self._events.next_time
 
     def schedule(self, time: float, action: Action, priority: int = 0) -> Event:

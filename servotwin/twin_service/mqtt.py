@@ -10,21 +10,21 @@ import logging
 from collections.abc import Callable
 from uuid import uuid4
 
-from servotwin.link.broker import Broker, Connection, Events, Wanted
-from servotwin.link.exchange import (
-    GONE,
-    UP,
-    Answer,
-    Asked,
-    Heard,
-    Listen,
-    NotTaken,
-    Taken,
-    answer,
-    asked,
-    down,
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.link.mqtt_messages import (
+    REQUEST_TOPICS,
+    TWIN_GONE,
+    MqttResponse,
+    PollRequest,
+    PollResponse,
+    PutResponse,
+    ReceivedRequest,
+    RefusedResponse,
+    decode_request,
+    encode_response,
+    encode_unknown_peer,
+    response_topic,
     servo_of,
-    stranger,
 )
 from servotwin.link.seal import key_of
 from servotwin.messages import InvalidMessage, Refusal
@@ -65,40 +65,40 @@ class MqttRequestHandler:
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
 
-    def decode(self, servo: str, data: bytes) -> Asked | bytes | None:
+    def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
         """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
         verifier = self._gate.find_verifier(servo)
         try:
             if verifier is None:
                 raise InvalidMessage(f"servo {servo!r} has no token", Refusal.BAD_TOKEN)
-            return asked(key_of(verifier), servo, data)
+            return decode_request(key_of(verifier), servo, data)
         except InvalidMessage as error:
             too_large = error.refusal is Refusal.TOO_LARGE
             self._count(servo, Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, str(error))
-            return None if too_large else stranger(data)
+            return None if too_large else encode_unknown_peer(data)
 
-    async def respond(self, request: Asked) -> bytes | None:
+    async def respond(self, request: ReceivedRequest) -> bytes | None:
         """Handle a request; returns the bytes of the response, or None where its token was revoked."""
         try:
             response = await self._handle(request)
         except RequestRejected as rejected:
             self._count(request.servo, rejected.refusal, rejected.detail)
             busy = rejected.refusal in (Refusal.TOO_MANY, Refusal.UNAVAILABLE)
-            response = NotTaken(rejected.refusal, rejected.detail, _RETRY_AFTER_S if busy else 0.0)
+            response = RefusedResponse(rejected.refusal, rejected.detail, _RETRY_AFTER_S if busy else 0.0)
         verifier = self._gate.find_verifier(request.servo)
-        return None if verifier is None else answer(key_of(verifier), request.servo, request.serial, response)
+        return None if verifier is None else encode_response(key_of(verifier), request.servo, request.serial, response)
 
-    async def _handle(self, request: Asked) -> Answer:
+    async def _handle(self, request: ReceivedRequest) -> MqttResponse:
         servo, question = request.servo, request.question
-        if isinstance(question, Listen):
+        if isinstance(question, PollRequest):
             self._gate.admit_authenticated(servo, limited=False)
             messages = await self._polls.messages(servo, question.after, question.wait)
-            return Heard(seal_messages(self._gate.verifier(servo), servo, messages))
+            return PollResponse(seal_messages(self._gate.verifier(servo), servo, messages))
         self._gate.admit_authenticated(servo)
         incoming, _ = self._ingest.read(servo, question.body, question.encoding)
         if await self._ingest.commit(incoming) is PutResult.NEW:
             self._wake()
-        return Taken()
+        return PutResponse()
 
     def _count(self, servo: str, code: Refusal, why: str) -> None:
         self._metrics.rejected.add(code.value)
@@ -133,14 +133,16 @@ class MqttServer:
         def on_message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
             loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
 
-        wanted = Wanted(
+        session = MqttSession(
             client_id=f"servotwin-{uuid4().hex}",
-            topics=(f"$share/{self._group}/{UP}",),
+            topics=(f"$share/{self._group}/{REQUEST_TOPICS}",),
             session_s=_SESSION_S,
             receive=_MAX_IN_FLIGHT,
-            will=GONE,
+            will=TWIN_GONE,
         )
-        self._connection = Connection(self._broker, wanted, Events(on_message, self._on_connected, self._on_lost))
+        self._connection = Connection(
+            self._broker, session, MqttCallbacks(on_message, self._on_connected, self._on_lost)
+        )
 
     async def stop(self) -> None:
         """Accept nothing more, finish the running requests, disconnect."""
@@ -161,17 +163,17 @@ class MqttServer:
 
     async def _serve(self, connection: Connection, servo: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         request = self._handler.decode(servo, payload)
-        polls = isinstance(request, Asked) and isinstance(request.question, Listen)
+        polls = isinstance(request, ReceivedRequest) and isinstance(request.question, PollRequest)
         if polls:
             acknowledge()  # a long poll waits, and must not count as in flight meanwhile
         try:
-            response = await self._handler.respond(request) if isinstance(request, Asked) else request
+            response = await self._handler.respond(request) if isinstance(request, ReceivedRequest) else request
         except Exception:
             log.exception("question not answered", extra={"servo": servo})
             response = None
         if not polls:
             acknowledge()
-        if response is not None and connection.publish(down(servo), response, _RESPONSE_EXPIRY_S) is None:
+        if response is not None and connection.publish(response_topic(servo), response, _RESPONSE_EXPIRY_S) is None:
             log.warning("answer not sent: too much waits for the broker", extra={"servo": servo})
 
     def _on_connected(self, _session_lost: bool) -> None:

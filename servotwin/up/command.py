@@ -13,7 +13,7 @@ from types import FrameType
 from rich.console import Console
 from rich.live import Live
 
-from servotwin.drives.simulated.diary import read_speed, write_speed
+from servotwin.drives.simulated.machine_state import read_speed, write_speed
 from servotwin.errors import InvalidInput
 from servotwin.up import display
 from servotwin.up.display import Snapshot, clock

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from servotwin.drives.simulated.diary import MachineState, read_state
+from servotwin.drives.simulated.machine_state import MachineState, read_state
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
 from servotwin.runtime.files import write_text

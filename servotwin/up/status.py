@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from servotwin.drives.simulated.diary import MachineState, read_state
+from servotwin.drives.simulated.machine_state import MachineState, read_state
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge_process.monitoring import read_status
 from servotwin.errors import InvalidInput

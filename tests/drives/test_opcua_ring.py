@@ -5,7 +5,7 @@ from array import array
 from hypothesis import given
 from hypothesis import strategies as some
 
-from servotwin.drives.opcua.ring import Change, Reading, blocks, oldest, sound, whole
+from servotwin.drives.opcua.ring import RingReading, VersionChange, blocks, is_valid, oldest, whole
 
 SIZE, MARGIN = 12, 3
 
@@ -23,7 +23,7 @@ def rings(written: int) -> tuple[list[float], ...]:
 def test_only_whole_samples_are_read(before: int, more: int, unannounced: int, first: int) -> None:
     """The arrays are read when up to `more` samples were counted since and up to a margin are being written."""
     after = before + more
-    reading = Reading(before, after, rings(after + unannounced))
+    reading = RingReading(before, after, rings(after + unannounced))
     begin, signals = whole(reading, first, MARGIN)
     numbers = list(range(begin, before))
     for s, signal in enumerate(signals):
@@ -36,7 +36,7 @@ def test_only_whole_samples_are_read(before: int, more: int, unannounced: int, f
     some.integers(0, 50), some.integers(1, 30), some.lists(some.integers(0, 90), min_size=1, max_size=5, unique=True)
 )
 def test_blocks_are_cut_where_versions_change(first: int, count: int, since: list[int]) -> None:
-    changes = [Change(at, version) for version, at in enumerate(sorted(since))]
+    changes = [VersionChange(at, version) for version, at in enumerate(sorted(since))]
     signals = [array("d", [1000.0 * s + first + k for k in range(count)]) for s in range(4)]
     found = blocks(first, signals, changes)
     assert [sample for block in found for sample in range(block.first, block.last)] == [*range(first, first + count)]
@@ -48,7 +48,7 @@ def test_blocks_are_cut_where_versions_change(first: int, count: int, since: lis
 
 def test_what_is_no_reading_is_seen() -> None:
     good = [[0.0, 1.0]] * 4
-    assert sound(Reading(1, 2, tuple(good)))
+    assert is_valid(RingReading(1, 2, tuple(good)))
     for rings_ in ([None] * 4, [[1]] * 4, [[]] * 4, [*good[:3], [0.0]], [["a", "b"]] * 4):
-        assert not sound(Reading(1, 2, tuple(rings_)))
-    assert not sound(Reading(None, 2, tuple(good)))
+        assert not is_valid(RingReading(1, 2, tuple(rings_)))
+    assert not is_valid(RingReading(None, 2, tuple(good)))

@@ -14,8 +14,8 @@ from mosquitto import Mosquitto, broker, free_port
 from mqttparts import PATIENCE, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
 from relay import Relay, State, Weather
 
-from servotwin.link import exchange
-from servotwin.link.broker import Broker, Connection, Events, Wanted
+from servotwin.link import mqtt_messages as wire
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
@@ -162,14 +162,14 @@ def test_too_large_a_message_is_refused_before_it_is_sent_or_parsed(server: Mosq
     with twin(Broker(server.url), store) as there, edge(Broker(server.url), timeout_s=2.0) as here:
         with pytest.raises(Refused, match="too_large"):
             here.deliver(Parcel("axis-1", big))
-        raw(server, exchange.up("axis-1"), bytes(2 * MAX_BYTES))
+        raw(server, wire.request_topic("axis-1"), bytes(2 * MAX_BYTES))
         here.deliver(parcel(0))
         assert refusals(there) == {"too_large": 1}
 
 
 def test_what_is_no_question_is_counted_and_the_rest_goes_on(server: Mosquitto, store: Store) -> None:
     key = key_of(verifier_of(TOKENS["axis-1"]))
-    good = exchange.ask(key, "axis-1", 5, exchange.Listen(0, 0.0))
+    good = wire.encode_request(key, "axis-1", 5, wire.PollRequest(0, 0.0))
     bad = [
         b"",
         b"\x00",
@@ -180,8 +180,8 @@ def test_what_is_no_question_is_counted_and_the_rest_goes_on(server: Mosquitto, 
     ]
     with twin(Broker(server.url), store) as there, edge(Broker(server.url)) as here:
         for payload in bad:
-            raw(server, exchange.up("axis-1"), payload)
-        raw(server, exchange.up("axis-9"), good)
+            raw(server, wire.request_topic("axis-1"), payload)
+        raw(server, wire.request_topic("axis-9"), good)
         raw(server, "servotwin/bad name/up", good)
         here.deliver(parcel(0))
         assert refusals(there) == {"bad_token": len(bad) + 1}
@@ -190,18 +190,22 @@ def test_what_is_no_question_is_counted_and_the_rest_goes_on(server: Mosquitto, 
 def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -> None:
     """Whoever may publish to the edge's topic cannot acknowledge a window."""
     key = key_of(verifier_of("another token"))
-    forged = [b"", b"\x00" * 100] + [exchange.answer(key, "axis-1", serial, exchange.Taken()) for serial in range(3)]
+    forged = [b"", b"\x00" * 100] + [
+        wire.encode_response(key, "axis-1", serial, wire.PutResponse()) for serial in range(3)
+    ]
     with edge(Broker(server.url), timeout_s=1.0) as here:
         for payload in forged:
-            raw(server, exchange.down("axis-1"), payload)
+            raw(server, wire.response_topic("axis-1"), payload)
         with pytest.raises(Unreachable, match="no twin listens"):
             here.deliver(parcel(0))
 
 
 def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitto) -> None:
-    wanted = Wanted("deaf", (exchange.UP,), 0)
+    session = MqttSession("deaf", (wire.REQUEST_TOPICS,), 0)
     ready = threading.Event()
-    deaf = Connection(Broker(server.url), wanted, Events(lambda *_: None, lambda _: ready.set(), lambda _: None))
+    deaf = Connection(
+        Broker(server.url), session, MqttCallbacks(lambda *_: None, lambda _: ready.set(), lambda _: None)
+    )
     with edge(Broker(server.url), timeout_s=0.3) as here:
         assert ready.wait(PATIENCE)
         with pytest.raises(Unreachable, match=r"no answer of a twin within 0\.3 s"):
@@ -211,22 +215,28 @@ def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitt
 
 def test_an_answer_belongs_to_its_question() -> None:
     key = key_of(verifier_of("token"))
-    data = exchange.answer(key, "axis-1", 7, exchange.NotTaken(Refusal.CONFLICT, "Another one is kept."))
-    assert exchange.answered(key, "axis-1", data) == (7, exchange.NotTaken(Refusal.CONFLICT, "Another one is kept."))
+    data = wire.encode_response(key, "axis-1", 7, wire.RefusedResponse(Refusal.CONFLICT, "Another one is kept."))
+    assert wire.decode_response(key, "axis-1", data) == (
+        7,
+        wire.RefusedResponse(Refusal.CONFLICT, "Another one is kept."),
+    )
     for foreign in ((key, "axis-2"), (key_of(verifier_of("other")), "axis-1")):
         with pytest.raises(InvalidMessage):
-            exchange.answered(*foreign, data)
+            wire.decode_response(*foreign, data)
     with pytest.raises(InvalidMessage):
-        exchange.asked(key, "axis-1", data)
+        wire.decode_request(key, "axis-1", data)
 
 
 @given(st.binary(max_size=200))
 def test_bytes_from_a_broker_never_do_more_than_be_refused(data: bytes) -> None:
     key = key_of(verifier_of("token"))
-    for read in (lambda: exchange.asked(key, "axis-1", data), lambda: exchange.answered(key, "axis-1", data)):
+    for read in (
+        lambda: wire.decode_request(key, "axis-1", data),
+        lambda: wire.decode_response(key, "axis-1", data),
+    ):
         with suppress(InvalidMessage):
-            assert not isinstance(read(), exchange.Asked)
-    assert exchange.stranger(data) is None or len(data) > 32
+            assert not isinstance(read(), wire.ReceivedRequest)
+    assert wire.encode_unknown_peer(data) is None or len(data) > 32
 
 
 def test_closing_wakes_whoever_waits(server: Mosquitto) -> None:

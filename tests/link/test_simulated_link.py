@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
-from servotwin.link.simulated import Fate, Line, LinkSettings, SimulatedLink, derive_seed
+from servotwin.link.simulated import Fate, LinkDirection, LinkSettings, SimulatedLink, derive_seed
 from servotwin.runtime.clock import VirtualClock
 
 PROBABILITY = st.sampled_from([0.0, 0.1, 0.5, 1.0])
@@ -24,10 +24,12 @@ SETTINGS = st.builds(
 )
 
 
-def play(settings: LinkSettings, seed: int, messages: int = 20, until: float = 100.0) -> tuple[Line, list[bytes]]:
+def play(
+    settings: LinkSettings, seed: int, messages: int = 20, until: float = 100.0
+) -> tuple[LinkDirection, list[bytes]]:
     """A line with one message every half second; what arrived."""
     clock, arrived = VirtualClock(), list[bytes]()
-    line = Line("axis-1/up", clock, arrived.append, settings, seed)
+    line = LinkDirection("axis-1/up", clock, arrived.append, settings, seed)
     for k in range(messages):
         clock.run_until(0.5 * k)
         line.send(b"%d" % k)

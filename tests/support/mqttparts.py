@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from mosquitto import Mosquitto
 
-from servotwin.link.broker import Broker, Connection, Events, Wanted
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
 from servotwin.link.transport import Parcel, Unreachable, deflated
@@ -133,8 +133,8 @@ def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
         acknowledge()
         arrived.set()
 
-    events = Events(message, lambda _: ready.set(), lambda _: None)
-    wanted = Wanted("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
+    events = MqttCallbacks(message, lambda _: ready.set(), lambda _: None)
+    wanted = MqttSession("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
     connection = Connection(Broker(server.url), wanted, events)
     try:
         assert ready.wait(PATIENCE)

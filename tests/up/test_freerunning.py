@@ -14,7 +14,7 @@ from services import service
 
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.drives.simulated.diary import write_speed
+from servotwin.drives.simulated.machine_state import write_speed
 from servotwin.plant.signals import as_pieces
 from servotwin.up.enrolment import Enrolment, enroll
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from servotwin.drives.simulated.diary import read_state
+from servotwin.drives.simulated.machine_state import read_state
 from servotwin.edge_process.config_file import load
 from servotwin.errors import InvalidInput
 from servotwin.store.store import open_store

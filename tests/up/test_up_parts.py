@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 from rich.console import Console
 
-from servotwin.drives.simulated.diary import MachineState, read_speed, read_state, write_speed, write_state
+from servotwin.drives.simulated.machine_state import MachineState, read_speed, read_state, write_speed, write_state
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput

@@ -48,7 +48,7 @@ class OpcUaDrive:
         self._settings, self._clock, self._sleep = settings, clock, sleep
         self._session: Session | None = None
         self._ready: deque[Block] = deque()
-        self._changes: deque[ring.Change] = deque(maxlen=CHANGES)
+        self._changes: deque[ring.VersionChange] = deque(maxlen=CHANGES)
         self._next: int | None = None
         self._looked = -inf
         self._margin, self.rate, self.machine = 0, 0.0, ""
@@ -66,7 +66,7 @@ class OpcUaDrive:
             self.machine, self._next = machine, count
             self._ready.clear()
             self._changes.clear()
-        self._learn(ring.Change(since, version))
+        self._learn(ring.VersionChange(since, version))
 
     def read(self, most: int = 0) -> Block | None:
         """The next samples; never None, since a drive's run does not end."""
@@ -114,16 +114,16 @@ class OpcUaDrive:
         machine, before, *signals, version, since, after = session.read(model.STATE)
         if machine != self.machine:
             raise self._lost("the machine began anew")
-        reading = ring.Reading(before, after, tuple(signals))
-        if not ring.sound(reading) or type(version) is not int or type(since) is not int:
+        reading = ring.RingReading(before, after, tuple(signals))
+        if not ring.is_valid(reading) or type(version) is not int or type(since) is not int:
             raise self._lost("its variables do not hold what the model says")
-        self._learn(ring.Change(since, version))
+        self._learn(ring.VersionChange(since, version))
         due = before if self._next is None else self._next
         first, fresh = ring.whole(reading, due, self._margin)
         self._next = before
         self._ready.extend(ring.blocks(first, fresh, list(self._changes)) if len(fresh[0]) else ())
 
-    def _learn(self, change: ring.Change) -> None:
+    def _learn(self, change: ring.VersionChange) -> None:
         if not self._changes or self._changes[-1] != change:
             self._changes.append(change)
 
@@ -139,7 +139,7 @@ class OpcUaDrive:
             self._sleep(_ASKING)
         if refused:
             raise DriveRefused(f"drive {self._settings.url}: {refused}")
-        self._learn(ring.Change(since, version))
+        self._learn(ring.VersionChange(since, version))
 
     def _lost(self, why: str) -> DriveLost:
         self.close()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from servotwin.edge.drive import Block
 
 
-class Reading(NamedTuple):
+class RingReading(NamedTuple):
     """One look at the rings.
 
     Attributes
@@ -24,38 +24,38 @@ class Reading(NamedTuple):
     rings: tuple[Sequence[float], ...]
 
 
-class Change(NamedTuple):
+class VersionChange(NamedTuple):
     """A version of the parameters and the first sample under it."""
 
     since: int
     version: int
 
 
-def sound(reading: Any) -> bool:
-    """Whether it is a reading at all: a server may hold anything."""
+def is_valid(reading: Any) -> bool:
+    """True where the values form a reading: a server may hold anything."""
     counts, rings = (reading.before, reading.after), reading.rings
     lists = all(isinstance(ring, list) and ring and all(type(value) is float for value in ring) for ring in rings)
     return lists and len({len(ring) for ring in rings}) == 1 and all(type(count) is int for count in counts)
 
 
-def oldest(reading: Reading, margin: int) -> int:
+def oldest(reading: RingReading, margin: int) -> int:
     """The first sample that nothing was written over, when up to `margin` more than counted were being written."""
     return max(0, reading.after + margin - len(reading.rings[0]))
 
 
-def whole(reading: Reading, first: int, margin: int) -> tuple[int, list["array[float]"]]:
+def whole(reading: RingReading, first: int, margin: int) -> tuple[int, list["array[float]"]]:
     """The samples from `first` on, or from the oldest that is left: the number of the first, and their signals."""
     begin = min(max(first, oldest(reading, margin)), reading.before)
     return begin, [_unrolled(ring, begin, reading.before) for ring in reading.rings]
 
 
-def blocks(first: int, signals: Sequence["array[float]"], changes: Sequence[Change]) -> list[Block]:
+def blocks(first: int, signals: Sequence["array[float]"], changes: Sequence[VersionChange]) -> list[Block]:
     """The samples cut where the version changes, which holds for what is before the first change too."""
     last = first + len(signals[0])
     inside = [change for change in changes if first < change.since < last]
     start = next((change.version for change in reversed(changes) if change.since <= first), changes[0].version)
     found = []
-    bounds = [Change(first, start), *inside, Change(last, 0)]
+    bounds = [VersionChange(first, start), *inside, VersionChange(last, 0)]
     for change, following in pairwise(bounds):
         part = slice(change.since - first, following.since - first)
         found.append(Block(change.since, change.version, *(signal[part] for signal in signals)))

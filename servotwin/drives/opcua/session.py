@@ -125,7 +125,7 @@ class Session:
             raise self._meaning(error) from None
 
     def _meaning(self, error: BaseException) -> Exception:
-        """What an error of the stack means for who drives."""
+        """Convert an error of the OPC UA stack to one of the drive's."""
         name, url = type(error).__name__, self._settings.url
         told = f"drive {url}: {name}" + (f" ({error})" if str(error) else "")
         missing = isinstance(error, ValueError) and not isinstance(error, OSError)

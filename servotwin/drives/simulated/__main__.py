@@ -10,11 +10,11 @@ import time
 
 from servotwin.cosim.machine import compile_ahead
 from servotwin.drives.simulated.control import ControlServer
-from servotwin.drives.simulated.diary import Diary
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
 from servotwin.drives.simulated.server import Ending, Server, Tend, address_in_use, listening, run, start_pace, untended
 from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.drives.simulated.state_recorder import StateRecorder
 from servotwin.drives.simulated.supervise import SuperviseServer
 from servotwin.errors import InvalidInput
 
@@ -32,14 +32,14 @@ def main(path: str, ending: Ending) -> None:
     plant = ControlledPlant(settings) if settings.role == "control" else SupervisedPlant(settings)
     with listening(settings.address) as listener:
         pace = start_pace(settings)
-        diary = None if pace is None else Diary(settings, pace, time.monotonic())
-        server = _server(plant, pace, settings.slack, untended if diary is None else diary.look)
+        recorder = None if pace is None else StateRecorder(settings, pace, time.monotonic())
+        server = _server(plant, pace, settings.slack, untended if recorder is None else recorder.update)
         print("ready", address_in_use(listener, settings.address), flush=True)
         try:
             run(server, listener, settings, os.urandom(8), ending)
         finally:
-            if diary is not None:
-                diary.write(plant.index)
+            if recorder is not None:
+                recorder.write(plant.index)
 
 
 def _server(plant: ControlledPlant | SupervisedPlant, pace: Pace | None, slack: float, tend: Tend) -> Server:

@@ -19,13 +19,13 @@ _NO_GAINS = (0.0,) * len(Gains.__struct_fields__)
 
 @dataclass(frozen=True)
 class Welcome:
-    """What a machine says of itself."""
+    """A machine's answer to a connection."""
 
     rate: float
     machine: str
 
 
-class Line:
+class MachineConnection:
     """The connection to a machine in one role.
 
     Parameters
@@ -87,7 +87,7 @@ class Line:
         return self._socket
 
     def lost(self, error: OSError) -> DriveLost:
-        """What to raise when it is gone."""
+        """Make the error to raise when it is gone."""
         self.close()
         told = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
         return DriveLost(f"machine {self._address}: {told}")
@@ -100,22 +100,22 @@ class Line:
 
 
 class SimulatedControl:
-    """`edge.drive.ControlDrive` of a simulated machine; the parameters are those of `Line`."""
+    """`edge.drive.ControlDrive` of a simulated machine; the parameters are those of `MachineConnection`."""
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
-        self._line = Line(address, "control", silence)
+        self._connection = MachineConnection(address, "control", silence)
         self._owed = False
         self._lag = 0.0
 
     @property
     def rate(self) -> float:
         """Hz."""
-        return self._line.welcome.rate
+        return self._connection.welcome.rate
 
     @property
     def machine(self) -> str:
         """The machine's present run."""
-        return self._line.welcome.machine
+        return self._connection.welcome.machine
 
     @property
     def lag(self) -> float:
@@ -124,14 +124,14 @@ class SimulatedControl:
 
     def connect(self) -> None:
         """Reach the machine; its voltage is what it was left with until the first `write`."""
-        self._line.connect()
+        self._connection.connect()
         self._owed = False
 
     def read(self) -> DriveSample | None:
         """The next sample; one that was not answered lets the voltage hold."""
         if self._owed:
             self.write(nan)
-        number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._line.receive(wire.SAMPLE.size))
+        number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._connection.receive(wire.SAMPLE.size))
         if number == wire.LAST:
             return None
         self._owed = True
@@ -141,15 +141,15 @@ class SimulatedControl:
         """Answer the last sample, once."""
         if self._owed:
             self._owed = False
-            self._line.send(wire.VOLTAGE.pack(voltage))
+            self._connection.send(wire.VOLTAGE.pack(voltage))
 
     def close(self) -> None:
         """Let go of it."""
-        self._line.close()
+        self._connection.close()
 
 
 class SimulatedSupervised:
-    """`edge.drive.SupervisedDrive` of a simulated machine; the parameters are those of `Line`.
+    """`edge.drive.SupervisedDrive` of a simulated machine; the parameters are those of `MachineConnection`.
 
     Reconnected to the same run of the machine it goes on with the sample that is due, as long as the machine has it.
     """
@@ -157,19 +157,19 @@ class SimulatedSupervised:
     can_move, patient = True, False
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
-        self._line = Line(address, "supervise", silence)
+        self._connection = MachineConnection(address, "supervise", silence)
         self._next = wire.NOW
         self._lag = 0.0
 
     @property
     def rate(self) -> float:
         """Hz."""
-        return self._line.welcome.rate
+        return self._connection.welcome.rate
 
     @property
     def machine(self) -> str:
         """The machine's present run."""
-        return self._line.welcome.machine
+        return self._connection.welcome.machine
 
     @property
     def lag(self) -> float:
@@ -179,7 +179,7 @@ class SimulatedSupervised:
     def connect(self) -> None:
         """Reach the machine; in a new run samples count from the present one."""
         before = self.machine
-        self._line.connect()
+        self._connection.connect()
         if self.machine != before:
             self._next = wire.NOW
 
@@ -189,7 +189,7 @@ class SimulatedSupervised:
         if over == wire.OVER:
             return None
         signals = [array("d") for _ in range(4)]
-        data = self._line.receive(32 * count) if count else b""
+        data = self._connection.receive(32 * count) if count else b""
         for k, signal in enumerate(signals):
             signal.frombytes(data[8 * count * k : 8 * count * (k + 1)])
             if sys.byteorder == "big":
@@ -203,7 +203,7 @@ class SimulatedSupervised:
         numbers = parameters.setting.tolerance, *gains
         status, count, _, _ = self._ask(wire.WRITE, parameters.version, numbers, parameters.setting.gains is not None)
         if status == wire.REFUSED:
-            raise DriveRefused(self._line.receive(count).decode("utf-8", "replace"))
+            raise DriveRefused(self._connection.receive(count).decode("utf-8", "replace"))
 
     def move(self, offset: float) -> None:
         """Add this (m) to the reference from the next sample on."""
@@ -211,12 +211,12 @@ class SimulatedSupervised:
 
     def close(self) -> None:
         """Let go of it."""
-        self._line.close()
+        self._connection.close()
 
     def _ask(
         self, kind: int, number: int, numbers: tuple[float, ...] = (0.0, *_NO_GAINS), gains: bool = False, most: int = 0
     ) -> tuple[int, int, int, int]:
         """Send one request; returns the head of its reply."""
-        self._line.send(wire.REQUEST.pack(kind, gains, most, number, *numbers))
-        status, count, first, version, self._lag = wire.REPLY.unpack(self._line.receive(wire.REPLY.size))
+        self._connection.send(wire.REQUEST.pack(kind, gains, most, number, *numbers))
+        status, count, first, version, self._lag = wire.REPLY.unpack(self._connection.receive(wire.REPLY.size))
         return status, count, first, version

@@ -30,7 +30,7 @@ class ControlServer:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended."""
+        """The run has ended."""
         return self._plant.over
 
     def run_alone(self) -> float | None:

@@ -1,4 +1,4 @@
-"""How a machine keeps to the clock; the clock's time (s) comes from outside."""
+"""Pacing of a machine by the clock, whose time (s) comes from outside."""
 
 import math
 
@@ -31,7 +31,7 @@ class Pace:
         self._zero = now - passed * self._every
 
     def due(self, number: int) -> float:
-        """When a sample is due."""
+        """Time at which a sample is due, s."""
         return self._zero + number * self._every
 
     def reached(self, now: float) -> int:

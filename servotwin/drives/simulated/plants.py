@@ -45,7 +45,7 @@ class ControlledPlant:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended."""
+        """The run has ended."""
         return self._end is not None and self._held.index >= self._end
 
     def tick(self, voltage: float) -> None:
@@ -63,7 +63,7 @@ class ControlledPlant:
         self._held.hold(self._voltage)
 
 
-class Stretch(NamedTuple):
+class SampleBlock(NamedTuple):
     """Samples from `first` on, (4, n), under one version of the parameters."""
 
     first: int
@@ -75,10 +75,10 @@ class Stretch(NamedTuple):
         """The sample after it."""
         return self.first + self.values.shape[1]
 
-    def part(self, first: int, most: int) -> Stretch:
+    def part(self, first: int, most: int) -> SampleBlock:
         """At most so many samples from one of its own on."""
         begin = first - self.first
-        return Stretch(first, self.version, self.values[:, begin : begin + most])
+        return SampleBlock(first, self.version, self.values[:, begin : begin + most])
 
 
 class SupervisedPlant:
@@ -93,7 +93,7 @@ class SupervisedPlant:
         self._machine = machine.endless(settings.present, wire.MOST)
         self._law, self._end = settings.scenario.law, settings.end
         self._kept = round(settings.kept * settings.rate)
-        self._stretches: deque[Stretch] = deque()
+        self._blocks: deque[SampleBlock] = deque()
         self.block, self.version = settings.block_samples, 0
 
     @property
@@ -103,7 +103,7 @@ class SupervisedPlant:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended."""
+        """The run has ended."""
         return self._end is not None and self.index >= self._end
 
     def advance(self, samples: int) -> None:
@@ -112,14 +112,14 @@ class SupervisedPlant:
         stop = first + samples if self._end is None else min(first + samples, self._end)
         self._machine.advance(stop)
         values = np.array([self._machine.measured(name, first, stop) for name in CHANNELS])
-        self._stretches.append(Stretch(first, self.version, values))
-        while self._stretches and self._stretches[0].last <= self.index - self._kept:
-            self._stretches.popleft()
+        self._blocks.append(SampleBlock(first, self.version, values))
+        while self._blocks and self._blocks[0].last <= self.index - self._kept:
+            self._blocks.popleft()
 
-    def read(self, first: int, most: int) -> Stretch | None:
+    def read(self, first: int, most: int) -> SampleBlock | None:
         """Samples from one on, or from the oldest kept; None: there are none yet."""
         found = None
-        for stretch in reversed(self._stretches):
+        for stretch in reversed(self._blocks):
             if stretch.last <= first:
                 break
             found = stretch

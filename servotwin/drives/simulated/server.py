@@ -1,4 +1,4 @@
-"""What the two roles share: a listening socket, one client at a time, and the clock."""
+"""Server of a simulated machine, the same in both roles: a listening socket, one client at a time, the clock."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Server(Protocol):
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended."""
+        """The run has ended."""
 
 
 def run(
@@ -148,7 +148,7 @@ def listening(address: wire.Address) -> Iterator[socket.socket]:
 
 
 def address_in_use(listener: socket.socket, address: wire.Address) -> wire.Address:
-    """Where clients find it: port 0 became another one."""
+    """Address in use: port 0 became another one."""
     return address if address.path is not None else address._replace(port=listener.getsockname()[1])
 
 
@@ -186,6 +186,6 @@ def _greet(connection: socket.socket, settings: MachineSettings, name: bytes) ->
 
 
 def _answers(address: wire.Address) -> bool:
-    """Whether somebody listens at a path."""
+    """True where a process listens at a path."""
     with wire.new_socket(address) as trial:
         return trial.connect_ex(wire.place(address)) == 0

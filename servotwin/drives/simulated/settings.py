@@ -12,7 +12,7 @@ from servotwin.config.table import Table, named, read_toml
 from servotwin.config.toml import read
 from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.drives.simulated import wire
-from servotwin.drives.simulated.diary import read_speed, read_state
+from servotwin.drives.simulated.machine_state import read_speed, read_state
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
 

@@ -18,7 +18,7 @@ SENDING = 5.0
 """s that a client may take to receive a reply."""
 
 
-class Asked(NamedTuple):
+class DriveRequest(NamedTuple):
     """A request."""
 
     kind: int
@@ -45,7 +45,7 @@ class SuperviseServer:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended."""
+        """The run has ended."""
         return self._plant.over
 
     def run_alone(self) -> float | None:
@@ -81,7 +81,7 @@ class SuperviseServer:
             if select.select([connection], [], [], patience)[0]:
                 return
 
-    def _read(self, connection: socket.socket, asked: Asked) -> bool:
+    def _read(self, connection: socket.socket, asked: DriveRequest) -> bool:
         """Answer with a block as soon as there is one; whether there is none any more."""
         plant, most = self._plant, min(asked.most or wire.MOST, wire.MOST)
         first = plant.index if asked.number == wire.NOW else asked.number
@@ -98,7 +98,7 @@ class SuperviseServer:
         connection.sendall(head + data)
         return False
 
-    def _obey(self, connection: socket.socket, asked: Asked) -> None:
+    def _obey(self, connection: socket.socket, asked: DriveRequest) -> None:
         """Take parameters or a move, or say why not."""
         try:
             if asked.kind == wire.WRITE:
@@ -115,6 +115,6 @@ class SuperviseServer:
             connection.sendall(wire.REPLY.pack(wire.DONE, 0, self._plant.index, self._plant.version, self._late))
 
 
-def _asked(data: bytes) -> Asked:
+def _asked(data: bytes) -> DriveRequest:
     kind, with_gains, most, number, tolerance, *gains = wire.REQUEST.unpack(data)
-    return Asked(kind, with_gains, most, number, tolerance, tuple(gains))
+    return DriveRequest(kind, with_gains, most, number, tolerance, tuple(gains))

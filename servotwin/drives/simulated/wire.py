@@ -1,4 +1,4 @@
-"""What a simulated machine and its client say to each other: fixed sizes, little-endian.
+"""Protocol between a simulated machine and its client: messages of fixed sizes, little-endian.
 
 Client: HELLO, once; machine: WELCOME, once. Then in control the machine sends a SAMPLE at each sample instant and the
 client answers each with a VOLTAGE. In supervise the client sends a REQUEST at a time and the machine answers each with
@@ -32,7 +32,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class Address(NamedTuple):
-    """Where a machine listens: a path, or a host on this machine and a port."""
+    """Address of a machine: a path, or a host on this machine and a port."""
 
     path: str | None
     host: str = ""

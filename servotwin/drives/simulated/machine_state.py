@@ -1,0 +1,77 @@
+"""Files of a simulated machine: its state (time and gap) and the speed that it is asked for."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import msgspec
+
+from servotwin.errors import InvalidInput
+from servotwin.runtime.files import replace_file
+
+MOST_SPEED = 1e4
+_LONGEST = 64
+
+
+class MachineState(msgspec.Struct, frozen=True, tag="servotwin-machine/1", tag_field="schema", kw_only=True):
+    """State of a machine.
+
+    Attributes
+    ----------
+    time_s : float
+        Machine time since it was new, all its runs together.
+    gap_deg : float
+        Total gap.
+    speed : float
+        Seconds of machine time per second that it is told to keep.
+    begun_s : float
+        Machine time at the beginning of this run: its sample 0.
+    written : float
+        s since the epoch.
+    """
+
+    time_s: float
+    gap_deg: float
+    speed: float
+    begun_s: float
+    written: float
+
+
+def read_state(path: str | os.PathLike[str]) -> MachineState | None:
+    """Read the state file; None: there is none.
+
+    Raises
+    ------
+    InvalidInput
+        There is a file, and it is no machine's.
+    """
+    try:
+        state = msgspec.json.decode(Path(path).read_bytes(), type=MachineState)
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.MsgspecError) as error:
+        raise InvalidInput(f"{path}: is no state of a machine ({error}); without this file it begins anew") from None
+    if not (0.0 <= state.time_s < math.inf):
+        raise InvalidInput(f"{path}: time_s = {state.time_s!r} s: must be finite and 0 or more")
+    return state
+
+
+def write_state(path: Path, state: MachineState) -> None:
+    """Replace the state file, whole or not at all; raises OSError."""
+    replace_file(path, msgspec.json.format(msgspec.json.encode(state)) + b"\n")
+
+
+def read_speed(path: Path) -> float | None:
+    """Read the speed asked for; None: the file holds none, and the present speed stays."""
+    try:
+        speed = float(path.read_bytes()[:_LONGEST])
+    except (OSError, ValueError):
+        return None
+    return speed if 0.0 < speed <= MOST_SPEED else None
+
+
+def write_speed(path: Path, speed: float) -> None:
+    """Ask a machine for a speed; raises OSError."""
+    replace_file(path, f"{speed!r}\n".encode())
