@@ -24,7 +24,7 @@ from benchmarks.estimator_figures import (
     eight_gaps,
     on_floor,
 )
-from benchmarks.estimator_windows import RATE, Case, paper_loop_cases, random_cases
+from benchmarks.estimator_windows import RATE, WindowCase, paper_loop_cases, random_cases
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.paper.estimator import PaperSettings
@@ -95,13 +95,13 @@ def in_the_papers_noise(per_gap: int, seed: int, floor: float = FLOOR) -> list[F
     return [*figures, against_the_paper(cases, errors)] if judged else figures
 
 
-def paper_noise_cases(per_gap: int, seed: int, floor: float) -> list[Case]:
+def paper_noise_cases(per_gap: int, seed: int, floor: float) -> list[WindowCase]:
     """The paper's loop in its noise, and a white floor (m) on top."""
     rng = np.random.default_rng(seed)
     return [on_floor(case, floor, rng) for case in paper_loop_cases(eight_gaps(), per_gap, seed, PAPER_NOISE)]
 
 
-def against_the_paper(cases: Sequence[Case], errors: Array) -> Figure:
+def against_the_paper(cases: Sequence[WindowCase], errors: Array) -> Figure:
     """Root mean square error of the paper's method over ours."""
     settings = PaperSettings(lowpass_hz=20.0)
     published = [estimate_gap(c.window, c.servo, method="paper", prior=c.gap, settings=settings) for c in cases]
@@ -189,7 +189,7 @@ def _times(jobs: Sequence[Callable[[], object]], clock: Clock) -> list[float]:
     return found
 
 
-def _bounds(cases: Sequence[Case], floor: float, noise: Noise | None) -> Array:
+def _bounds(cases: Sequence[WindowCase], floor: float, noise: Noise | None) -> Array:
     """(n,) deg, Cramer-Rao bounds."""
     root = noise_root(cases[0].window.position.size, RATE, floor, noise)
     angles = [case.window.theta_m for case in cases]

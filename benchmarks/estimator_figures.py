@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.estimator import WhitenedSettings
@@ -54,7 +54,7 @@ class Figure:
 class Answers:
     """Estimates of some cases, accepted or not."""
 
-    cases: Sequence[Case]
+    cases: Sequence[WindowCase]
     estimates: Sequence[GapEstimate]
 
     @property
@@ -75,7 +75,9 @@ class Answers:
         return float(np.mean(ratio <= NORMAL_95)) if ratio.size else math.nan
 
 
-def answers(cases: Iterable[Case], servo: Servo | None = None, settings: WhitenedSettings | None = None) -> Answers:
+def answers(
+    cases: Iterable[WindowCase], servo: Servo | None = None, settings: WhitenedSettings | None = None
+) -> Answers:
     """The default estimator's, with another model where one is given."""
     known = list(cases)
     return Answers(known, [estimate_gap(c.window, servo or c.servo, settings=settings) for c in known])
@@ -86,11 +88,11 @@ def eight_gaps() -> Array:
     return np.radians(np.linspace(4.0, 18.0, 8))
 
 
-def clean_cases(per_gap: int, seed: int) -> list[Case]:
+def clean_cases(per_gap: int, seed: int) -> list[WindowCase]:
     """Windows of the paper's loop without noise."""
     return paper_loop_cases(eight_gaps(), per_gap, seed, None)
 
 
-def on_floor(case: Case, floor: float, rng: np.random.Generator) -> Case:
+def on_floor(case: WindowCase, floor: float, rng: np.random.Generator) -> WindowCase:
     """A case with white noise of `floor` (m)."""
     return case.noisy(floor * rng.standard_normal(case.window.position.size))

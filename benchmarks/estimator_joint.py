@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.cramer_rao import bound, motor_unknowns, noise_root
 from benchmarks.estimator_figures import ANY, FLOOR, Figure, on_floor
-from benchmarks.estimator_windows import PRESETS, RATE, Case, cut
+from benchmarks.estimator_windows import PRESETS, RATE, WindowCase, cut
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.joint.estimator import estimate_jointly
 from servotwin.estimation.window import Window
@@ -29,7 +29,7 @@ OFF = {"k": 1.05, "c": 1.2, "p": 1.01}
 
 
 @dataclass(frozen=True)
-class Loop:
+class JointLoop:
     """Where windows come from, and how long they are (s); each begins `before` (s) ahead of its step."""
 
     name: str
@@ -39,13 +39,13 @@ class Loop:
     seconds: float = 1.0
 
 
-CONTINUOUS, SAMPLED = Loop("continuous loop"), Loop("sampled loop", sampled=True)
-PAPER = Loop("paper's noise", sampled=True, noise=Noise(0.22e-3))
+CONTINUOUS, SAMPLED = JointLoop("continuous loop"), JointLoop("sampled loop", sampled=True)
+PAPER = JointLoop("paper's noise", sampled=True, noise=Noise(0.22e-3))
 
 
-def recorded(loop: Loop) -> Loop:
+def recorded(loop: JointLoop) -> JointLoop:
     """With the recorder's windows: 2 s, from 0.3 s before the step on."""
-    return Loop(f"{loop.name}, 2 s", loop.sampled, loop.noise, 0.3, 2.0)
+    return JointLoop(f"{loop.name}, 2 s", loop.sampled, loop.noise, 0.3, 2.0)
 
 
 LOOPS = (CONTINUOUS, PAPER, recorded(CONTINUOUS), recorded(SAMPLED), recorded(PAPER))
@@ -66,7 +66,7 @@ def table(runs: int, seed: int) -> Iterator[Figure]:
                 yield from judged(groups, loop, preset, False, together=True)
 
 
-def windows(loop: Loop, preset: str, runs: int, seed: int, floor: float = FLOOR) -> list[list[Case]]:
+def windows(loop: JointLoop, preset: str, runs: int, seed: int, floor: float = FLOOR) -> list[list[WindowCase]]:
     """`PER_RUN` windows of each of `runs` runs with gaps of 1 to 20 deg, every second one with a dead zone."""
     rng, groups = np.random.default_rng(seed), []
     servo = Servo.preset(preset)
@@ -90,7 +90,7 @@ def windows(loop: Loop, preset: str, runs: int, seed: int, floor: float = FLOOR)
     return groups
 
 
-def noise_free(groups: Sequence[Sequence[Case]], loop: Loop, preset: str, voltage: bool) -> Figure:
+def noise_free(groups: Sequence[Sequence[WindowCase]], loop: JointLoop, preset: str, voltage: bool) -> Figure:
     """Largest error where only rounding and sampling are left."""
     found = Errors.of(groups, [estimates(group, loop, voltage, together=False) for group in groups])
     name = f"{_words(loop, preset, voltage)}, noise-free: largest error, deg"
@@ -98,7 +98,7 @@ def noise_free(groups: Sequence[Sequence[Case]], loop: Loop, preset: str, voltag
 
 
 def judged(
-    groups: Sequence[Sequence[Case]], loop: Loop, preset: str, voltage: bool, together: bool = False
+    groups: Sequence[Sequence[WindowCase]], loop: JointLoop, preset: str, voltage: bool, together: bool = False
 ) -> list[Figure]:
     """Errors beside the bound; the largest has to keep its target where three times the bound does."""
     found = Errors.of(groups, [estimates(group, loop, voltage, together) for group in groups])
@@ -125,7 +125,7 @@ class Errors:
     refused: int
 
     @classmethod
-    def of(cls, groups: Sequence[Sequence[Case]], found: Sequence[Sequence[GapEstimate]]) -> Errors:
+    def of(cls, groups: Sequence[Sequence[WindowCase]], found: Sequence[Sequence[GapEstimate]]) -> Errors:
         """Of the windows of some groups."""
         pairs = [pair for each in zip(groups, found, strict=True) for pair in zip(*each, strict=True)]
         known = [(one.gap - case.gap, one.std) for case, one in pairs if one.ok]
@@ -143,11 +143,11 @@ class Errors:
         return float(np.mean(np.abs(self.errors) <= NORMAL_95 * self.stds))
 
 
-def _words(loop: Loop, preset: str, voltage: bool) -> str:
+def _words(loop: JointLoop, preset: str, voltage: bool) -> str:
     return f"{'from the voltage' if voltage else 'joint fit'}, {loop.name}, {preset}"
 
 
-def estimates(group: Sequence[Case], loop: Loop, voltage: bool, together: bool) -> tuple[GapEstimate, ...]:
+def estimates(group: Sequence[WindowCase], loop: JointLoop, voltage: bool, together: bool) -> tuple[GapEstimate, ...]:
     """Of the windows of one machine, whose description is wrong."""
     servo, seen = group[0].servo, [case.window for case in group]
     wrong, free = described(servo, OFF), None
@@ -168,13 +168,13 @@ def described(servo: Servo, factors: Mapping[str, float]) -> Servo:
     return servo.replace(**changes)
 
 
-def limit(cases: Sequence[Case], loop: Loop, voltage: bool) -> float:
+def limit(cases: Sequence[WindowCase], loop: JointLoop, voltage: bool) -> float:
     """Root mean square of the bounds, deg; one window at a time, the jumps of the voltage known."""
     root = noise_root(cases[0].window.position.size, RATE, FLOOR, loop.noise)
     return math.degrees(float(np.sqrt(np.mean([_bound(case, loop, voltage, root) ** 2 for case in cases]))))
 
 
-def _bound(case: Case, loop: Loop, voltage: bool, root: Array) -> float:
+def _bound(case: WindowCase, loop: JointLoop, voltage: bool, root: Array) -> float:
     seen, at = case.window, (RATE, case.gap, case.theta_d0, root)
     assert seen.theta_m is not None
     assert seen.voltage is not None

@@ -24,7 +24,7 @@ _GROWTH = math.radians(20.0) / 200.0  # rad/s, the paper's S-curve on average
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class WindowCase:
     """A window and the truth about it.
 
     Attributes
@@ -54,16 +54,16 @@ class Case:
         """Whether the screw was pushed both ways by what the gate asks for."""
         return min(self.forwards, self.backwards) >= _TRAVEL
 
-    def noisy(self, noise: Array) -> Case:
+    def noisy(self, noise: Array) -> WindowCase:
         """The same with noise (n,) m on the position."""
         return self.replaced(self.window.replace(position=self.window.position + noise), self.servo)
 
-    def replaced(self, window: Window, servo: Servo) -> Case:
+    def replaced(self, window: Window, servo: Servo) -> WindowCase:
         """The same truth about another window, for another model."""
         return replace(self, window=window, servo=servo)
 
 
-def cut(run: Run, start: float, duration: float, words: str = "") -> Case:
+def cut(run: Run, start: float, duration: float, words: str = "") -> WindowCase:
     """The window of a run from `start` (s) on, `duration` (s) long."""
     window = Window.from_run(run, start, duration)
     first = round(window.start * run.sample_rate)
@@ -71,7 +71,7 @@ def cut(run: Run, start: float, duration: float, words: str = "") -> Case:
     moved = np.diff(screw[: -round(response(run.servo, RATE).unseen * run.sample_rate)])
     gap = float(run.gap[first + (window.position.size - 1) // 2])
     forwards, backwards = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
-    return Case(window, run.servo, gap, float(screw[0]), forwards, backwards, f"{words}, window at {start:.4f} s")
+    return WindowCase(window, run.servo, gap, float(screw[0]), forwards, backwards, f"{words}, window at {start:.4f} s")
 
 
 def random_servo(rng: np.random.Generator) -> Servo:
@@ -108,7 +108,7 @@ def random_run(rng: np.random.Generator, gap: float, duration: float, kind: str)
 
 def random_cases(
     rng: np.random.Generator, count: int, largest: float, two_contacts: bool, constant: bool = False, per_run: int = 4
-) -> Iterator[Case]:
+) -> Iterator[WindowCase]:
     """`count` windows of 1 s with gaps up to `largest` (rad), anywhere in their runs.
 
     On demand only those with two contacts, or only runs with a constant gap.
@@ -126,7 +126,7 @@ def random_cases(
 
 def paper_loop_cases(
     gaps: Array, per_gap: int, seed: int, noise: Noise | None, servo: Servo | None = None, seconds: float = 1.0
-) -> list[Case]:
+) -> list[WindowCase]:
     """Windows after the steps of the paper's loop: +-1 mm, a step every 5 s, the dead zone for the true gap.
 
     With noise the controller is section 4.3's, sampled, with a loop filter at 20 Hz.

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import report
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.messages import Channel, WindowMessage, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.plant.noise import Noise
@@ -96,7 +96,7 @@ def _row(name: str, floor: float | None, gaps: int) -> GlanceRow:
     return GlanceRow(name, len(cases), error, std, seen, min(times), float(np.median(times)))
 
 
-def _cases(floor: float | None, gaps: int) -> Iterator[Case]:
+def _cases(floor: float | None, gaps: int) -> Iterator[WindowCase]:
     """Windows that show both contacts, of gaps from 1 to 40 deg."""
     rng = np.random.default_rng(0)
     noise = None if floor is None else Noise(0.22e-3, (10.0, 50.0))
@@ -106,7 +106,7 @@ def _cases(floor: float | None, gaps: int) -> Iterator[Case]:
 
 
 def _estimated_share(
-    cases: Sequence[Case], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
+    cases: Sequence[WindowCase], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
 ) -> float:
     """Share of windows that would be estimated, the gap having moved by so much (deg) to either side."""
     found = []
@@ -118,7 +118,7 @@ def _estimated_share(
     return float(np.mean(found))
 
 
-def _glance_time(case: Case, message: WindowMessage, usual: float) -> float:
+def _glance_time(case: WindowCase, message: WindowMessage, usual: float) -> float:
     """ms from bytes to verdict."""
     body, watch = encode(message), _watch(case.gap, usual)
     begin = time.perf_counter()
@@ -132,7 +132,7 @@ def _watch(gap: float, usual: float) -> TriageState:
     return TriageState("", "b", 0, 0.0, gap, math.radians(KNOWN_DEG), misfit=usual)
 
 
-def _message(case: Case) -> WindowMessage:
+def _message(case: WindowCase) -> WindowMessage:
     packed: list[Channel] = []
     for name, samples in case.window.channels.items():
         packed += (

@@ -18,9 +18,9 @@ from benchmarks import report
 from benchmarks.accuracy import limited, target
 from benchmarks.estimator_figures import ANY, Figure
 from benchmarks.novelty import loops
-from benchmarks.novelty.loops import Account, Case
+from benchmarks.novelty.loops import Account, LoopCase
 from benchmarks.novelty.sequences import Delays, delays, one_window, run_length, wearing
-from benchmarks.novelty.windows import CONDITIONS, RATE, TOLD, Condition, Pool, Task, pools, recorded
+from benchmarks.novelty.windows import CONDITIONS, RATE, TOLD, NoveltyCondition, PoolTask, ScorePool, pools, recorded
 from servotwin.analysis.maps.pool import workplace
 from servotwin.novelty.score import model_of, score
 from servotwin.novelty.settings import NoveltyRules
@@ -84,7 +84,7 @@ def novelty(
     return tuple(figures)
 
 
-def charted(condition: Condition, size: Size, seed: int = 2026) -> Iterator[Figure]:
+def charted(condition: NoveltyCondition, size: Size, seed: int = 2026) -> Iterator[Figure]:
     """All figures of one condition."""
     gaps = [TOLD + math.radians(step) for step in (0.0, *STEPS)]
     counts = [size.quiet, *(size.changed for _ in STEPS)]
@@ -108,7 +108,7 @@ def charted(condition: Condition, size: Size, seed: int = 2026) -> Iterator[Figu
         yield _delay(f"{name}: wear of {rate} deg per window", found, size.trials // 4)
 
 
-def _scatter(pool: Pool) -> float:
+def _scatter(pool: ScorePool) -> float:
     return float(np.mean(pool.scores[..., 0].std(axis=1)))
 
 
@@ -122,7 +122,7 @@ def cost(size: Size, clock: Clock = time.perf_counter) -> Iterator[Figure]:
     known, spent = Servo.preset("paper"), []
     model = model_of(known, RATE)
     for seed in range(1 + size.quiet // 200):
-        for window in recorded(Task(CONDITIONS[0], TOLD, seed), known):
+        for window in recorded(PoolTask(CONDITIONS[0], TOLD, seed), known):
             assert window.theta_m is not None
             signals = array("d", window.theta_m), array("d", window.position)
             begin = clock()
@@ -145,7 +145,7 @@ def shown(figures: Sequence[Figure]) -> Table:
     return result
 
 
-def saved(sent: Sequence[tuple[Case, str, Account]]) -> Table:
+def saved(sent: Sequence[tuple[LoopCase, str, Account]]) -> Table:
     """What was sent and what it cost."""
     result = Table(title="messages of the closed loop", title_justify="left", box=None, pad_edge=False)
     result.add_column("loop")
@@ -162,7 +162,7 @@ def saved(sent: Sequence[tuple[Case, str, Account]]) -> Table:
     return result
 
 
-def dumps(figures: Sequence[Figure], sent: Sequence[tuple[Case, str, Account]], date: str) -> str:
+def dumps(figures: Sequence[Figure], sent: Sequence[tuple[LoopCase, str, Account]], date: str) -> str:
     """The document: schema, date, machine, figures, loops."""
     rows = [
         {
@@ -175,6 +175,7 @@ def dumps(figures: Sequence[Figure], sent: Sequence[tuple[Case, str, Account]], 
         for figure in figures
     ]
     closed = [
-        {**dict(zip(Case._fields[:3], case, strict=False)), "sent is": name, **a._asdict()} for case, name, a in sent
+        {**dict(zip(LoopCase._fields[:3], case, strict=False)), "sent is": name, **a._asdict()}
+        for case, name, a in sent
     ]
     return report.text(SCHEMA, date, figures=rows, loops=closed)

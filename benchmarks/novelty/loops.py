@@ -22,7 +22,7 @@ GROWTH = math.radians(20.0)
 _SAMPLES, _KNOWN = 200.0, 5.0  # Hz, at which errors of the loop and of the gap are summed up
 
 
-class Case(NamedTuple):
+class LoopCase(NamedTuple):
     """A packaged scenario, its wear of 20 deg (or none, at 10 deg) over so many seconds, and what the edge sends."""
 
     scenario: str
@@ -70,20 +70,20 @@ FULL = (("fig15", 200.0, True), ("fig15", 2000.0, True), ("fig16", 2000.0, False
 QUICK = (("fig15", 200.0, True), ("fig15", 400.0, False))
 
 
-def accounts(loops: Sequence[tuple[str, float, bool]]) -> Iterator[tuple[Case, str, Account]]:
+def accounts(loops: Sequence[tuple[str, float, bool]]) -> Iterator[tuple[LoopCase, str, Account]]:
     """All loops under all rules, each rule with its name, in their order."""
-    cases = {Case(*loop, rules): name for loop in loops for name, rules in RULES}
+    cases = {LoopCase(*loop, rules): name for loop in loops for name, rules in RULES}
     found = dict(shared(account, cases))
     for case, name in cases.items():
         yield case, name, found[case]
 
 
-def account(case: Case) -> Account:
+def account(case: LoopCase) -> Account:
     """One loop."""
     return summary(cosimulate(scenario(case)))
 
 
-def scenario(case: Case) -> Scenario:
+def scenario(case: LoopCase) -> Scenario:
     """The packaged one, its wear stretched."""
     packaged = Scenario.preset(case.scenario)
     gap = SCurve(0.0, GROWTH, duration=case.seconds) if case.wears else 0.5 * GROWTH

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.novelty.windows import Pool
+from benchmarks.novelty.windows import ScorePool
 from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.signals import Array
@@ -41,7 +41,7 @@ def follow(chart: Chart, scores: Array, rules: NoveltyRules) -> Iterator[tuple[C
         yield chart, seen.sudden or seen.slow
 
 
-def run_length(pool: Pool, rules: NoveltyRules, windows: int, rng: np.random.Generator) -> tuple[float, int]:
+def run_length(pool: ScorePool, rules: NoveltyRules, windows: int, rng: np.random.Generator) -> tuple[float, int]:
     """Windows per false alarm where nothing changes, after the first few; and how many alarms there were."""
     chart = _settled(pool, rules, rng)
     alarms = sum(news for _, news in follow(chart, pool.drawn(windows, rng), rules))
@@ -49,14 +49,14 @@ def run_length(pool: Pool, rules: NoveltyRules, windows: int, rng: np.random.Gen
 
 
 def delays(
-    before: Pool, after: Pool, rules: NoveltyRules, trials: int, rng: np.random.Generator, fresh: bool = False
+    before: ScorePool, after: ScorePool, rules: NoveltyRules, trials: int, rng: np.random.Generator, fresh: bool = False
 ) -> Delays:
     """Until a step from one gap to another is seen; `fresh`: the baseline has begun anew with the last window."""
     found = [_delay(before, after, 0.0, rules, rng, fresh) for _ in range(trials)]
     return _summary(found)
 
 
-def wearing(pool: Pool, rate: float, rules: NoveltyRules, trials: int, rng: np.random.Generator) -> Delays:
+def wearing(pool: ScorePool, rate: float, rules: NoveltyRules, trials: int, rng: np.random.Generator) -> Delays:
     """Until a growth of `rate` (rad per window) is seen."""
     found = [_delay(pool, pool, rate, rules, rng, fresh=False) for _ in range(trials)]
     return _summary(found)
@@ -67,7 +67,9 @@ def _summary(found: list[float]) -> Delays:
     return Delays(middle, late, float(np.mean(np.array(found) == 1.0)))
 
 
-def _delay(before: Pool, after: Pool, rate: float, rules: NoveltyRules, rng: np.random.Generator, fresh: bool) -> float:
+def _delay(
+    before: ScorePool, after: ScorePool, rate: float, rules: NoveltyRules, rng: np.random.Generator, fresh: bool
+) -> float:
     chart = _settled(before, rules, rng)
     if fresh:
         chart = with_fewer_windows(restarted(chart, float(before.drawn(1, rng)[0, 0]), math.inf), 1)
@@ -81,7 +83,7 @@ def _delay(before: Pool, after: Pool, rate: float, rules: NoveltyRules, rng: np.
     return math.inf
 
 
-def _settled(pool: Pool, rules: NoveltyRules, rng: np.random.Generator) -> Chart:
+def _settled(pool: ScorePool, rules: NoveltyRules, rng: np.random.Generator) -> Chart:
     """A chart that has seen some windows."""
     chart = Chart()
     for later, _ in follow(chart, pool.drawn(QUIET, rng), rules):
@@ -89,7 +91,7 @@ def _settled(pool: Pool, rules: NoveltyRules, rng: np.random.Generator) -> Chart
     return chart
 
 
-def one_window(before: Pool, after: Pool, false_alarms: float) -> float:
+def one_window(before: ScorePool, after: ScorePool, false_alarms: float) -> float:
     """Share of single windows beyond the limit that a share of the unchanged ones exceeds: the baseline is known."""
     resting, changed = (pool.scores[..., 0].ravel() for pool in (before, after))
     limit = np.quantile(np.abs(resting - resting.mean()), 1.0 - false_alarms)

@@ -26,7 +26,7 @@ TOLD = math.radians(10.0)
 
 
 @dataclass(frozen=True)
-class Condition:
+class NoveltyCondition:
     """What the machine is beside what the edge takes it for.
 
     Attributes
@@ -46,23 +46,23 @@ class Condition:
 
 PAPER_NOISE = Noise(0.22e-3)
 CONDITIONS = (
-    Condition("paper's noise", PAPER_NOISE),
-    Condition("paper's noise, k + 1 %, c + 20 %", PAPER_NOISE, 1.01, 1.2),
-    Condition("1 um", None),
-    Condition("1 um, k + 1 %, c + 20 %", None, 1.01, 1.2),
+    NoveltyCondition("paper's noise", PAPER_NOISE),
+    NoveltyCondition("paper's noise, k + 1 %, c + 20 %", PAPER_NOISE, 1.01, 1.2),
+    NoveltyCondition("1 um", None),
+    NoveltyCondition("1 um, k + 1 %, c + 20 %", None, 1.01, 1.2),
 )
 
 
-class Task(NamedTuple):
+class PoolTask(NamedTuple):
     """So many windows of one machine at a gap (rad)."""
 
-    condition: Condition
+    condition: NoveltyCondition
     gap: float
     seed: int
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class ScorePool:
     """Scores at one gap, those after steps up and those after steps down.
 
     Attributes
@@ -85,10 +85,10 @@ class Pool:
         return np.asarray(self.scores[np.arange(count) % 2, which])
 
 
-def pools(condition: Condition, gaps: Sequence[float], counts: Sequence[int], seed: int) -> Iterator[Pool]:
+def pools(condition: NoveltyCondition, gaps: Sequence[float], counts: Sequence[int], seed: int) -> Iterator[ScorePool]:
     """One pool for each gap (rad), of at least so many windows."""
     tasks = [
-        Task(condition, gap, seed + 1000 * place + chunk)
+        PoolTask(condition, gap, seed + 1000 * place + chunk)
         for place, (gap, count) in enumerate(zip(gaps, counts, strict=True))
         for chunk in range(-(-count // CHUNK))
     ]
@@ -97,10 +97,10 @@ def pools(condition: Condition, gaps: Sequence[float], counts: Sequence[int], se
         rows = [row for task in tasks if task.gap == gap for row in found[task]]
         said = [[s[1:] for s in rows if s[0] == way and math.isfinite(s[1])] for way in (0, 1)]
         few = min(map(len, said))
-        yield Pool(gap, np.array([way[:few] for way in said]), len(rows) - sum(map(len, said)))
+        yield ScorePool(gap, np.array([way[:few] for way in said]), len(rows) - sum(map(len, said)))
 
 
-def scored(task: Task) -> list[tuple[int, float, float]]:
+def scored(task: PoolTask) -> list[tuple[int, float, float]]:
     """Of each window: after which kind of step, estimate, standard deviation; NaN where it says nothing."""
     known = Servo.preset("paper")
     model, rng = model_of(known, RATE), np.random.default_rng(task.seed)
@@ -113,7 +113,7 @@ def scored(task: Task) -> list[tuple[int, float, float]]:
     return rows
 
 
-def recorded(task: Task, known: Servo) -> Iterator[Window]:
+def recorded(task: PoolTask, known: Servo) -> Iterator[Window]:
     """The windows after the steps of one run, in a dead zone for what the twin was told."""
     condition = task.condition
     plant = known.replace(k=_times(known.k, condition.k), c=_times(known.c, condition.c))

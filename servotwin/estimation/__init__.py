@@ -1,1 +1,1 @@
-"""From measurements to the gap: windows, observers, estimators, and what an estimate says of itself."""
+"""Estimation of the gap from measurements: windows, observers, estimators, estimates with their spread and status."""

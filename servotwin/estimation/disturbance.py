@@ -1,4 +1,4 @@
-"""What pushes and shakes a servo at rest: the bias at the motor's input, and the noise of the position.
+"""Disturbances of a servo at rest: the bias at the motor's input, and the noise of the position.
 
 At rest nothing accelerates, so on average no torque is passed on, and the motor's voltage cancels the bias, whatever
 the controller is made of. A motor that creeps across its gap is still at rest in that sense: the voltage then carries
@@ -35,7 +35,7 @@ _DRIFTS = 2.0  # standard deviations from which on a drift is one
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What a window says of the input bias and the measurement's noise.
+    """Input bias and measurement noise, as one window shows them.
 
     Attributes
     ----------
@@ -62,12 +62,12 @@ class Disturbance:
 
     @property
     def known(self) -> bool:
-        """Whether there is a bias to go by."""
+        """True where the bias is known."""
         return math.isfinite(self.bias)
 
 
 def nothing_known(effort: float, *reasons: str) -> Disturbance:
-    """Of a window without a rest; `effort` in V."""
+    """Return the result for a window without a rest; `effort` in V."""
     return Disturbance(math.nan, math.inf, math.nan, 0.0, effort, reasons)
 
 
@@ -168,7 +168,7 @@ def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches
 
 
 def _still(means: Array, size: int, volts: float) -> bool:
-    """Whether a signal rests but for noise; `volts` is the back EMF (V) of one unit per sample."""
+    """Tell whether a signal rests but for noise; `volts` is the back EMF (V) of one unit per sample."""
     if volts * float(np.max(np.abs(np.diff(means)))) / size <= _CREEP:
         return True
     return means.size >= _FEWEST and _roughness(means) >= _SMOOTH
@@ -195,7 +195,7 @@ def _spread(drive: Array) -> float:
 
 @lru_cache(maxsize=16)
 def _few(freedom: int) -> float:
-    """By how much more standard deviations 95 % take where few values made them."""
+    """Return the factor from normal to Student's 95 % interval, for a spread estimated from few values."""
     return float(student.ppf(0.975, freedom)) / NORMAL_95
 
 

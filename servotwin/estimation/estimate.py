@@ -14,7 +14,7 @@ NORMAL_95 = 1.959963984540054  # standard deviations on either side of the mean 
 
 
 class GapStatus(StrEnum):
-    """What an estimate may be used for; only OK may reach a controller."""
+    """Status of an estimate; only OK may reach a controller."""
 
     OK = "ok"
     LOWER_BOUND = "lower bound"
@@ -122,12 +122,12 @@ class GapEstimate:
 
     @property
     def ok(self) -> bool:
-        """Whether the value may be used to set a controller."""
+        """True where the value may be used to set a controller."""
         return self.status is GapStatus.OK
 
 
 def no_estimate(time: float, reasons: tuple[str, ...] = (), model_version: str = "", method: str = "") -> GapEstimate:
-    """What is stated of the gap at a time (s) of which nothing is known, and why."""
+    """Make the estimate of a window that shows nothing, with the reasons; `time` in s."""
     return GapEstimate(
         gap=math.nan,
         std=math.inf,

@@ -1,4 +1,4 @@
-"""Estimating the gap: one entry, several methods."""
+"""Estimating the gap: one entry, a registry of methods. A new method is one more module there."""
 
 from __future__ import annotations
 
@@ -9,20 +9,31 @@ from typing import Any, NamedTuple
 from servotwin.errors import InvalidInput
 from servotwin.estimation import paper, whitened
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.estimation.window import MINIMUM_SAMPLES, Window
+from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 
 
 class Method(NamedTuple):
-    """An estimator, and the class of its settings."""
+    """An estimator in the registry.
+
+    Attributes
+    ----------
+    estimate : callable
+        (window, servo, prior, settings) -> GapEstimate; the prior is a gap (rad), an estimate that is OK, or None.
+    settings : type
+        Class of its settings.
+    shortest : callable
+        (settings, sample rate in Hz) -> shortest window (s), and the reason in words.
+    """
 
     estimate: Callable[..., GapEstimate]
     settings: type
+    shortest: Callable[[Any, float], tuple[float, str]]
 
 
 METHODS: Mapping[str, Method] = {
-    whitened.METHOD: Method(whitened.estimate, whitened.WhitenedSettings),
-    paper.METHOD: Method(paper.estimate, paper.PaperSettings),
+    module.METHOD: Method(module.estimate, settings, module.shortest_window)
+    for module, settings in ((whitened, whitened.WhitenedSettings), (paper, paper.PaperSettings))
 }
 
 
@@ -56,10 +67,7 @@ def estimate_gap(
         is too short.
     """
     chosen = settings_of(method, settings)
-    known = _believed(prior)
-    if method == paper.METHOD and isinstance(known, GapEstimate):
-        known = known.gap
-    return METHODS[method].estimate(window, servo, known, chosen)
+    return METHODS[method].estimate(window, servo, _believed(prior), chosen)
 
 
 def settings_of(method: str, settings: Any = None) -> Any:
@@ -81,15 +89,11 @@ def settings_of(method: str, settings: Any = None) -> Any:
 
 def shortest_window(method: str, sample_rate: float, settings: Any = None) -> tuple[float, str]:
     """The shortest window (s) that a method accepts at a sample rate (Hz), and why, in words."""
-    chosen = settings_of(method, settings)
-    if isinstance(chosen, paper.PaperSettings):
-        settle = chosen.settle_s
-        return settle + MINIMUM_SAMPLES / sample_rate, f"the observer, which takes {settle!r} s to settle"
-    return whitened.SHORTEST / sample_rate, f"method {method!r}, which needs {whitened.SHORTEST} samples"
+    return METHODS[method].shortest(settings_of(method, settings), sample_rate)
 
 
 def _believed(prior: float | GapEstimate | None) -> float | GapEstimate | None:
-    """The prior, if it is one."""
+    """Return the prior if it may be used."""
     if isinstance(prior, GapEstimate):
         return prior if prior.ok else None
     if prior is not None and not (math.isfinite(prior) and prior >= 0.0):

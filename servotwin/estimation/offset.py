@@ -71,7 +71,7 @@ def estimate_carrying(
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
-    """What a window says alone, with why nothing else is believed."""
+    """Return the estimate of the window alone, with the reason why the other is not used."""
     if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
         return alone
     worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
@@ -116,7 +116,7 @@ def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whit
 
 
 def _slope(table: Array) -> float:
-    """By how much the gap of the best fit changes per change of the offset."""
+    """Change of the best fit's gap per change of the offset."""
     columns = table[1:]
     answer = least_squares(np.delete(columns, _CONSTANT, axis=0), columns[_CONSTANT])
     return -float(answer.coefficients[_GAP])

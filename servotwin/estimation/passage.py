@@ -1,4 +1,4 @@
-"""When a gap that grows at an uncertain rate reaches a limit: first passage of a linear trend."""
+"""First passage of a linear trend: the time until a gap that grows at an uncertain rate reaches a limit."""
 
 from __future__ import annotations
 

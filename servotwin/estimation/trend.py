@@ -1,4 +1,4 @@
-"""How the gap grows from window to window: a Kalman filter on the gap, its wear rate and the encoder's offset.
+"""Trend of the gap from window to window: a Kalman filter on the gap, its wear rate and the encoder's offset.
 
 The state is frozen; `predict` and `update` return the next one. Between windows the rate performs a random walk and
 the gap integrates it (an integrated Wiener process), the offset performs a random walk of its own. Every window's
@@ -40,7 +40,7 @@ class TrendMeasurement:
 
 
 def reading(estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None) -> TrendMeasurement:
-    """What an OK estimate says of gap and offset.
+    """Turn an OK estimate into a measurement of gap and offset.
 
     A gap that rests on the carried offset is none of its own: the window shows gap - slope offset. Taken as a gap, the
     offset's error would count anew with every such window, as if it were another each time.
@@ -103,7 +103,7 @@ _DOUBTED = "the gap rested on the encoder's offset, which is forgotten until a w
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known before a window: mean and standard deviation of the gap and of the encoder's offset, rad."""
+    """Knowledge before a window: mean and standard deviation of the gap and of the encoder's offset, rad."""
 
     gap: float
     gap_std: float
@@ -163,7 +163,7 @@ class Trend:
 
     @classmethod
     def start(cls, time: float = 0.0, settings: TrendSettings | None = None) -> Trend:
-        """Before the first window: zero, as uncertain as the settings say."""
+        """Return the state before the first window: zero, as uncertain as the settings say."""
         given = settings or TrendSettings()
         spread = np.array([given.gap_std_rad, given.rate_std_rad_per_s, given.offset_std_rad])
         return cls(_time(time), np.zeros(3), np.diag(spread**2), given)
@@ -226,7 +226,7 @@ class Trend:
         return self._joseph(seen)
 
     def _distance(self, seen: TrendMeasurement) -> float:
-        """How far from the prediction, in standard deviations of both."""
+        """Distance from the prediction, in standard deviations of both."""
         surprise = seen.values - seen.select @ self.mean
         spread = seen.select @ self.covariance @ seen.select.T + seen.noise
         return math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
@@ -308,7 +308,7 @@ class Trend:
 
     @property
     def prior(self) -> Prior:
-        """What the next window may start from; predict to its time first."""
+        """Prior for the next window; predict to its time first."""
         return Prior(self.gap, self.gap_std, float(self.mean[OFFSET]), math.sqrt(self.covariance[OFFSET, OFFSET]))
 
     def as_estimate(self) -> GapEstimate:
@@ -317,7 +317,7 @@ class Trend:
         return GapEstimate(self.gap, std, self.gap_std, self.gap_interval, GapStatus.OK, self.time, method="trend")
 
     def time_until(self, gap: float) -> Passage:
-        """How long from now until the gap (rad, total) has grown to `gap`: see `servotwin.estimation.passage`.
+        """Time from now until the gap (rad, total) has grown to `gap`: see `servotwin.estimation.passage`.
 
         Raises
         ------
@@ -333,7 +333,7 @@ class Trend:
 
 
 def _leans_on_offset(seen: TrendMeasurement) -> bool:
-    """Whether a gap was read by means of the carried offset."""
+    """Tell whether a gap was read by means of the carried offset."""
     return bool(seen.select[0, OFFSET] != 0.0)
 
 

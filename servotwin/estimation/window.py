@@ -164,12 +164,12 @@ class Window:
 
     @property
     def where(self) -> str:
-        """What a message about this window begins with."""
+        """Beginning of a message about this window."""
         return f"{self.source}: " if self.source else ""
 
 
 def _samples(where: str, begin: float, rate: float, size: int, start: float, duration: float) -> slice:
-    """Which of `size` samples at `rate` (Hz), the first at `begin` (s), lie in `duration` (s) from `start` (s) on."""
+    """Select of `size` samples at `rate` (Hz), the first at `begin` (s), those in `duration` (s) from `start` (s)."""
     first = round((_number(where, "start", "s", start) - begin) * rate)
     last = first + round(_number(where, "duration", "s", duration) * rate)
     if not 0 <= first < last <= size:

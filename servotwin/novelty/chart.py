@@ -54,7 +54,7 @@ class Chart(Struct, frozen=True):
 
     @property
     def factor(self) -> float:
-        """Of the windows' own spreads."""
+        """Factor of the windows' own spreads."""
         return median((*self.bends, *(_QUARTILE,) * _PRIOR)) / _QUARTILE
 
     @property
@@ -96,7 +96,7 @@ def summed(up: float, down: float, change: float, allowance: float) -> tuple[flo
 
 
 def _bent(chart: Chart, new: ChartPoint) -> Chart:
-    """With one more second difference."""
+    """Add one more second difference."""
     last = (*chart.last, new)[-3:]
     if len(last) < 3:
         return structs.replace(chart, last=last)
@@ -107,7 +107,7 @@ def _bent(chart: Chart, new: ChartPoint) -> Chart:
 
 
 def _learnt(chart: Chart, gap: float, variance: float) -> Chart:
-    """With one more window in the baseline."""
+    """Add one more window to the baseline."""
     weight = chart.weight + 1.0 / variance
     mean = chart.gap + (gap - chart.gap) / (variance * weight)
     return structs.replace(chart, gap=mean, weight=weight, anchor=chart.anchor if chart.weight > 0.0 else mean)

@@ -285,7 +285,7 @@ class _Columns(NamedTuple):
 
     @property
     def by_level(self) -> tuple[float, float]:
-        """What place and gap take off the constant to give the offset, m: the screw's first angle."""
+        """Derivatives of the screw's first angle by place and gap, m: they turn the constant into the offset."""
         gain = self.window.model.static_gain
         return -0.5 * gain * self.place.gap, -0.5 * gain * self.place.place
 

@@ -14,14 +14,15 @@ from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
 from servotwin.edge.watch import WatchSettings
 from servotwin.estimation import paper, whitened
+from servotwin.estimation.gap import settings_of
 from servotwin.messages import Band, Gains, Setting
 from servotwin.plant.servo import Servo
 
 
 @pytest.mark.parametrize(("module", "without"), [(paper, set()), (whitened, {"combine"})])
 def test_every_setting_has_its_key(module, without):
-    keys = {item.name for item in items_of(module.Settings) if item.key.in_file}
-    assert keys == {f.name for f in dataclasses.fields(module.Settings)} - without
+    keys = {item.name for item in items_of(type(settings_of(module.METHOD))) if item.key.in_file}
+    assert keys == {f.name for f in dataclasses.fields(settings_of(module.METHOD))} - without
 
 
 def estimator(tmp_path, method, lines):

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import estimator as bench
 from benchmarks import estimator_conditions as conditions
 from benchmarks.cramer_rao import bound, noise_root
-from benchmarks.estimator_windows import RATE, Case, cut, paper_loop_cases, random_cases
+from benchmarks.estimator_windows import RATE, WindowCase, cut, paper_loop_cases, random_cases
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -28,16 +28,16 @@ FLOOR = 1e-6
 
 
 @lru_cache
-def clean() -> tuple[Case, ...]:
+def clean() -> tuple[WindowCase, ...]:
     return tuple(paper_loop_cases(np.radians([4.0, 9.0, 18.0]), 3, 5, None))
 
 
-def measured(case: Case, seed: int = 1, floor: float = FLOOR) -> Window:
+def measured(case: WindowCase, seed: int = 1, floor: float = FLOOR) -> Window:
     rng = np.random.default_rng(seed)
     return case.noisy(floor * rng.standard_normal(case.window.position.size)).window
 
 
-def error(estimate: GapEstimate, case: Case) -> float:
+def error(estimate: GapEstimate, case: WindowCase) -> float:
     assert estimate.ok, (estimate, case.words)
     return math.degrees(estimate.gap - case.gap)
 
@@ -310,7 +310,7 @@ def test_a_gap_that_grows_within_the_window(integral):
         assert estimate.interval[0] < case.gap < estimate.interval[1]
 
 
-def at_rest(span: float = 1.0) -> tuple[Case, ...]:
+def at_rest(span: float = 1.0) -> tuple[WindowCase, ...]:
     """A calm loop long after its step: the motor creeps by less than a degree, the load by half a micrometre."""
     calm = SERVO.controller.replace(Ki=0.0)
     run = simulate(SERVO, 6.5, controller=calm, reference=SquareWave(1e-3, 12.0), gap=math.radians(10.0))
@@ -381,7 +381,7 @@ def test_growth_is_among_the_reasons():
     assert any("grows by +" in reason for estimate in refused for reason in estimate.reasons), refused
 
 
-def evidence(case: Case) -> FitEvidence:
+def evidence(case: WindowCase) -> FitEvidence:
     """Evidence of a clean fit with a spread of 0.01 deg, against which nothing speaks."""
     fitted = fit(measured(case), case.servo, None, WhitenedSettings())
     assert fitted.aligned is not None

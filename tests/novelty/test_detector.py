@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.config.table import parse_toml
 from servotwin.config.toml import read, values_of
 from servotwin.edge.recorder import Cut
@@ -46,7 +46,7 @@ SETTINGS = NoveltySettings(MODEL, NoveltyRules(), math.radians(10.0))
 
 
 @cache
-def cases(gap_deg: float) -> tuple[Case, ...]:
+def cases(gap_deg: float) -> tuple[WindowCase, ...]:
     return tuple(paper_loop_cases(np.radians([gap_deg]), 4, 1, None))
 
 

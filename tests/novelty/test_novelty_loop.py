@@ -13,7 +13,7 @@ import pytest
 
 import servotwin as st
 from benchmarks.novelty.command import QUICK, charted, saved
-from benchmarks.novelty.loops import Case, account, summary
+from benchmarks.novelty.loops import LoopCase, account, summary
 from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
@@ -148,7 +148,7 @@ def test_the_bench_measures_what_it_says() -> None:
     assert figures["1 um: windows that say nothing, share"] == 0.0
     assert figures["1 um: scatter of the score, deg"] < 0.01
     assert figures["1 um: 0.5 deg: seen after, windows (median)"] == 1.0
-    case = Case("fig15", 60.0, False, NoveltyRules())
+    case = LoopCase("fig15", 60.0, False, NoveltyRules())
     found = account(case)
     assert (found.windows, found.sent, found.updates) == (3, 1, 1)
     assert saved([(case, "news", found)]).row_count == 1

@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lsim
 
 import servotwin
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.response import response
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, model_of, response_of, score
@@ -30,11 +30,11 @@ def walk(count: int, seed: int = 0) -> np.ndarray:
 
 
 @cache
-def clean(gap_deg: float) -> tuple[Case, ...]:
+def clean(gap_deg: float) -> tuple[WindowCase, ...]:
     return tuple(paper_loop_cases(np.radians([gap_deg]), 4, 1, None))
 
 
-def scored(case: Case, off_deg: float = 0.0, offset: EncoderOffset | None = None) -> Score:
+def scored(case: WindowCase, off_deg: float = 0.0, offset: EncoderOffset | None = None) -> Score:
     assert case.window.theta_m is not None
     angle, position = array("d", case.window.theta_m), array("d", case.window.position)
     found = score(angle, position, MODEL, max(0.0, case.gap + math.radians(off_deg)), offset)

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from twin_messages import eq_21
 
-from benchmarks.estimator_windows import Case, paper_loop_cases
+from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from benchmarks.glances import triage as bench
 from servotwin import messages
 from servotwin.config.table import Table, parse_toml
@@ -42,7 +42,7 @@ OFFSET = (0.0, 0.0155 * DEG)
 
 
 @cache
-def cases(noisy: bool) -> tuple[Case, ...]:
+def cases(noisy: bool) -> tuple[WindowCase, ...]:
     """Windows of the paper's loop at gaps of 4 to 18 deg; in the paper's noise on a floor of 1 um, or clean."""
     noise = Noise(0.22e-3, (10.0, 50.0)) if noisy else None
     found = paper_loop_cases(np.linspace(4.0, 18.0, 4) * DEG, 3, 5, noise)
@@ -86,7 +86,7 @@ def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
     )
 
 
-def seen(case: Case, expected: float, **changes) -> Glance:
+def seen(case: WindowCase, expected: float, **changes) -> Glance:
     return glance(message_of(case.window), case.window, case.servo, watch_of(expected, **changes))
 
 

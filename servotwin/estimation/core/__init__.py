@@ -1,1 +1,1 @@
-"""What the estimators share: contacts, the structure's response, projection, noise."""
+"""Parts that the estimators share: contacts, the structure's response, projection, noise."""

@@ -42,7 +42,7 @@ class Gap(NamedTuple):
 
 
 class Travel(NamedTuple):
-    """How far (rad) the motor pushed the screw forwards and backwards, and the range of its lead over the screw."""
+    """Angles (rad) by which the motor pushed the screw forwards and backwards, and the range of its lead."""
 
     forwards: float
     backwards: float
@@ -87,7 +87,7 @@ def follow_screw(theta_m: Array, gap: float, theta_d0: float, rate: float, out: 
 
 
 def travel(theta_m: Array, at: Gap) -> Travel:
-    """What the contacts did to the screw in a window, for the motor's angle (n,)."""
+    """Sum up the screw's motion in a window, for the motor's angle (n,)."""
     screw = np.empty(theta_m.size)
     follow_screw(theta_m, *at, screw)
     moved = np.diff(screw)
@@ -139,7 +139,7 @@ def integrals(x: float, low: float, slope: float, bend: float, twist: float) -> 
 
 @inlined
 def summit(slope: float, bend: float, twist: float) -> float:
-    """Where in 0..1 the cubic is highest."""
+    """Return the x in 0..1 at which the cubic is highest."""
     if slope + bend + 0.5 * twist >= 0.0:
         return 1.0
     if slope <= 0.0:
@@ -149,7 +149,7 @@ def summit(slope: float, bend: float, twist: float) -> float:
 
 @inlined
 def meeting(end: float, low: float, slope: float, bend: float, twist: float) -> float:
-    """Where before `end`, at which it is positive, the cubic turns positive: by Newton, by halves where that fails."""
+    """Find the x before `end` at which the cubic turns positive: by Newton's method, by halves where that fails."""
     inside, outside, x = end, 0.0, 0.5 * end
     for _ in range(_STEPS):
         value = level(x, low, slope, bend, twist)
@@ -167,7 +167,7 @@ def meeting(end: float, low: float, slope: float, bend: float, twist: float) -> 
 
 @inlined
 def pushed(low: float, high: float, before: float, after: float) -> tuple[float, float, float, float]:
-    """What a motor does to the screw from one sample to the next, seen in its direction, from the screw.
+    """Push the screw from one sample to the next; angles are counted in the direction of the push, from the screw.
 
     Parameters
     ----------

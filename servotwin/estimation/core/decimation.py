@@ -42,7 +42,7 @@ class Decimation:
 
 @lru_cache(maxsize=32)
 def decimation(factor: int) -> Decimation:
-    """By a whole factor; 1 leaves everything as it is."""
+    """Return the decimation by a whole factor; 1 leaves everything as it is."""
     taps = np.ones(1)
     for _ in range(_AVERAGES):
         taps = np.convolve(taps, np.full(factor, 1.0 / factor))

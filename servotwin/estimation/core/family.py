@@ -25,7 +25,7 @@ STRUCTURE = ("k/m", "c/m", "pitch")
 
 
 class InputHold(StrEnum):
-    """What an input does between its samples."""
+    """Course of an input between its samples."""
 
     CONSTANT = "zero-order hold"
     LINEAR = "linear"

@@ -1,4 +1,4 @@
-"""What the structure makes of the screw's motion: the exact sampled response of G2, mode by mode.
+"""Exact sampled response of the structure (G2) to the screw's motion, mode by mode.
 
 Between samples the screw's angle is taken as linear (first-order hold), so a step is exact. Each mode runs as a
 recurrence of its own, z[i+1] = e z[i] + u[i]: it needs no polynomial, whose coefficients lose their digits when the
@@ -26,7 +26,7 @@ _DEFECTIVE, _SPLIT = 1e9, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """How an output is read from the modes: the real part of gain z, and a direct term.
+    """Output equation of the modes: the real part of gain z, and a direct term.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Readout:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """From samples of the screw's angle (rad) to those of the last mass's position (m).
+    """Response of the last mass's position (m) to samples of the screw's angle (rad).
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ def _modes(matrix: Array) -> tuple[Complex, Complex]:
 
 
 def _readout(poles: Complex, weight: Complex, interval: float, direct: float) -> Readout:
-    """Of the sum of weight z_true + direct u, for z_true[i] = after u[i] + (now + e after) z[i]."""
+    """Make the readout of the sum of weight z_true + direct u, for z_true[i] = after u[i] + (now + e after) z[i]."""
     now, after = _hold(poles, interval)
     gain = weight * (now + np.exp(poles * interval) * after)
     return Readout(_parts(gain), direct + float(np.sum(weight * after).real))

@@ -37,7 +37,7 @@ class Autoregression:
         return cls(np.ones((1, 1)), np.array([std]))
 
     def at_least(self, spread: float) -> Autoregression:
-        """With innovations of a standard deviation of at least `spread`."""
+        """Raise the standard deviation of the innovations to at least `spread`."""
         return Autoregression(self.predictors, np.maximum(self.spread, spread))
 
     @property

@@ -197,7 +197,7 @@ def _windows(given: Window | Sequence[Window]) -> tuple[Window, ...]:
 
 
 def _start_of(prior: AnyPrior) -> AnyPrior:
-    """What a prior means to windows that it was not made for: a gap to search from."""
+    """Reduce a prior, for windows that it was not made for, to a gap to search from."""
     return prior.gap if isinstance(prior, Prior) else prior
 
 
@@ -238,14 +238,14 @@ def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointS
 
 
 def _faults(window: Window) -> tuple[str, ...]:
-    """What is plainly wrong with the channels that are used."""
+    """List the faults of the channels that are used."""
     angle = window.position if window.theta_m is None else window.theta_m
     sentences = faults(Window(window.position, angle, sample_rate=window.sample_rate))
     return tuple(one for one in sentences if window.theta_m is not None or not one.startswith("theta_m"))
 
 
 def _still(window: Window) -> bool:
-    """Whether the voltage is all there is, and constant."""
+    """Tell whether there is no angle and the voltage is constant."""
     return window.theta_m is None and window.voltage is not None and float(np.ptp(window.voltage)) == 0.0
 
 
@@ -286,7 +286,7 @@ def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: J
 
 
 def _contradiction(before: JointFit, after: JointFit, settings: JointSettings) -> str:
-    """Why a window is not of the same machine as the others; empty when it may be."""
+    """Reason why a window is not of the same machine as the others; empty when it may be."""
     moved, spread = after.point[0] - before.point[0], math.hypot(before.std(settings), settings.model_error_rad)
     if before.objection or not abs(moved) > _SIGMAS * spread:
         return ""
@@ -294,7 +294,7 @@ def _contradiction(before: JointFit, after: JointFit, settings: JointSettings) -
 
 
 def _doubt(converged: bool, gap: float, rivals: tuple[float, ...]) -> str:
-    """Why a minimum may not be the right one; empty when it is."""
+    """Reason why a minimum may not be the right one; empty when there is none."""
     if not converged:
         return "the search did not converge"
     gaps = ", ".join(f"{math.degrees(one):.3g} deg" for one in (gap, *rivals))

@@ -83,7 +83,7 @@ def stand(model: JointModel, point: Array, known: ParameterPrior, reduce: Reduce
 
 
 def descend(evaluate: Evaluate, start: Array, known: ParameterPrior, tolerance: Array, steps: int = 40) -> FitPoint:
-    """From a start (P,) to the nearest minimum; it ends when a step is below `tolerance` (P,) in each."""
+    """Descend from a start (P,) to the nearest minimum; it ends when a step is below `tolerance` (P,) in each."""
     here, damping = evaluate(np.clip(start, known.lowest, known.highest)), _FIRST_DAMPING
     for count in range(2, steps):
         trial = np.clip(here.point + _step(here, known, damping), known.lowest, known.highest)
@@ -275,7 +275,7 @@ class WindowMinima:
 
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
-    """Where a search would begin."""
+    """Make the fit from which a search begins."""
     known, reduce, noise = (
         known_of(model, prior, settings),
         decimation(decimation_factor(model.rate)),
@@ -311,7 +311,7 @@ def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
 
 
 def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoint]) -> WindowMinima:
-    """From each of the starts to its minimum; those that are worth following."""
+    """Descend from each of the starts to its minimum; keep those near the lowest."""
     tolerance = tolerance_of(fit.model)
     found = [descend(fit.evaluated(known), one.point, known, tolerance) for one in starts]
     near = min(one.cost for one in found) + 100.0 * RIVAL

@@ -48,7 +48,7 @@ class Identifiability:
 
     @property
     def rank(self) -> int:
-        """How many independent products of the parameters can be identified at all."""
+        """Number of independent products of the parameters that can be identified at all."""
         return int(np.count_nonzero(self.strengths))
 
     @property
@@ -80,7 +80,7 @@ class Identifiability:
 
 
 def identifiability(names: Sequence[str], sensitivities: Array, nuisances: Array, noise: float) -> Identifiability:
-    """From the derivatives of a measurement.
+    """Decompose the information in the derivatives of a measurement.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class SensorNoise:
 
 @dataclass(frozen=True, eq=False)
 class MotorCase:
-    """What is measured, and what that shows of (J, L, R, k_T, k_B)."""
+    """Measured channels, and what they show of (J, L, R, k_T, k_B)."""
 
     measured: str
     shows: Identifiability

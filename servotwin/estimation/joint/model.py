@@ -40,7 +40,7 @@ class JointSlopes:
 
 @dataclass(frozen=True, eq=False)
 class JointModel:
-    """What a window should show, for values of named parameters.
+    """Model of a window as a function of named parameters.
 
     Parameters are "gap" (rad), "place" (-1..1, where in the gap the screw begins), "delay" (s, of the position),
     "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch" and "k_B" over the servo's, "speed0" and "current0".

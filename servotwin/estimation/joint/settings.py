@@ -85,5 +85,5 @@ class JointSettings:
                 raise InvalidInput(f"joint spreads {name!r} = {spread!r}: {allowed}")
 
     def spread(self, name: str) -> float:
-        """Of a free parameter."""
+        """Prior standard deviation of a free parameter."""
         return self.spreads.get(name, SPREADS[name])

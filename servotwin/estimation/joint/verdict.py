@@ -1,4 +1,4 @@
-"""What a minimum of the joint fit is worth: gap, parameters, spreads, status and reasons."""
+"""Estimate from a minimum of the joint fit: gap, parameters, spreads, status and reasons."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class JointEstimate:
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Where a fit ended, for one window.
+    """End of a fit, for one window.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class JointFit:
 
     @property
     def values(self) -> dict[str, float]:
-        """By name."""
+        """Values of the parameters by name."""
         return dict(zip(self.model.names, self.point.tolist(), strict=True))
 
     @cached_property
@@ -101,7 +101,7 @@ class JointFit:
         return math.sqrt(self.model.cost(self.values, np.asarray) / self.model.measured.size)
 
     def std(self, settings: JointSettings) -> float:
-        """Of the gap, calibrated, rad."""
+        """Standard deviation of the gap, calibrated, rad."""
         variance = float(self.covariance[0, 0])
         return math.hypot(settings.inflation * math.sqrt(variance), settings.numeric_error_rad)
 
@@ -139,7 +139,7 @@ def stated(found: JointFit, settings: JointSettings) -> GapEstimate:
 
 
 def _verdict(found: JointFit, std: float, settings: JointSettings) -> tuple[GapStatus, tuple[str, ...]]:
-    """What the minimum may be used for, and why not for more."""
+    """Status of the minimum, and the reasons where it is not OK."""
     if found.objection:
         return GapStatus.UNIDENTIFIABLE, (found.objection,)
     mismatch = found.contradiction or mismatched(found, settings)
@@ -167,7 +167,7 @@ def at_bound(found: JointFit, settings: JointSettings) -> str:
 
 
 def mismatched(found: JointFit, settings: JointSettings) -> str:
-    """Why the model does not belong to the window; empty when it does."""
+    """Reason why the model does not belong to the window; empty when it does."""
     variation = float(np.std(found.model.measured))
     if variation > 0.0 and found.rms > settings.unexplained * variation:
         return f"the model leaves {100.0 * found.rms / variation:.0f} % of the measured motion unexplained"
@@ -192,7 +192,7 @@ def _by_contacts(found: JointFit, needed: float) -> tuple[GapStatus, tuple[str, 
 
 
 def pushed(model: JointModel, theta_m: Array, at: Gap) -> Travel:
-    """What the contacts did to the screw, but for the end of the window, to which the last mass has not answered."""
+    """Sum up the screw's motion without the end of the window, to which the last mass has not answered."""
     unseen = model.margin + round(response(model.servo, model.rate).unseen * model.rate)
     return travel(theta_m[: max(2, theta_m.size - unseen)], at)
 
@@ -212,7 +212,7 @@ def _parameter(servo: Servo, name: str, value: float, std: float) -> Parameter:
 
 
 def _remarks(names: list[str], stds: Mapping[str, float], settings: JointSettings) -> tuple[str, ...]:
-    """Which parameters the window hardly informed."""
+    """Name the parameters that the window hardly informed."""
     return tuple(
         f"{name} rests on what was known before: the window alone does not show it"
         for name in names

@@ -1,5 +1,5 @@
 """The estimator as published (section 4.1, Eqs 22-23, Appendix)."""
 
-from servotwin.estimation.paper.estimator import METHOD, PaperSettings, estimate
+from servotwin.estimation.paper.estimator import METHOD, PaperSettings, estimate, shortest_window
 
-__all__ = ["METHOD", "PaperSettings", "estimate"]
+__all__ = ["METHOD", "PaperSettings", "estimate", "shortest_window"]

@@ -21,7 +21,7 @@ _TRIALS = 12
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended.
+    """End of a minimisation.
 
     A point from which the gradient leads to no lower cost, however short the step, counts as converged: it is a corner
     of the cost, or its rounding.

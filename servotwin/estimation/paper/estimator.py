@@ -31,7 +31,7 @@ from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "PaperSettings", "estimate"]
+__all__ = ["METHOD", "PaperSettings", "estimate", "shortest_window"]
 
 _SPAN_S = 0.02  # speeds are taken over this time: one encoder count between two samples is no motion
 
@@ -83,7 +83,7 @@ def judge(residual: PlayResidual, found: Minimum, std: float, settings: PaperSet
 
 
 def _objection(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict | None:
-    """Why the minimum says nothing of the gap, if so."""
+    """Reason why the minimum does not show the gap; empty when it does."""
     if not found.converged:
         return _unknown(f"the minimisation did not converge: {found.message}")
     share = residual.unexplained(found.cost)
@@ -126,7 +126,15 @@ METHOD = "paper"
 _GRADIENT_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-9  # of the motor's range: 1e-5 deg in the paper's loop
 
 
-def estimate(window: Window, servo: Servo, prior: float | None, settings: PaperSettings | None) -> GapEstimate:
+def shortest_window(settings: PaperSettings, sample_rate: float) -> tuple[float, str]:
+    """Shortest window (s) at a sample rate (Hz), and the reason in words."""
+    settle = settings.settle_s
+    return settle + MINIMUM_SAMPLES / sample_rate, f"the observer, which takes {settle!r} s to settle"
+
+
+def estimate(
+    window: Window, servo: Servo, prior: float | GapEstimate | None, settings: PaperSettings | None
+) -> GapEstimate:
     """The total gap (rad) that a window with theta_m and position shows.
 
     Parameters
@@ -134,7 +142,7 @@ def estimate(window: Window, servo: Servo, prior: float | None, settings: PaperS
     window : Window
     servo : Servo
         The model, taken as exact.
-    prior : float, optional
+    prior : float or GapEstimate, optional
         The previous total gap, rad, from which the search starts; None: 0, the paper's first.
     settings : PaperSettings, optional
 
@@ -154,7 +162,8 @@ def estimate(window: Window, servo: Servo, prior: float | None, settings: PaperS
     skip = math.ceil(settings.settle_s * window.sample_rate - 1e-9)
     measured = theta_m - angle_origin, position - origin
     residual = PlayResidual.of(*measured, window.sample_rate, model, servo.p, skip)
-    start = _start(measured[0], prior or 0.0) / residual.scale
+    previous = prior.gap if isinstance(prior, GapEstimate) else prior
+    start = _start(measured[0], previous or 0.0) / residual.scale
     found = minimise(residual.slope, start, _GRADIENT_TOLERANCE, _STEP_TOLERANCE, settings.iterations)
     return _stated(_nothing(window, servo), settings, residual, found, angle_origin)
 
@@ -163,7 +172,7 @@ def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
     """theta_m and position, low-passed where the settings say so."""
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method 'paper' needs the motor's angle in rad")
-    needed = settings.settle_s + MINIMUM_SAMPLES / window.sample_rate
+    needed, _ = shortest_window(settings, window.sample_rate)
     if window.duration < needed:
         raise InvalidInput(
             f"{window.where}the window lasts {window.duration:.6g} s: must be at least {needed:.6g} s, so that the "
@@ -181,7 +190,7 @@ def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
 
 
 def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings) -> str:
-    """Why the motor's motion cannot show a gap; empty when it can."""
+    """Reason why the motor's motion cannot show a gap; empty when it can."""
     seen = motion(theta_m, sample_rate, settings.rest_speed)
     if seen.moving == 0.0:
         return f"the motor never moved faster than {settings.rest_speed:.3g} rad/s"

@@ -81,7 +81,7 @@ class PlayResidual:
     def of(
         cls, theta_m: Array, position: Array, sample_rate: float, plant: Observer, pitch: float, skip: int
     ) -> PlayResidual:
-        """From theta_m (n,) rad and position (n,) m; `pitch` (m/rad) only sets the unit."""
+        """Prepare the residual of theta_m (n,) rad and position (n,) m; `pitch` (m/rad) only sets the unit."""
         scale = float(np.ptp(theta_m))
         unit = pitch * scale
         screw = plant.screw_filter(sample_rate)
@@ -143,7 +143,7 @@ class PlayResidual:
         return math.nan if math.isnan(gap) else min(max(angle, first - 0.5 * gap), first + 0.5 * gap)
 
     def screw_motion(self, point: Array) -> tuple[float, float, float]:
-        """How far (rad) the motor pushed the screw forwards and backwards, and how far it moved without pushing.
+        """Return the angles (rad) of the screw's pushes forwards and backwards, and of motion without a push.
 
         All of it where the cost counts, after k_s.
         """
@@ -163,7 +163,7 @@ def mean_square(values: Array, skip: int) -> float:
 
 @compiled
 def screw_motion(theta_m: Array, half: float, start: float, skip: int) -> tuple[float, float, float]:
-    """After sample `skip`: travel of the play operator's output up and down, and the range of its input's lead."""
+    """Return, after sample `skip`, the travel of the screw up and down and the range of the motor's lead."""
     w = play_step(start, theta_m[0], half)
     upward = downward = 0.0
     lowest, highest = math.inf, -math.inf

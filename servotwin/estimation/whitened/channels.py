@@ -29,7 +29,7 @@ _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3
 
 
 def faults(window: Window) -> tuple[str, ...]:
-    """What is plainly wrong with theta_m or position, one sentence each."""
+    """List the faults of theta_m and position, one sentence each."""
     assert window.theta_m is not None
     channels = {"theta_m": (window.theta_m, math.degrees(1.0), "deg"), "position": (window.position, 1e3, "mm")}
     found = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
@@ -125,7 +125,7 @@ def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: floa
 
 
 def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Array, float]]:
-    """What may be wrong, and angle, position and rate if that is undone."""
+    """Yield possible faults, with angle, position and rate as they were if that were undone."""
     position, rate = window.position, window.sample_rate
     yield "position and theta_m seem to be swapped", position, theta_m, rate
     yield "position or theta_m seems to have the wrong sign", theta_m, -position, rate

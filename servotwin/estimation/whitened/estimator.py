@@ -33,10 +33,15 @@ from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit"]
+__all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit", "shortest_window"]
 
 METHOD = "whitened"
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
+
+
+def shortest_window(_settings: WhitenedSettings, sample_rate: float) -> tuple[float, str]:
+    """Shortest window (s) at a sample rate (Hz), and the reason in words."""
+    return SHORTEST / sample_rate, f"method {METHOD!r}, which needs {SHORTEST} samples"
 
 
 def estimate(
@@ -88,7 +93,7 @@ class WindowFit:
     aligned: AlignedFit | None
 
     def one_sided(self) -> str:
-        """Why the window cannot show the gap, whatever else is found: too little contact; empty: it has enough."""
+        """Reason why the window cannot show the gap, which is too little contact; empty when it has enough."""
         return "" if self.aligned is None else one_sided(_travel(self.aligned.found), self.settings)
 
     def rms(self) -> float:
@@ -162,7 +167,7 @@ def _left(found: WhitenedFit) -> float:
 
 
 def _travel(found: WhitenedFit) -> Travel:
-    """Of the screw, without the end of the window, to which the last mass cannot have answered."""
+    """Sum up the screw's motion without the end of the window, to which the last mass cannot have answered."""
     reduction, model = found.reduction, found.reduction.response
     kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
     middle = found.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - kept)
@@ -218,7 +223,7 @@ def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
 
 
 def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
-    """What is known without the window: the prior."""
+    """Make the estimate without the window: the prior."""
     blank = no_estimate(window.mid_time, model_version=servo.version, method=METHOD)
     if isinstance(prior, GapEstimate):
         return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)

@@ -80,7 +80,7 @@ class WhitenedFit:
 
     @property
     def variance(self) -> float:
-        """Of the whitened residual; 1 where the noise was well described."""
+        """Variance of the whitened residual; 1 where the noise was well described."""
         return self.fit.slopes.cost / max(1, self.rows.shape[1] - len(self.misfit.basis) - 2)
 
     @property
@@ -232,7 +232,7 @@ def align_and_fit(
 def _look_around(
     theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
 ) -> list[Point]:
-    """Where the search at the full rate begins."""
+    """Find the points from which the search at the full rate begins."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
     angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
     model = response(servo, rate / reduce.factor)
@@ -260,7 +260,7 @@ def gaps_to_try(span: float, count: int) -> list[float]:
 
 
 def _offset(settings: WhitenedSettings, gain: float, angle: float, position: float) -> NuisancePrior | None:
-    """What is known of the constant in the position (m), which is the encoder's offset and where counting began."""
+    """Prior of the constant in the position (m): the encoder's offset and the origin of counting."""
     if settings.offset is None:
         return None
     mean, std = settings.offset
@@ -314,7 +314,7 @@ def profile_interval(found: WhitenedFit, std: float, calibration: float, largest
     allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
 
     def rise(gap: float) -> float:
-        """How much worse the best fit with this gap is, in units of what is allowed; well within, how much at most."""
+        """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
         near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
         places = (found.point.place,) if near else (*same_way(found.point, gap), *PLACES)
         lowest = math.inf
@@ -343,7 +343,7 @@ def same_way(point: Point, gap: float) -> tuple[float, float, float]:
 
 
 def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
-    """Where `rise` reaches 1 on one side, between what is known to be below and above; the far limit as 0 or inf.
+    """Find where `rise` reaches 1 on one side; the far limit counts as 0 or inf.
 
     When the trials do not suffice, what is known to be above.
     """

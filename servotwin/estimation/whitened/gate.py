@@ -117,7 +117,7 @@ _ALPHA = 40.0  # rad/s, the paper's observer
 
 
 class ModelShift(NamedTuple):
-    """By how much the gap moves (rad), the standard deviation of that, what moves it most, in words, and how much more
+    """Change of the gap (rad) with the model free, its standard deviation, its main cause in words, and how much more
     likely the window becomes: twice the logarithm of the ratio, a few for a right model."""
 
     gap: float
@@ -163,7 +163,7 @@ def _within_tolerance(rows: Array, free: int) -> LeastSquares:
 
 
 def _words(shares: Array, deviations: Array) -> str:
-    """Which direction is needed most, and by how much."""
+    """Describe the direction that is needed most, and its size."""
     index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
     if index == len(TOLERANCES):
         return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
@@ -185,7 +185,7 @@ def _neighbours(servo: Servo, sample_rate: float) -> tuple[tuple[Response, float
 
 
 def observer_shift(found: WhitenedFit, servo: Servo) -> tuple[float, float]:
-    """By how much (rad) the paper's observer form would move the gap, and the standard deviation of that.
+    """Return the change of the gap (rad) in the paper's observer form, and its standard deviation.
 
     The observer weights the residual by denominator / (s + alpha)^N; one step of Gauss and Newton in that weight.
     """
@@ -314,7 +314,7 @@ def _delayed(seen: FitEvidence, settings: WhitenedSettings) -> str:
 
 
 def _disagreements(seen: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
-    """What other views of the same window say against the fit."""
+    """List the disagreements of other views of the same window with the fit."""
     found = []
     shift, limit = seen.shift, settings.largest_shift
     if abs(shift.gap) > max(limit, _SIGMAS * shift.std):

@@ -112,7 +112,7 @@ def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
 
 
 def _by_offset(reduction: Reduction, misfit: Misfit, weights: Array) -> float:
-    """By how much the gap moves per change of the encoder's offset."""
+    """Change of the gap per change of the encoder's offset."""
     constant = np.full(weights.size, reduction.response.static_gain)
     remove(misfit.basis, len(misfit.basis), constant)
     return float(weights @ constant)

@@ -112,7 +112,7 @@ _MOST_GROWTH = 4.0  # standard deviations of the gap's rate
 
 @dataclass(frozen=True, eq=False)
 class NuisancePrior:
-    """What is known beforehand of a nuisance, in its own unit."""
+    """Prior knowledge of a nuisance, in its own unit."""
 
     mean: float
     std: float
@@ -162,7 +162,7 @@ class Reduction:
         growth: NuisancePrior | None = None,
         skew: bool = True,
     ) -> Reduction:
-        """From theta_m (n,) rad and position (n,) m, both from any origin."""
+        """Prepare theta_m (n,) rad and position (n,) m, both from any origin."""
         reduce = decimation(factor_for(model, theta_m.size))
         rows = reduce.rows(np.asarray(position - position[0])[None])
         largest = max(float(np.abs(position).max()), abs(model.static_gain) * float(np.abs(theta_m).max()))
@@ -215,7 +215,7 @@ class Reduction:
         return Misfit(self.theta_m, rows[0], basis, self.response, self.decimation, noise, extra, self.rate)
 
     def growing(self, noise: Autoregression, point: Point) -> Reduction:
-        """With the screw followed at the rate of growth that a point and a noise make likely.
+        """Follow the screw at the rate of growth that a point and a noise make likely.
 
         The rate is linear only as long as no contact comes or goes with it: a motor that holds still in contact holds
         the screw in a constant gap, and not in a growing one.
@@ -239,7 +239,7 @@ def _fixed_basis(model: Response, reduce: Decimation, samples: int, constant: bo
 
 
 def factor_for(model: Response, samples: int) -> int:
-    """By how much to decimate: the structure's fastest mode keeps its band, and the window enough samples."""
+    """Choose the decimation: the structure's fastest mode keeps its band, and the window enough samples."""
     rate = 1.0 / model.interval
     fastest = float(np.abs(model.poles).max()) / (2.0 * np.pi)
     kept = max(_SLOWEST, _SAMPLES_PER_PERIOD * fastest)

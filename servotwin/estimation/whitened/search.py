@@ -19,7 +19,7 @@ ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one l
 
 
 class Free(NamedTuple):
-    """What a search may change."""
+    """Coordinates that a search may change."""
 
     gap: bool
     place: bool
@@ -34,7 +34,7 @@ PLACES, _WITHIN, _BEYOND = (-1.0, -0.75, -0.4, 0.0, 0.4, 0.75, 1.0), (0.97, 0.85
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Where a search ended."""
+    """End of a search."""
 
     point: Point
     slopes: MisfitSlopes
@@ -51,7 +51,7 @@ def descend(
     free: Free = BOTH,
     gain: float = _GAIN,
 ) -> SearchResult:
-    """From a start to the nearest minimum with 0 <= gap <= largest (rad).
+    """Descend from a start to the nearest minimum with 0 <= gap <= largest (rad).
 
     It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises less than the
     part `gain` of the cost. What is not `free` keeps its value.
@@ -87,7 +87,7 @@ def _step(here: MisfitSlopes, point: Point, damping: float, largest: float, free
 
 
 def _promise(here: MisfitSlopes, point: Point, trial: Point) -> float:
-    """By how much a step lowers the cost if the residual is linear."""
+    """Predict the decrease of the cost by a step, for a linear residual."""
     change = (trial.gap - point.gap) * here.jacobian[0] + (trial.place - point.place) * here.jacobian[1]
     return -float(change @ (2.0 * here.residual + change))
 
@@ -118,7 +118,7 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
 
 
 def continued(misfit: Misfit, fit: SearchResult, largest: float, tolerance: float) -> SearchResult:
-    """On with both; and again from within, if the screw would have begun in contact, or from there, if close to it.
+    """Continue in gap and place; also from inside, if the screw began in contact, or from contact, if close to it.
 
     In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
     in. And from a little further in, where the motor only just began to move, next to nothing leads there.
