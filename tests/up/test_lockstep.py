@@ -135,13 +135,11 @@ def test_a_url_is_one() -> None:
         HttpTwin("127.0.0.1:80", "axis")
 
 
-def test_a_machine_in_lock_step_waits_for_its_client_however_long_the_twin_takes(
+def test_a_machine_in_lock_step_waits_for_a_client_whose_twin_is_slow(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervise, "SENDING", 0.05)
-    plant = SimpleNamespace(
-        index=0, version=0, block=1, over=True, read=lambda first, most: None, advance=lambda n: None
-    )
+    plant = SimpleNamespace(index=0, version=0, block=1, over=True, read=lambda *_: None, advance=lambda *_: None)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         serving = threading.Thread(target=supervise.SuperviseServer(plant, None).serve, args=(theirs,))
