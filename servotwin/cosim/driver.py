@@ -33,7 +33,7 @@ from servotwin.simulation import Run
 from servotwin.simulation.inputs import shifted
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.evidence import EvidenceLog
-from servotwin.twin.step import TwinModel
+from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 
 Progress = Callable[[float], object]

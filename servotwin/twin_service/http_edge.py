@@ -65,7 +65,7 @@ class EdgeApi:
             "Commit a hello, receipt, fallback or answer",
             {202: ("It is safe.", None)},
             parameters=(SERVO, ENCODING),
-            body="A hello/1, receipt/1, fallback/1 or answer/1, MessagePack.",
+            body="A hello/2, receipt/1, fallback/2 or answer/1, MessagePack; hello/1 and fallback/1 are read too.",
             errors=MESSAGE_ERRORS,
         )
         get_outgoing = operation(
