@@ -21,7 +21,7 @@ from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import TIMED, Cut, Floats, Recorder, as_floats
-from servotwin.edge.requests import RequestState, decide
+from servotwin.edge.requests import GrantedRequests, decide
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
@@ -30,7 +30,7 @@ from servotwin.link.outbox import Outbox
 from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
 
 
-class OutgoingMessage(NamedTuple):
+class ScheduledMessage(NamedTuple):
     """A message, and the sample instant (samples absorbed so far) at which it is sent."""
 
     sample: int
@@ -78,7 +78,7 @@ class Agent:
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(0.0)
-        self._requests = RequestState(settings.window_samples, settings.pre_trigger_samples)
+        self._requests = GrantedRequests(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
         self._opened: OpenWindow | None = None
         self._cut_at = 0
@@ -130,7 +130,7 @@ class Agent:
         """Windows that will never be sent again without having been acknowledged, by reason."""
         return Counter(self.outlet.dropped)
 
-    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[OutgoingMessage]:
+    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[ScheduledMessage]:
         """Take one sample (m, rad, m, V); return what is to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
         if reference != self._expected:
@@ -139,12 +139,12 @@ class Agent:
 
     def absorb_block(
         self, reference: Floats, theta_m: Floats, position: Floats, voltage: Floats
-    ) -> list[OutgoingMessage]:
+    ) -> list[ScheduledMessage]:
         """Take equally long blocks of samples: the same effect as one by one."""
         blocks = [as_floats(block) for block in (reference, theta_m, position, voltage)]
         if len({len(block) for block in blocks}) != 1:
             raise InvalidInput(f"blocks of {[len(block) for block in blocks]} samples: must be equally long")
-        sent: list[OutgoingMessage] = []
+        sent: list[ScheduledMessage] = []
         done = 0
         while done < len(blocks[0]):
             stop = self._stop(blocks[0], done)
@@ -156,12 +156,12 @@ class Agent:
             done = stop
         return sent
 
-    def receive(self, message: Message) -> list[OutgoingMessage]:
+    def receive(self, message: Message) -> list[ScheduledMessage]:
         """Take a message from the twin; return what is to be sent now. Messages not meant for an edge are ignored."""
         if isinstance(message, Update):
             replies = self._supervisor.offer(message)
             self._twin_answered(message.servo)
-            return [OutgoingMessage(self.samples, each) for each in replies]
+            return [ScheduledMessage(self.samples, each) for each in replies]
         if isinstance(message, Request):
             return self._handle_request(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
@@ -177,11 +177,11 @@ class Agent:
             self._supervisor.twin_answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
-    def restore(self, former: Parameters) -> list[OutgoingMessage]:
+    def restore(self, former: Parameters) -> list[ScheduledMessage]:
         """Put former parameters in force again, as the drive has refused the present ones; return messages."""
         messages = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
-        return [OutgoingMessage(self.samples, each) for each in messages]
+        return [ScheduledMessage(self.samples, each) for each in messages]
 
     def hello(self) -> Hello:
         """Make the message that introduces the edge: send it after a start or a reconnection."""
@@ -203,7 +203,7 @@ class Agent:
             self._supervisor.twin_answered(self.time, more=self.outlet.unacknowledged)
         self._deadline = self._next_deadline()
 
-    def _handle_request(self, request: Request) -> list[OutgoingMessage]:
+    def _handle_request(self, request: Request) -> list[ScheduledMessage]:
         """Decide about a request; a probing move begins with the next sample."""
         s, before = self.settings, self.probe
         here = Instant(s.servo, s.boot, self.samples, s.sample_rate)
@@ -213,7 +213,7 @@ class Agent:
             self._opened = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
             self._expected = self._reference + self.offset
         self._twin_answered(request.servo)
-        return [OutgoingMessage(self.samples, answer)]
+        return [ScheduledMessage(self.samples, answer)]
 
     def _at_rest(self) -> bool:
         """True where the reference rests and no window is being recorded."""
@@ -237,7 +237,7 @@ class Agent:
             self._opened = None
         self._expected = self._reference
 
-    def _act(self) -> list[OutgoingMessage]:
+    def _act(self) -> list[ScheduledMessage]:
         """Cut the window that is complete, and send what is due."""
         opened = self._opened
         if opened is not None and self.samples >= opened.last:
@@ -246,13 +246,13 @@ class Agent:
             self._opened = None
         elif opened is None and self.samples >= self._timed:
             self._cut(OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
-        sent = [OutgoingMessage(self.samples, window) for window in self.outlet.due(self.time)]
+        sent = [ScheduledMessage(self.samples, window) for window in self.outlet.due(self.time)]
         messages = self._supervisor.check()
         if any(isinstance(each, Fallback) for each in messages):
             self._abort()
         self._expected = self._reference + self.offset
         self._deadline = self._next_deadline()
-        return sent + [OutgoingMessage(self.samples, each) for each in messages]
+        return sent + [ScheduledMessage(self.samples, each) for each in messages]
 
     def _cut(self, opened: OpenWindow) -> None:
         """Cut a window and hand it to the outlet, which knows whether the twin then owes an answer."""

@@ -29,7 +29,7 @@ NEVER = (
 """How the names of errors begin that trying again does not mend."""
 
 
-class Session:
+class OpcUaSession:
     """One connection, open from the start.
 
     Parameters
