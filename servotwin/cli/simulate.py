@@ -67,8 +67,8 @@ def recording(loop: Loop, scenario_text: str) -> SignalTable:
         "servo": scenario.servo.dumps(),
         "seed": scenario.seed,
         "sample_rate_hz": run.sample_rate,
-        "window_s": scenario.window,
-        "pre_trigger_s": scenario.pre_trigger,
+        "window_s": scenario.commissioning.window,
+        "pre_trigger_s": scenario.commissioning.pre_trigger,
         "scenario": scenario_text,
     }
     return SignalTable(run.columns, metadata)
