@@ -80,7 +80,7 @@ class Agent:
             self._supervisor.window_sent(0.0)
         self._requests = GrantedRequests(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
-        self._opened: OpenWindow | None = None
+        self._open_window: OpenWindow | None = None
         self._cut_at = 0
         self._deadline = self._next_deadline()
 
@@ -192,7 +192,7 @@ class Agent:
     def _stop(self, reference: "array[float]", done: int) -> int:
         """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""
         stop = int(min(len(reference), done + self._deadline - self.samples))
-        if self._opened is not None and self.probe is None:
+        if self._open_window is not None and self.probe is None:
             return stop
         last = self._expected
         return next((k + 1 for k in range(done, stop) if reference[k] != last), stop)
@@ -210,7 +210,7 @@ class Agent:
         self._requests, answer = decide(request, self._requests, s, here, self._at_rest())
         move = self.probe
         if move is not None and move is not before:
-            self._opened = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
+            self._open_window = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
             self._expected = self._reference + self.offset
         self._twin_answered(request.servo)
         return [ScheduledMessage(self.samples, answer)]
@@ -218,32 +218,33 @@ class Agent:
     def _at_rest(self) -> bool:
         """True where the reference rests and no window is being recorded."""
         return (
-            self._opened is None and self._recorder.constant("reference", self.settings.rest_samples) == self._reference
+            self._open_window is None
+            and self._recorder.constant("reference", self.settings.rest_samples) == self._reference
         )
 
     def _reference_changed(self, reference: float) -> None:
         """Note a new reference in the last sample, and abort a probing move; what that has added is in the sample."""
         self._reference = reference
         self._abort()
-        if self._opened is None:
+        if self._open_window is None:
             first = max(0, self.samples - 1 - self._requests.pre_trigger)
-            self._opened = OpenWindow(first, first + self._requests.window, "reference")
+            self._open_window = OpenWindow(first, first + self._requests.window, "reference")
             self._deadline = self._next_deadline()
 
     def _abort(self) -> None:
         """End the probing move and its window."""
         if self.probe is not None:
             self._requests = replace(self._requests, probe=None)
-            self._opened = None
+            self._open_window = None
         self._expected = self._reference
 
     def _act(self) -> list[ScheduledMessage]:
         """Cut the window that is complete, and send what is due."""
-        opened = self._opened
+        opened = self._open_window
         if opened is not None and self.samples >= opened.last:
             self._cut(opened)
             self._abort()
-            self._opened = None
+            self._open_window = None
         elif opened is None and self.samples >= self._timed:
             self._cut(OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
         sent = [ScheduledMessage(self.samples, window) for window in self.outlet.due(self.time)]
@@ -280,7 +281,7 @@ class Agent:
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
         deadline = self._supervisor.next_check
-        deadline = min(deadline, self._timed if self._opened is None else self._opened.last)
+        deadline = min(deadline, self._timed if self._open_window is None else self._open_window.last)
         if self.probe is not None:
             deadline = min(deadline, self.probe.next_change(self.samples))
         due = self.outlet.next_time
