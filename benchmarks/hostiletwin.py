@@ -18,7 +18,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.window import Window
 from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, WindowMessage
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.step import TwinModel
+from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 

@@ -15,7 +15,7 @@ from servotwin.messages.compression import decompress
 from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.models import ServoModel
-from servotwin.twin.replay import Replayed, replay
+from servotwin.twin.replay import ReplayResult, replay
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of
 
@@ -122,7 +122,7 @@ def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: Ser
         return Again(name, UNREADABLE, str(error))
 
 
-def _compared(name: str, found: StoredEvidence, again: Replayed) -> Again:
+def _compared(name: str, found: StoredEvidence, again: ReplayResult) -> Again:
     if again.same:
         return Again(name, SAME, "", again.differs)
     gaps = f"gap {_degrees(found.gap)} deg then, {_degrees(again.estimate.gap)} deg now"

@@ -123,6 +123,7 @@ class DecodedWindow(NamedTuple):
     @property
     def tail(self) -> float | None:
         """Largest tracking error (m) in the last tenth of the window; None where a channel is missing."""
+        # Of the numbers as decoded: the edge sends neither channel with a fine part.
         if self.window is None or self.window.reference is None:
             return None
         last = -(-self.message.samples // _TAIL)

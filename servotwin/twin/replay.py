@@ -1,4 +1,4 @@
-"""Making a stored estimate again: from the stored window, what was known before it, model and settings."""
+"""Replay of a stored estimate, from the stored window, the expectation before it, model and settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from servotwin.twin.evidence import StoredEstimate, plain
 from servotwin.twin.models import ServoModel
 
 
-class Replayed(NamedTuple):
+class ReplayResult(NamedTuple):
     """Result of a replay.
 
     Attributes
@@ -24,7 +24,7 @@ class Replayed(NamedTuple):
     estimate : GapEstimate
         As it comes out now.
     same : bool
-        Whether it is the stored one, bit for bit.
+        True where it is the stored one, bit for bit.
     differs : tuple of str
         What is not as it was then: versions, sources, processor and, under another model, its numbers and settings;
         each with both values.
@@ -41,7 +41,7 @@ class Replayed(NamedTuple):
 _estimated = msgspec.msgpack.Decoder(StoredEstimate)
 
 
-def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> Replayed:
+def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> ReplayResult:
     """Make an estimate again and compare.
 
     Parameters
@@ -66,7 +66,9 @@ def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = 
     expected = stored.prior.expectation(settings.trend)
     estimate = DecodedWindow.of(message).estimate(estimator_of(servo, settings), expected)
     again = plain(estimate)
-    return Replayed(estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again))
+    return ReplayResult(
+        estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again)
+    )
 
 
 def _window(data: bytes) -> WindowMessage:

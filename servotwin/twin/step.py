@@ -9,14 +9,11 @@ Of a window with another status a policy may use the rest, its input bias and no
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.disturbance import disturbance
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -25,19 +22,15 @@ from servotwin.messages import (
     Message,
     ParameterMessage,
     Receipt,
-    Setting,
     Update,
     Verification,
     WindowMessage,
     finite,
 )
-from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Policy, Redesign
-from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Estimator, Observer, estimator_of
+from servotwin.redesign.policy import Redesign
+from servotwin.twin.estimating import UNUSABLE, DecodedWindow
 from servotwin.twin.evidence import (
     DisturbanceRecord,
     ExcitationRecord,
@@ -49,101 +42,12 @@ from servotwin.twin.evidence import (
     VerificationRecord,
     WithdrawalRecord,
 )
-from servotwin.twin.lookups import Lookups, LookupState, VerificationRequest
-from servotwin.twin.requests import Requests, RequestState
-from servotwin.twin.settings import TwinSettings
-from servotwin.twin.state import TwinState, decode_state
-from servotwin.twin.triage import Triage, TriageState
-from servotwin.twin.versions import Attempts, Versions, noted_setting
-from servotwin.twin.wear import Wear
+from servotwin.twin.lookups import VerificationRequest
+from servotwin.twin.model import TwinModel
+from servotwin.twin.state import TwinState
+from servotwin.twin.versions import Attempts, noted_setting
 
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
-
-
-@dataclass(frozen=True)
-class TwinModel:
-    """Constant parts of a twin.
-
-    Parameters
-    ----------
-    estimator : callable
-        (estimation.Window, Expectation) -> GapEstimate.
-    policy : Policy
-        Makes a setting of the evidence; where it raises InvalidInput, there is none.
-    settings : TwinSettings
-    observer : callable, optional
-        estimation.Window -> Disturbance; None: input bias and noise are not estimated.
-    start : Setting, optional
-        In force at the edge before the first update; None: not known.
-    requests : Requests, optional
-        Requests more informative windows.
-    triage : Triage, optional
-        Decides for which windows a glance is enough.
-    lookups : Lookups, optional
-        Verifies settings after they were looked up and sent; then `policy` is not used.
-    """
-
-    estimator: Estimator
-    policy: Policy
-    settings: TwinSettings
-    observer: Observer | None = None
-    start: Setting | None = None
-    requests: Requests | None = None
-    triage: Triage | None = None
-    lookups: Lookups | None = None
-
-    @classmethod
-    def of(
-        cls,
-        servo: Servo,
-        settings: TwinSettings,
-        start: Setting | None = None,
-        estimator: Estimator | None = None,
-        policy: Policy | None = None,
-    ) -> TwinModel:
-        """The model that `settings` describe for a servo, with the controller that runs: policies design for it.
-
-        `estimator` and `policy` replace those of the settings.
-
-        Raises
-        ------
-        InvalidInput
-            The policy cannot design for this controller, or its table is not this model's.
-        """
-        chosen = policy or policy_of(servo, settings)
-        return cls(
-            estimator=estimator or estimator_of(servo, settings),
-            policy=chosen,
-            settings=settings,
-            observer=partial(disturbance, servo=servo),
-            start=start,
-            requests=Requests.of(servo, settings),
-            triage=None if settings.triage is None else Triage(servo, settings.triage),
-            lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
-        )
-
-    def initial_state(self, servo: str) -> TwinState:
-        """State of the twin of a servo of that name before its first message."""
-        known = {} if self.start is None else {0: self.start}
-        return self._fitted(TwinState(servo, Versions(), known, Wear(self.settings.initial_gap)))
-
-    def restored(self, servo: str, data: bytes) -> TwinState:
-        """The stored state of a servo, with a slice for each optional part of this model and no other.
-
-        Raises
-        ------
-        InvalidInput
-            The bytes are no state, or another servo's.
-        """
-        return self._fitted(decode_state(servo, data))
-
-    def _fitted(self, state: TwinState) -> TwinState:
-        return replace(
-            state,
-            requests=None if self.requests is None else state.requests or RequestState(),
-            triage=None if self.triage is None else state.triage or TriageState(),
-            lookups=None if self.lookups is None else state.lookups or LookupState(),
-        )
 
 
 class WindowArrival(NamedTuple):
@@ -204,6 +108,7 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
         servo = event.window.servo if isinstance(event, WindowArrival) else event.servo
         if servo != state.servo:
             raise InvalidMessage(f"message of servo {servo!r} came to the twin of {state.servo!r}")
+    # A clock that was put back must not make anything wait for it to come round again.
     requests = None if state.requests is None else state.requests.not_after(now)
     state = replace(state, attempts=state.attempts.not_after(now), requests=requests)
     match event:
@@ -248,6 +153,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     estimate = decoded.estimate(model.estimator, expected)
     disturbed = decoded.disturbance(model.observer)
     records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
+    # A stale window is estimated for the record, but moves nothing: windows may come in any order.
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
@@ -300,6 +206,7 @@ def _send(state: TwinState, update: Update | None, now: float, records: tuple[Re
     """Send the pending update for the first time; None: nothing."""
     if update is None:
         return StepResult(state, (), records)
+    # The receipt may never come: what the update sets is noted when it leaves.
     known = noted_setting(state.known, update.version, update.setting, update.base_version, state.versions.in_force)
     return StepResult(replace(state, known=known, attempts=Attempts(now, 1)), (update,), (*records, update))
 

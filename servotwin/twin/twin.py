@@ -6,8 +6,9 @@ from servotwin.estimation.trend import Trend
 from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import VerificationRequest
+from servotwin.twin.model import TwinModel
 from servotwin.twin.state import encode_state
-from servotwin.twin.step import Event, TwinModel, Wake, WindowArrival, next_wake, step
+from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 
 
 class Twin:

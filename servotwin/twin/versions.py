@@ -156,5 +156,6 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     if setting.gains is None and before is not None:
         setting = replace(setting, gains=before.gains)
     after = {**known, version: setting}
+    # 0 is what the edge starts with, the fallback for gains that later updates leave alone.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
     return {number: each for number, each in sorted(after.items()) if number in keep}

@@ -18,9 +18,10 @@ from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import failure_row, rows
 from servotwin.twin.lookups import VerificationRequest, decode_request, encode_request
+from servotwin.twin.model import TwinModel
 from servotwin.twin.models import ModelRegistry, ServoModel
 from servotwin.twin.state import TwinState, encode_state
-from servotwin.twin.step import Event, TwinModel, Wake, WindowArrival, next_wake, step
+from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 
 ONE_BY_ONE, GIVEN_UP = 3, 5
 """Attempts of one lease from which on it is worked through message by message, so that the one that kills its workers
@@ -66,6 +67,7 @@ class _Worker:
                 self.evidence.append(failure_row(stored.id, why))
             else:
                 self._process(stored, now)
+        # A lease that kills its workers without a message is not woken again before the next message.
         woken = not (given_up and not taken) and self._step(0, Wake(), now)
         return WorkResult(
             self.lease.servo,

@@ -20,7 +20,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
 from servotwin.twin.estimating import decode_window
-from servotwin.twin.step import TwinModel
+from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 
 DEG = math.radians(1.0)

@@ -13,8 +13,8 @@ from servotwin.messages import (
 )
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 

@@ -29,8 +29,8 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation

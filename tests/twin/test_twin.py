@@ -22,8 +22,8 @@ from servotwin.messages import (
 )
 from servotwin.twin.estimating import decode_channel, decode_window
 from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import Expectation
 

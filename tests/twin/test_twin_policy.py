@@ -23,8 +23,8 @@ from servotwin.plant.signals import SquareWave
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import PaperPolicy, Redesign
 from servotwin.simulation import simulate
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 from servotwin.twin.wear import TrendState
 

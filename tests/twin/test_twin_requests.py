@@ -12,8 +12,8 @@ from servotwin.messages import Answer, LongerWindow, Probe, RequestOutcome, Sett
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import TwinModel
 from servotwin.twin.twin import Twin
 
 SERVO = Servo.preset("paper")

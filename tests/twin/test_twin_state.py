@@ -40,9 +40,10 @@ from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import LookupState
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.state import decode_state, encode_state
-from servotwin.twin.step import TwinModel, WindowArrival, step
+from servotwin.twin.step import WindowArrival, step
 from servotwin.twin.twin import Twin
 from servotwin.twin.versions import MAX_ENDED_BOOTS, MAX_SETTINGS, Versions
 from servotwin.twin.wear import TrendState

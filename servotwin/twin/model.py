@@ -1,0 +1,109 @@
+"""Model of a twin: everything about it that no step changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from msgspec.structs import replace
+
+from servotwin.estimation.disturbance import disturbance
+from servotwin.messages import Setting
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.lookup import TablePolicy
+from servotwin.redesign.policy import Policy
+from servotwin.redesign.registry import policy_of
+from servotwin.twin.estimating import Estimator, Observer, estimator_of
+from servotwin.twin.lookups import Lookups, LookupState
+from servotwin.twin.requests import Requests, RequestState
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import TwinState, decode_state
+from servotwin.twin.triage import Triage, TriageState
+from servotwin.twin.versions import Versions
+from servotwin.twin.wear import Wear
+
+
+@dataclass(frozen=True)
+class TwinModel:
+    """Constant parts of a twin.
+
+    Parameters
+    ----------
+    estimator : callable
+        (estimation.Window, Expectation) -> GapEstimate.
+    policy : Policy
+        Makes a setting of the evidence; where it raises InvalidInput, there is none.
+    settings : TwinSettings
+    observer : callable, optional
+        estimation.Window -> Disturbance; None: input bias and noise are not estimated.
+    start : Setting, optional
+        In force at the edge before the first update; None: not known.
+    requests : Requests, optional
+        Requests more informative windows.
+    triage : Triage, optional
+        Decides for which windows a glance is enough.
+    lookups : Lookups, optional
+        Verifies settings after they were looked up and sent; then `policy` is not used.
+    """
+
+    estimator: Estimator
+    policy: Policy
+    settings: TwinSettings
+    observer: Observer | None = None
+    start: Setting | None = None
+    requests: Requests | None = None
+    triage: Triage | None = None
+    lookups: Lookups | None = None
+
+    @classmethod
+    def of(
+        cls,
+        servo: Servo,
+        settings: TwinSettings,
+        start: Setting | None = None,
+        estimator: Estimator | None = None,
+        policy: Policy | None = None,
+    ) -> TwinModel:
+        """The model that `settings` describe for a servo, with the controller that runs: policies design for it.
+
+        `estimator` and `policy` replace those of the settings.
+
+        Raises
+        ------
+        InvalidInput
+            The policy cannot design for this controller, or its table is not this model's.
+        """
+        chosen = policy or policy_of(servo, settings)
+        return cls(
+            estimator=estimator or estimator_of(servo, settings),
+            policy=chosen,
+            settings=settings,
+            observer=partial(disturbance, servo=servo),
+            start=start,
+            requests=Requests.of(servo, settings),
+            triage=None if settings.triage is None else Triage(servo, settings.triage),
+            lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
+        )
+
+    def initial_state(self, servo: str) -> TwinState:
+        """State of the twin of a servo of that name before its first message."""
+        known = {} if self.start is None else {0: self.start}
+        return self._fitted(TwinState(servo, Versions(), known, Wear(self.settings.initial_gap)))
+
+    def restored(self, servo: str, data: bytes) -> TwinState:
+        """The stored state of a servo, with a slice for each optional part of this model and no other.
+
+        Raises
+        ------
+        InvalidInput
+            The bytes are no state, or another servo's.
+        """
+        return self._fitted(decode_state(servo, data))
+
+    def _fitted(self, state: TwinState) -> TwinState:
+        return replace(
+            state,
+            requests=None if self.requests is None else state.requests or RequestState(),
+            triage=None if self.triage is None else state.triage or TriageState(),
+            lookups=None if self.lookups is None else state.lookups or LookupState(),
+        )
