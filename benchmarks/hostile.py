@@ -18,10 +18,10 @@ from functools import cache
 import numpy as np
 
 from benchmarks.hostiletwin import HostileTwin, TwinFault
+from servotwin.commissioning.edge_settings import Recording
 from servotwin.cosim.driver import Cosimulation
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.cosim.scenario_file import Recording
 from servotwin.edge.watch import WatchSettings
 from servotwin.hybrid.automaton import Array
 from servotwin.messages import Band, Cause, Reason

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
+from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.keys import key
 from servotwin.config.reference import TableSpec, markdown, schema
 from servotwin.control.controller import Controller
 from servotwin.cosim.scenario import Scenario
-from servotwin.cosim.scenario_file import Recording
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.table import SUPERVISED
 from servotwin.edge.parameters import FallbackSet

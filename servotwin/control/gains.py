@@ -24,7 +24,7 @@ def read_gains(table: Table, running: Controller) -> Gains:
 
 
 def gains_given(table: Table) -> bool:
-    """Whether a table gives any gain."""
+    """True when a table gives any gain."""
     return bool(changes(table, Controller, only=Gains.__struct_fields__))
 
 

@@ -21,7 +21,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import Floats
 from servotwin.link.outbox import MemoryOutbox
@@ -99,10 +99,10 @@ class Remote(Protocol):
         """Return the answers to a message that arrived at `now` (s)."""
 
     def next_wake(self) -> float | None:
-        """When `wake` is due, s; None: nothing is waited for."""
+        """Return the time at which `wake` is due, s; None: nothing is waited for."""
 
     def wake(self, now: float) -> list[Message]:
-        """What to send without having been asked."""
+        """Return the messages that are due at `now` (s)."""
 
 
 class Cosimulation:
@@ -205,7 +205,7 @@ class Cosimulation:
         """The first sample at or after a time."""
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
-    def _send_up(self, outgoing: OutgoingMessage) -> None:
+    def _send_up(self, outgoing: ScheduledMessage) -> None:
         if isinstance(outgoing.message, Receipt):
             self.receipts.append(outgoing.message)
         elif isinstance(outgoing.message, Fallback):

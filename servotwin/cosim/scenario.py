@@ -11,22 +11,18 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from servotwin.commissioning.guarding import Guarding, guarding, start_of
+from servotwin.commissioning.edge_settings import Commissioning, Recording, check_samples
 from servotwin.config.keys import check, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import read
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of, with_gains
-from servotwin.cosim.scenario_file import GAPS, REFERENCES, Recording, gap_maker, read_parts
-from servotwin.edge.limits import Limits
+from servotwin.control.gains import with_gains
+from servotwin.cosim.scenario_file import GAPS, REFERENCES, gap_maker, read_parts
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
-from servotwin.estimation.gap import shortest_window
 from servotwin.link.simulated import LinkSettings, derive_seed
-from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.novelty.score import model_of
-from servotwin.novelty.settings import NoveltySettings
+from servotwin.messages import NAME_PATTERN
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
@@ -34,9 +30,6 @@ from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
-WINDOW = 1.0  # s, section 4.2
-CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
-MOST_SAMPLES = 1e8  # some 10 GB of signals
 PRESETS = ("fig15", "fig15-sampled", "fig16", "calm", "certified")
 
 
@@ -112,7 +105,8 @@ class Scenario:
         self._check_rates()
         as_pieces(self.reference, self.duration)
         as_gap(self.gap, self.duration)
-        self._check_window()
+        self.commissioning.check_window()
+        self.commissioning.recorder_settings(self.name, BOOT)
 
     def __repr__(self) -> str:
         """Name, length, servo and policy in one line."""
@@ -140,7 +134,7 @@ class Scenario:
         ------
         InvalidInput
             The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
-            is unstable on the servo even without a gap, nothing is proved for the stated range.
+            is unstable on the servo even without a gap, nothing is verified for the stated range.
         """
         return cls.from_table(read_toml(path), Path(path).parent)
 
@@ -186,26 +180,15 @@ class Scenario:
         return self.servo.replace(controller=self.law)
 
     @cached_property
-    def guarding(self) -> Guarding | None:
-        """What the edge is given where the scenario leaves its supervision to the policy; None: nothing.
-
-        Raises
-        ------
-        InvalidInput
-            No fallback set is proved for the whole stated range.
-        """
+    def commissioning(self) -> Commissioning:
+        """All that the settings of its edge follow from."""
         noise = 0.0 if self.noise is None else self.noise.std
-        return None if self.supervision is not None else guarding(self.model, self.twin, noise)
+        return Commissioning(self.servo, self.law, self.twin, self.recording, self.supervision, noise)
 
     @property
     def start(self) -> Parameters:
-        """What the edge runs before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
-        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
-        if self.twin.policy == "certified":
-            fallback = guarded.supervision.fallback if guarded is not None and own else None
-            return Parameters() if fallback is None else start_of(fallback)
-        k_dz = 1.0 if self.twin.k_dz is None else self.twin.k_dz
-        return Parameters(setting=Setting(self.servo.tolerance_for(self.twin.initial_gap, k_dz)))
+        """Parameters before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
+        return self.commissioning.start
 
     @property
     def start_law(self) -> Controller:
@@ -222,72 +205,15 @@ class Scenario:
         """Samples recorded, both ends included."""
         return round(self.duration * self.recording.sample_rate) + 1
 
-    @property
-    def window(self) -> float:
-        """Length of a window, s."""
-        given = self.recording.window
-        return given if given is not None else (CALM_WINDOW if self.calm else WINDOW)
-
-    @property
-    def pre_trigger(self) -> float:
-        """How much of a window lies before the change of the reference, s."""
-        given = self.recording.pre_trigger
-        fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
-        return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
-
-    @property
-    def calm(self) -> bool:
-        """Whether the loop has hardly any integral action, and so nothing that makes it hunt through the gap."""
-        return self.law.Ki == 0.0 or self.twin.policy == "certified"
-
     def agent_settings(self) -> AgentSettings:
-        """What the edge is told.
+        """Settings of its edge's agent.
 
         Raises
         ------
         InvalidInput
-            No fallback set is proved for the whole stated range.
+            No fallback set is verified for the whole stated range.
         """
-        settings, guarded = dataclasses.replace(self._recorded(), parameters=self.start), self.guarding
-        if guarded is not None:
-            given = self.recording.limits
-            limits = guarded.limits if given == Limits() else given
-            return dataclasses.replace(
-                settings,
-                limits=limits,
-                controller=self.law,
-                own=guarded.middle if given == Limits() else gains_of(self.servo.controller),
-                supervision=guarded.supervision,
-            )
-        if self.supervision is not None:
-            own = gains_of(self.servo.controller)
-            return dataclasses.replace(settings, controller=self.law, own=own, supervision=self.supervision)
-        return settings
-
-    def _recorded(self) -> AgentSettings:
-        """The part that is about windows."""
-        r = self.recording
-        return AgentSettings(
-            servo=self.name,
-            boot=BOOT,
-            sample_rate=r.sample_rate,
-            window_s=self.window,
-            pre_trigger_s=self.pre_trigger,
-            fine_angle=r.fine_angle,
-            retry=r.retry,
-            limits=r.limits,
-            model_version=self.servo.version,
-            window_filter=self._novelty(),
-            longest_window_s=r.longest_window,
-            longest_pre_trigger_s=r.longest_pre_trigger,
-            probe=r.probe,
-        )
-
-    def _novelty(self) -> NoveltySettings | None:
-        """What the edge needs to tell which windows are worth sending."""
-        rules = self.recording.novelty
-        model = None if rules is None else model_of(self.servo, self.recording.sample_rate)
-        return None if rules is None or model is None else NoveltySettings(model, rules, self.twin.initial_gap)
+        return self.commissioning.agent_settings(self.name, BOOT)
 
     def seed_of(self, source: str) -> int:
         """The seed of one named source of randomness: the same for equal (seed, name, source), on every machine."""
@@ -296,7 +222,7 @@ class Scenario:
     def _check_rates(self) -> None:
         rate, law = self.recording.sample_rate, self.law.sample_rate
         samples = self.duration * rate
-        self._check_size(max(rate, law or 0.0))
+        check_samples("duration", self.duration, max(rate, law or 0.0))
         if abs(samples - round(samples)) > 1e-6:
             raise InvalidInput(f"duration = {self.duration!r} s: must be a whole number of samples at {rate!r} Hz")
         if law is None:
@@ -311,19 +237,3 @@ class Scenario:
                 f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
                 "whole multiples of one another"
             )
-
-    def _check_size(self, rate: float) -> None:
-        """All samples and one window fit into memory."""
-        for name, seconds in (("duration", self.duration), ("window", self.recording.longest_window or self.window)):
-            if not seconds * rate <= MOST_SAMPLES:
-                raise InvalidInput(
-                    f"{name} = {seconds!r} s: has {seconds * rate:.3g} samples at {rate!r} Hz; "
-                    f"at most {MOST_SAMPLES:g} are allowed"
-                )
-
-    def _check_window(self) -> None:
-        """The edge accepts the window's length, and the estimator finds enough in it."""
-        self._recorded()
-        needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
-        if self.window < needed * (1.0 - 1e-9):
-            raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")

@@ -1,18 +1,18 @@
-"""A scenario's TOML: what a scenario records, and the tables that depend on its servo."""
+"""A scenario's TOML: kinds of reference and gap, and the tables that depend on its servo."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from servotwin.config.keys import Maker, key, settings
+from servotwin.commissioning.edge_settings import Recording
+from servotwin.config.keys import Maker, key
 from servotwin.config.table import Table, named, read_inner
 from servotwin.config.toml import changes, part, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import read_gains
-from servotwin.edge.limits import Limits
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.settings_file import read_supervision
@@ -21,61 +21,7 @@ from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.runtime.retry import Retry
 from servotwin.twin.settings import read_twin_settings
-
-
-@settings("recording")
-@dataclass(frozen=True)
-class Recording:
-    """What the edge records and sends.
-
-    Parameters
-    ----------
-    probe : ProbeLimits, optional
-        Probing moves of the reference that the twin may request; None: none. In a file, [edge.probe].
-    novelty : NoveltyRules, optional
-        Rules of the windows that the edge finds worth sending; None: it sends every one. In a file, [novelty].
-    """
-
-    sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
-    window: Annotated[
-        float | None,
-        key("window_s", above=0.0, help="Length of a window; by the controller where absent."),
-    ] = None
-    pre_trigger: Annotated[
-        float | None,
-        key(
-            "pre_trigger_s",
-            minimum=0.0,
-            help="Part of a window before the change of the reference; where absent it follows from the controller.",
-        ),
-    ] = None
-    retry: Annotated[Retry, key(prefix="retry_", help="When an unacknowledged window is sent again.")] = field(
-        default_factory=Retry
-    )
-    limits: Annotated[Limits, key(help="Limits that an update must respect.")] = field(default_factory=Limits)
-    fine_angle: Annotated[
-        bool,
-        key(
-            help="Send theta_m with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the "
-            "estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do."
-        ),
-    ] = True
-    longest_window: Annotated[
-        float | None,
-        key("longest_window_s", above=0.0, help="Longest window that the twin may request; window_s where absent."),
-    ] = None
-    longest_pre_trigger: Annotated[
-        float | None,
-        key(
-            "longest_pre_trigger_s",
-            minimum=0.0,
-            help="Longest pre-trigger that it may request; pre_trigger_s where absent.",
-        ),
-    ] = None
-    probe: ProbeLimits | None = None
-    novelty: NoveltyRules | None = None
 
 
 def square_wave(

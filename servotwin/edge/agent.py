@@ -21,7 +21,7 @@ from servotwin.edge.packing import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import TIMED, Cut, Floats, Recorder, as_floats
-from servotwin.edge.requests import RequestState, decide
+from servotwin.edge.requests import GrantedRequests, decide
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
@@ -30,7 +30,7 @@ from servotwin.link.outbox import Outbox
 from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
 
 
-class OutgoingMessage(NamedTuple):
+class ScheduledMessage(NamedTuple):
     """A message, and the sample instant (samples absorbed so far) at which it is sent."""
 
     sample: int
@@ -78,9 +78,9 @@ class Agent:
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(0.0)
-        self._requests = RequestState(settings.window_samples, settings.pre_trigger_samples)
+        self._requests = GrantedRequests(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
-        self._opened: OpenWindow | None = None
+        self._open_window: OpenWindow | None = None
         self._cut_at = 0
         self._deadline = self._next_deadline()
 
@@ -130,7 +130,7 @@ class Agent:
         """Windows that will never be sent again without having been acknowledged, by reason."""
         return Counter(self.outlet.dropped)
 
-    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[OutgoingMessage]:
+    def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[ScheduledMessage]:
         """Take one sample (m, rad, m, V); return what is to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
         if reference != self._expected:
@@ -139,12 +139,12 @@ class Agent:
 
     def absorb_block(
         self, reference: Floats, theta_m: Floats, position: Floats, voltage: Floats
-    ) -> list[OutgoingMessage]:
+    ) -> list[ScheduledMessage]:
         """Take equally long blocks of samples: the same effect as one by one."""
         blocks = [as_floats(block) for block in (reference, theta_m, position, voltage)]
         if len({len(block) for block in blocks}) != 1:
             raise InvalidInput(f"blocks of {[len(block) for block in blocks]} samples: must be equally long")
-        sent: list[OutgoingMessage] = []
+        sent: list[ScheduledMessage] = []
         done = 0
         while done < len(blocks[0]):
             stop = self._stop(blocks[0], done)
@@ -156,12 +156,12 @@ class Agent:
             done = stop
         return sent
 
-    def receive(self, message: Message) -> list[OutgoingMessage]:
+    def receive(self, message: Message) -> list[ScheduledMessage]:
         """Take a message from the twin; return what is to be sent now. Messages not meant for an edge are ignored."""
         if isinstance(message, Update):
             replies = self._supervisor.offer(message)
             self._twin_answered(message.servo)
-            return [OutgoingMessage(self.samples, each) for each in replies]
+            return [ScheduledMessage(self.samples, each) for each in replies]
         if isinstance(message, Request):
             return self._handle_request(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
@@ -177,11 +177,11 @@ class Agent:
             self._supervisor.twin_answered(self.time, more=False)
         self._deadline = self._next_deadline()
 
-    def restore(self, former: Parameters) -> list[OutgoingMessage]:
+    def restore(self, former: Parameters) -> list[ScheduledMessage]:
         """Put former parameters in force again, as the drive has refused the present ones; return messages."""
         messages = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
-        return [OutgoingMessage(self.samples, each) for each in messages]
+        return [ScheduledMessage(self.samples, each) for each in messages]
 
     def hello(self) -> Hello:
         """Make the message that introduces the edge: send it after a start or a reconnection."""
@@ -192,7 +192,7 @@ class Agent:
     def _stop(self, reference: "array[float]", done: int) -> int:
         """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""
         stop = int(min(len(reference), done + self._deadline - self.samples))
-        if self._opened is not None and self.probe is None:
+        if self._open_window is not None and self.probe is None:
             return stop
         last = self._expected
         return next((k + 1 for k in range(done, stop) if reference[k] != last), stop)
@@ -203,56 +203,57 @@ class Agent:
             self._supervisor.twin_answered(self.time, more=self.outlet.unacknowledged)
         self._deadline = self._next_deadline()
 
-    def _handle_request(self, request: Request) -> list[OutgoingMessage]:
+    def _handle_request(self, request: Request) -> list[ScheduledMessage]:
         """Decide about a request; a probing move begins with the next sample."""
         s, before = self.settings, self.probe
         here = Instant(s.servo, s.boot, self.samples, s.sample_rate)
         self._requests, answer = decide(request, self._requests, s, here, self._at_rest())
         move = self.probe
         if move is not None and move is not before:
-            self._opened = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
+            self._open_window = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
             self._expected = self._reference + self.offset
         self._twin_answered(request.servo)
-        return [OutgoingMessage(self.samples, answer)]
+        return [ScheduledMessage(self.samples, answer)]
 
     def _at_rest(self) -> bool:
         """True where the reference rests and no window is being recorded."""
         return (
-            self._opened is None and self._recorder.constant("reference", self.settings.rest_samples) == self._reference
+            self._open_window is None
+            and self._recorder.constant("reference", self.settings.rest_samples) == self._reference
         )
 
     def _reference_changed(self, reference: float) -> None:
         """Note a new reference in the last sample, and abort a probing move; what that has added is in the sample."""
         self._reference = reference
         self._abort()
-        if self._opened is None:
+        if self._open_window is None:
             first = max(0, self.samples - 1 - self._requests.pre_trigger)
-            self._opened = OpenWindow(first, first + self._requests.window, "reference")
+            self._open_window = OpenWindow(first, first + self._requests.window, "reference")
             self._deadline = self._next_deadline()
 
     def _abort(self) -> None:
         """End the probing move and its window."""
         if self.probe is not None:
             self._requests = replace(self._requests, probe=None)
-            self._opened = None
+            self._open_window = None
         self._expected = self._reference
 
-    def _act(self) -> list[OutgoingMessage]:
+    def _act(self) -> list[ScheduledMessage]:
         """Cut the window that is complete, and send what is due."""
-        opened = self._opened
+        opened = self._open_window
         if opened is not None and self.samples >= opened.last:
             self._cut(opened)
             self._abort()
-            self._opened = None
+            self._open_window = None
         elif opened is None and self.samples >= self._timed:
             self._cut(OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
-        sent = [OutgoingMessage(self.samples, window) for window in self.outlet.due(self.time)]
+        sent = [ScheduledMessage(self.samples, window) for window in self.outlet.due(self.time)]
         messages = self._supervisor.check()
         if any(isinstance(each, Fallback) for each in messages):
             self._abort()
         self._expected = self._reference + self.offset
         self._deadline = self._next_deadline()
-        return sent + [OutgoingMessage(self.samples, each) for each in messages]
+        return sent + [ScheduledMessage(self.samples, each) for each in messages]
 
     def _cut(self, opened: OpenWindow) -> None:
         """Cut a window and hand it to the outlet, which knows whether the twin then owes an answer."""
@@ -280,7 +281,7 @@ class Agent:
     def _next_deadline(self) -> float:
         """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
         deadline = self._supervisor.next_check
-        deadline = min(deadline, self._timed if self._opened is None else self._opened.last)
+        deadline = min(deadline, self._timed if self._open_window is None else self._open_window.last)
         if self.probe is not None:
             deadline = min(deadline, self.probe.next_change(self.samples))
         due = self.outlet.next_time

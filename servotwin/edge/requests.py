@@ -14,7 +14,7 @@ from servotwin.messages import Answer, LongerWindow, Probe, Request, RequestOutc
 
 
 @dataclass(frozen=True, slots=True)
-class RequestState:
+class GrantedRequests:
     """State that requests have led to.
 
     Parameters
@@ -44,19 +44,19 @@ class RequestState:
 class RequestDecision(NamedTuple):
     """State after a request, and the answer to it."""
 
-    state: RequestState
+    state: GrantedRequests
     answer: Answer
 
 
 def decide(
-    request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+    request: Request, state: GrantedRequests, settings: AgentSettings, here: Instant, at_rest: bool
 ) -> RequestDecision:
     """Take a request, or say why not.
 
     Parameters
     ----------
     request : Request
-    state : RequestState
+    state : GrantedRequests
     settings : AgentSettings
         Limits of windows and probing moves.
     here : Instant
@@ -81,7 +81,7 @@ def _is_for(request: Request, here: Instant) -> bool:
 
 
 def _judge(
-    request: Request, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+    request: Request, state: GrantedRequests, settings: AgentSettings, here: Instant, at_rest: bool
 ) -> RequestOutcome:
     checks = (
         (request.servo == here.servo, RequestOutcome.WRONG_SERVO),
@@ -104,7 +104,7 @@ def _judge_window(ask: LongerWindow, settings: AgentSettings) -> RequestOutcome:
 
 
 def _judge_probe(
-    ask: Probe, state: RequestState, settings: AgentSettings, here: Instant, at_rest: bool
+    ask: Probe, state: GrantedRequests, settings: AgentSettings, here: Instant, at_rest: bool
 ) -> RequestOutcome:
     limits = settings.probe
     if limits is None:
@@ -119,12 +119,12 @@ def _judge_probe(
     return next((outcome for passed, outcome in checks if not passed), RequestOutcome.TAKEN)
 
 
-def _rested(state: RequestState, limits: ProbeLimits, here: Instant) -> bool:
+def _rested(state: GrantedRequests, limits: ProbeLimits, here: Instant) -> bool:
     """True where the last probing move is long enough ago."""
     return state.probed is None or here.sample - state.probed >= limits.interval_s * here.rate
 
 
-def _grant(request: Request, state: RequestState, settings: AgentSettings, here: Instant) -> RequestState:
+def _grant(request: Request, state: GrantedRequests, settings: AgentSettings, here: Instant) -> GrantedRequests:
     """Windows are at least as configured."""
     ask, rate = request.ask, settings.sample_rate
     if isinstance(ask, Probe):

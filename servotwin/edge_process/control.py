@@ -71,7 +71,7 @@ class ControlRole:
         self._applied = edge.agent.parameters
         self.law = GuardedLaw(self._law(self._applied), round(sensor.hold_s * rate), sensor.safe_voltage)
         self._safe = sensor.safe_voltage
-        self._machine, self._away = drive.machine, False
+        self._machine, self._drive_lost = drive.machine, False
         self._reference = edge.config.agent.reference
 
     def step(self) -> bool:
@@ -80,7 +80,7 @@ class ControlRole:
         began = self._edge.clock()
         if sample is None:
             return False
-        if sample.number != self._edge.due or self._away:
+        if sample.number != self._edge.due or self._drive_lost:
             self._jumped(sample.number)
         self._edge.due = sample.number + 1
         self._tick(sample)
@@ -92,7 +92,7 @@ class ControlRole:
 
     def lost(self) -> None:
         """Note that the drive is away: its state meanwhile is not known."""
-        self.law.state, self._away = None, True
+        self.law.state, self._drive_lost = None, True
 
     def stop(self) -> None:
         """Apply the safe voltage; raises `DriveLost`."""
@@ -117,7 +117,7 @@ class ControlRole:
         if self._edge.due is None:
             return
         same = self._drive.machine == self._machine
-        self._machine, self._away = self._drive.machine, False
+        self._machine, self._drive_lost = self._drive.machine, False
         if not same or number != self._edge.due:
             missing = number - self._edge.due if same else -1
             self._edge.skip(missing, self._reference + self._edge.agent.offset, self.law.voltage)

@@ -10,7 +10,7 @@ from math import nan
 from typing import Protocol
 
 from servotwin.control.controller import Controller
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process.config import EdgeConfig
@@ -123,7 +123,7 @@ class EdgeRuntime:
         if received.reconnected:
             self._outlet.send_letter(self.agent.hello())
 
-    def send(self, letters: list[OutgoingMessage]) -> None:
+    def send(self, letters: list[ScheduledMessage]) -> None:
         """Send the agent's letters."""
         for each in letters:
             self._outlet.send_letter(each.message)

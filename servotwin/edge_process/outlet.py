@@ -20,7 +20,7 @@ MOST = 64_000_000
 """Bytes that are kept for a link process that does not acknowledge them."""
 
 
-class Received:
+class ReceivedFrames:
     """Frames of the link process, as the agent needs them.
 
     Attributes
@@ -138,7 +138,7 @@ class PipeOutlet:
         if self._pipe is not None and self._pipe.backlog == 0:
             self._pipe.post(frames.encode(frame))
 
-    def exchange(self) -> Received | None:
+    def exchange(self) -> ReceivedFrames | None:
         """Send a piece and receive a piece; None: nothing came."""
         pipe = self._pipe
         if pipe is None or pipe.broken:
@@ -151,8 +151,8 @@ class PipeOutlet:
             pipe.broken = True
             return None
 
-    def _receive(self, bodies: list[bytes]) -> Received:
-        received = Received()
+    def _receive(self, bodies: list[bytes]) -> ReceivedFrames:
+        received = ReceivedFrames()
         for data in bodies:
             frame = frames.to_control(data)
             if isinstance(frame, AckFrame):
@@ -168,7 +168,7 @@ class PipeOutlet:
                 received.reconnected = True
         return received
 
-    def _message(self, frame: MessageFrame, received: Received) -> None:
+    def _message(self, frame: MessageFrame, received: ReceivedFrames) -> None:
         """Take a message of the twin's once, however often it is repeated."""
         if frame.serial == 0 or frame.serial > self._processed:
             received.messages.append(decode(frame.body))

@@ -34,7 +34,7 @@ class Shape:
     reference, gap, tolerance : int
         Polynomial degree of each input.
     dead_zone, noise : bool
-        Whether there are zones for the dead zone, and a state "noise" (m, on the measurement).
+        True for the zones of a dead zone, and for a state "noise" (m, on the measurement).
     bias : bool
         A state "input bias" (V, added to the voltage behind the controller).
     friction : bool

@@ -199,11 +199,10 @@ def _servo(table: Table, folder: Path) -> Servo:
 
 
 def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
-    """First setting of an edge, as in `Scenario.start`; `own`: the gains are the servo's own."""
+    """Setting that an edge begins with, as `Commissioning.start` has it; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
         return None if own else Setting(0.0, gains_of(law))
-    k_dz = 1.0 if settings.k_dz is None else settings.k_dz
-    return Setting(servo.tolerance_for(settings.initial_gap, k_dz), gains_of(law))
+    return Setting(settings.initial_tolerance(servo), gains_of(law))
 
 
 @lru_cache(maxsize=2 * MAX_MODELS)

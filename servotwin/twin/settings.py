@@ -14,6 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
 from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
+from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
@@ -167,6 +168,10 @@ class TwinSettings:
                 raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False, as the trend already joins the windows")
+
+    def initial_tolerance(self, servo: Servo) -> float:
+        """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""
+        return servo.tolerance_for(self.initial_gap, 1.0 if self.k_dz is None else self.k_dz)
 
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""

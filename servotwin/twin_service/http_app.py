@@ -306,7 +306,7 @@ ENCODING = parameter(
 def operation(
     summary: str,
     responses: Mapping[int, tuple[str, str | None]],
-    *parameters: Operation,
+    parameters: Iterable[Operation] = (),
     body: str = "",
     errors: Iterable[int] = (),
 ) -> Operation:
@@ -317,7 +317,7 @@ def operation(
     summary : str
     responses : mapping of int to (str, str or None)
         Status to description and content type.
-    *parameters : dict
+    parameters : iterable of dict
         As `parameter` makes them.
     body : str
         Description of the request's MessagePack body; empty: it has none.

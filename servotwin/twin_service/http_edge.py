@@ -57,23 +57,25 @@ class EdgeApi:
                 201: ("New, and safe: an array with its acknowledgement.", MSGPACK),
                 200: ("Known already, likewise.", MSGPACK),
             },
-            *(SERVO, BOOT, SEQUENCE, ENCODING),
+            parameters=(SERVO, BOOT, SEQUENCE, ENCODING),
             body="A window/1, MessagePack.",
             errors=MESSAGE_ERRORS,
         )
         post_letter = operation(
             "Commit a hello, receipt, fallback or answer",
             {202: ("It is safe.", None)},
-            *(SERVO, ENCODING),
+            parameters=(SERVO, ENCODING),
             body="A hello/2, receipt/1, fallback/2 or answer/1, MessagePack; hello/1 and fallback/1 are read too.",
             errors=MESSAGE_ERRORS,
         )
         get_outgoing = operation(
             "Messages for an edge, sealed",
             {200: ("An array of sealed messages, serials rising; empty: none came in time.", MSGPACK)},
-            SERVO,
-            parameter("after", INTEGER, "Only messages with higher serials."),
-            parameter("wait", {**SECONDS, "maximum": MAX_WAIT_S}, "How long to wait for one, s."),
+            parameters=(
+                SERVO,
+                parameter("after", INTEGER, "Only messages with higher serials."),
+                parameter("wait", {**SECONDS, "maximum": MAX_WAIT_S}, "Longest wait for one, s."),
+            ),
             errors=(400, 401, 403, 404, 429, 503),
         )
         return [

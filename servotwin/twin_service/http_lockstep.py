@@ -63,15 +63,15 @@ class LockstepApi:
         receive = operation(
             "Lock-step: a message arrives",
             stepped,
-            *(SERVO, now, ENCODING),
+            parameters=(SERVO, now, ENCODING),
             body="Any message for a twin.",
             errors=MESSAGE_ERRORS,
         )
-        wake = operation("Lock-step: wake the twin", stepped, SERVO, now, errors=QUERY_ERRORS)
+        wake = operation("Lock-step: wake the twin", stepped, (SERVO, now), errors=QUERY_ERRORS)
         following = operation(
             "Lock-step: time of the next wake-up",
             {200: ("Sample time, s, or null.", MSGPACK)},
-            SERVO,
+            parameters=(SERVO,),
             errors=QUERY_ERRORS,
         )
         path = SERVO_PATH + "/lockstep"

@@ -82,28 +82,33 @@ class OperatorApi:
         servos = operation(
             "Summaries of all servos",
             {200: ("By name.", JSON)},
-            parameter("after", {"type": "string"}, "Only names after this one."),
-            limit,
+            parameters=(parameter("after", {"type": "string"}, "Only names after this one."), limit),
             errors=QUERY_ERRORS,
         )
-        servo = operation("Summary of one servo", {200: ("Its present state.", JSON)}, SERVO, errors=QUERY_ERRORS)
+        servo = operation("Summary of one servo", {200: ("Its present state.", JSON)}, (SERVO,), errors=QUERY_ERRORS)
         audit = operation(
             "The evidence chain: window, estimate, version, receipt, effect",
             {200: ("Newest window first.", JSON)},
-            *(SERVO, limit),
-            parameter("since", SECONDS, "Only windows received then or later, s since the epoch."),
-            parameter("before", INTEGER, "Only windows with lower ids: the next page."),
+            parameters=(
+                SERVO,
+                limit,
+                parameter("since", SECONDS, "Only windows received then or later, s since the epoch."),
+                parameter("before", INTEGER, "Only windows with lower ids: the next page."),
+            ),
             errors=QUERY_ERRORS,
         )
         events = operation(
             "Evidence that belongs to no window: starts of the edge, fallbacks, answers, faults of the twin itself",
             {200: ("Newest first.", JSON)},
-            *(SERVO, limit),
-            parameter("since", SECONDS, "Only evidence from then or later, s since the epoch."),
+            parameters=(
+                SERVO,
+                limit,
+                parameter("since", SECONDS, "Only evidence from then or later, s since the epoch."),
+            ),
             errors=QUERY_ERRORS,
         )
         window = operation(
-            "A window as it came", {200: ("window/1.", MSGPACK)}, SERVO, BOOT, SEQUENCE, errors=QUERY_ERRORS
+            "A window as it came", {200: ("window/1.", MSGPACK)}, (SERVO, BOOT, SEQUENCE), errors=QUERY_ERRORS
         )
         healthy = {200: ("All is well.", JSON), 503: ("Something is not; the body says what.", JSON)}
         return [

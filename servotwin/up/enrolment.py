@@ -11,15 +11,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.config.table import did_you_mean, read_toml
-from servotwin.cosim.scenario import Scenario
-from servotwin.cosim.scenario_file import Recording
 from servotwin.edge_process.config import ROLES, UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN
-from servotwin.plant.noise import Noise
 from servotwin.runtime.files import make_directory, write_text
 from servotwin.twin_service.auth import PRIVATE, Verifiers, read_tokens, tokens_locked, write_private, write_tokens
 from servotwin.twin_service.config import ServiceConfig
@@ -131,12 +129,12 @@ def drive_of(path: Path | None) -> Mapping[str, object]:
 
 
 def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
-    """What the edge of a servo runs on: guarded as the twin's policy needs it, proved where it is proved.
+    """Configuration of a servo's edge: supervised as the twin's policy needs it.
 
     Raises
     ------
     InvalidInput
-        The servo has no model, or nothing is proved for its stated range.
+        The servo has no model, or nothing is verified for its stated range.
     """
     model = twin.fleet.model_of(wanted.servo)
     sampled = wanted.role == "control" or wanted.noise > 0.0
@@ -144,15 +142,10 @@ def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
     recording = Recording(
         sample_rate=wanted.sample_rate, longest_window=LONGEST_WINDOW_S, longest_pre_trigger=LONGEST_PRE_TRIGGER_S
     )
-    scenario = Scenario(
-        servo=model.servo.replace(controller=law),
-        duration=1.0,
-        name=wanted.servo,
-        recording=recording,
-        twin=model.settings,
-        noise=Noise(wanted.noise) if wanted.noise > 0.0 else None,
-    )
-    agent = replace(scenario.agent_settings(), boot=UNBOOTED)
+    servo = model.servo.replace(controller=law)
+    commissioning = Commissioning(servo, law, model.settings, recording, noise=wanted.noise)
+    commissioning.check_window()
+    agent = commissioning.agent_settings(wanted.servo, UNBOOTED)
     certificate = None if _trusted(twin, wanted) is None else CERTIFICATE
     link = TwinLink(wanted.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
     return EdgeConfig(agent, wanted.role, agent.controller or law, wanted.drive, link, folder=wanted.folder)

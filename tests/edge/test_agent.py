@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.packing import MAX_CHANGES
 from servotwin.edge.parameters import Parameters
@@ -35,14 +35,14 @@ def settings(**changes: Any) -> AgentSettings:
     return AgentSettings(**{**values, **changes})
 
 
-def feed(agent: Agent, reference: list[float]) -> list[OutgoingMessage]:
+def feed(agent: Agent, reference: list[float]) -> list[ScheduledMessage]:
     """Samples whose signals tell their index."""
     n = agent.samples
     ramp = array("d", range(n, n + len(reference)))
     return agent.absorb_block(reference, [0.1 * x for x in ramp], [1e-3 * x for x in ramp], [-x for x in ramp])
 
 
-def windows(sent: list[OutgoingMessage]) -> list[WindowMessage]:
+def windows(sent: list[ScheduledMessage]) -> list[WindowMessage]:
     return [out.message for out in sent if isinstance(out.message, WindowMessage)]
 
 
@@ -147,7 +147,7 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
     agent = Agent(settings(limits=Limits(maximum=2e-4)))
     feed(agent, [1e-3] * 30)
     (good,) = agent.receive(update())
-    assert good == OutgoingMessage(30, Receipt("axis-1", 1, True, 30, Reason.APPLIED, 1, "b0"))
+    assert good == ScheduledMessage(30, Receipt("axis-1", 1, True, 30, Reason.APPLIED, 1, "b0"))
     assert (agent.parameters.version, agent.parameters.setting.tolerance, agent.parameters.sample) == (1, 1e-4, 30)
     (bad,) = agent.receive(update(version=2, base_version=1, data_time=1.0, setting=Setting(3e-4)))
     assert bad.message == Receipt("axis-1", 2, False, 30, Reason.OUT_OF_BOUNDS, 1, "b0")
@@ -212,7 +212,7 @@ def test_blocks_have_the_effect_of_single_samples(
     signals = [reference, *np.random.default_rng(seed).normal(size=(3, total))]
     both = [Agent(settings(pre_trigger_s=pre_trigger_s, retry=Retry(0.75)), MemoryOutbox(3)) for _ in range(2)]
     singly, blockwise = both
-    sent: tuple[list[OutgoingMessage], list[OutgoingMessage]] = ([], [])
+    sent: tuple[list[ScheduledMessage], list[ScheduledMessage]] = ([], [])
     done = 0
     for number, count in enumerate(chunks):
         part = [signal[done : done + count] for signal in signals]

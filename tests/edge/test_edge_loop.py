@@ -6,7 +6,7 @@ from functools import partial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
@@ -130,7 +130,7 @@ class Loop:
             self.history.append(self.agent.parameters)
             self.swaps.append((message.base_version, before.version))
 
-    def _up(self, sent: list[OutgoingMessage]) -> None:
+    def _up(self, sent: list[ScheduledMessage]) -> None:
         for out in sent:
             if isinstance(out.message, Receipt):
                 self.receipts.append(out.message)

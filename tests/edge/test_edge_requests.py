@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.supervisor import Supervisor
@@ -46,7 +46,7 @@ def request(serial: int = 1, ask: Any = MOVE, **changes: Any) -> Request:
 
 def feed(agent: Agent, wanted: list[float]) -> list[Message]:
     """As whoever ticks the law does: wanted position plus the agent's offset, one sample after the other."""
-    sent = list[OutgoingMessage]()
+    sent = list[ScheduledMessage]()
     for value in wanted:
         k = float(agent.samples)
         sent += agent.absorb(value + agent.offset, 0.1 * k, 1e-3 * k, -k)
@@ -201,7 +201,7 @@ def test_blocks_equal_single_samples(wanted: list[tuple[float, int]], requests: 
     """Blocks end where requests come and, during a move, with the sample at which the wanted position changes."""
     reference = [value for value, count in wanted for _ in range(count)]
     single, blocks = Agent(settings()), Agent(settings())
-    one, other = list[OutgoingMessage](), list[OutgoingMessage]()
+    one, other = list[ScheduledMessage](), list[ScheduledMessage]()
     serial, done = 0, 0
     while done < len(reference):
         if done in requests:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from servotwin.control import Controller
 from servotwin.control.gains import gains_of
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.limits import Limits
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import AgentSettings, Supervision
@@ -41,7 +41,7 @@ def update(version: int, base: int, data_time: float, tolerance: float = 1e-4) -
     )
 
 
-def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float = 1.5) -> list[OutgoingMessage]:
+def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float = 1.5) -> list[ScheduledMessage]:
     """Samples of a loop whose error swings, its reference 1 mm."""
     count = round(seconds * RATE)
     times = [(agent.samples + k) / RATE for k in range(count)]
@@ -50,7 +50,7 @@ def feed(agent: Agent, seconds: float, amplitude: float = 0.0, frequency: float 
     return agent.absorb_block([1e-3] * count, rest, position, rest)
 
 
-def fallbacks(sent: list[OutgoingMessage]) -> list[Fallback]:
+def fallbacks(sent: list[ScheduledMessage]) -> list[Fallback]:
     return [out.message for out in sent if isinstance(out.message, Fallback)]
 
 
@@ -149,7 +149,7 @@ STEPS = st.lists(st.tuples(st.integers(1, 400), st.sampled_from([0.0, 2e-5, 1.5e
 @given(steps=STEPS)
 def test_blocks_and_single_samples_decide_the_same(steps: list[tuple[int, float, bool]]) -> None:
     agents = [Agent(agent_settings(3.0, 0.5)) for _ in range(2)]
-    sent: list[list[OutgoingMessage]] = [[], []]
+    sent: list[list[ScheduledMessage]] = [[], []]
     version = 0
     for samples, amplitude, offered in steps:
         times = [(agents[0].samples + k) / RATE for k in range(samples)]

@@ -1,7 +1,11 @@
 """Deployed processes in lock-step do what the co-simulation does, to the last bit."""
 
+import socket
 import sqlite3
+import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -10,6 +14,7 @@ from services import service
 
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
+from servotwin.drives.simulated import supervise, wire
 from servotwin.drives.simulated.client import SimulatedSupervised
 from servotwin.errors import InvalidInput
 from servotwin.messages import Update, decode, encode
@@ -128,3 +133,19 @@ def test_deployed_is_simulated(
 def test_a_url_is_one() -> None:
     with pytest.raises(InvalidInput, match="must be http://HOST:PORT"):
         HttpTwin("127.0.0.1:80", "axis")
+
+
+def test_a_machine_in_lock_step_waits_for_a_client_whose_twin_is_slow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(supervise, "SENDING", 0.05)
+    plant = SimpleNamespace(index=0, version=0, block=1, over=True, read=lambda *_: None, advance=lambda *_: None)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        serving = threading.Thread(target=supervise.SuperviseServer(plant, None).serve, args=(theirs,))
+        serving.start()
+        time.sleep(0.3)
+        ours.send(wire.REQUEST.pack(wire.READ, 0, 1, 0, *(0.0,) * 8))
+        ours.settimeout(10.0)
+        assert wire.REPLY.unpack(wire.receive(ours, wire.REPLY.size))[0] == wire.OVER
+        serving.join()

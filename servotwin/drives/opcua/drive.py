@@ -10,7 +10,7 @@ from math import inf
 import msgspec
 
 from servotwin.drives.opcua import model, ring
-from servotwin.drives.opcua.session import Session
+from servotwin.drives.opcua.session import OpcUaSession
 from servotwin.drives.opcua.settings import OpcUaSettings
 from servotwin.edge.drive import Block, DriveLost, DriveRefused
 from servotwin.edge.parameters import Parameters
@@ -46,7 +46,7 @@ class OpcUaDrive:
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._settings, self._clock, self._sleep = settings, clock, sleep
-        self._session: Session | None = None
+        self._session: OpcUaSession | None = None
         self._ready: deque[Block] = deque()
         self._changes: deque[ring.VersionChange] = deque(maxlen=CHANGES)
         self._next: int | None = None
@@ -56,7 +56,7 @@ class OpcUaDrive:
     def connect(self) -> None:
         """Reach the server, at first or again; in a new run of the machine samples count from the present one."""
         self.close()
-        self._session = Session(self._settings)
+        self._session = OpcUaSession(self._settings)
         self.rate, self._margin, machine, count, version, since = self._session.read(
             (*model.FIXED, "Machine", "Count", "Version", "Since")
         )
@@ -104,12 +104,12 @@ class OpcUaDrive:
             self._session = None
 
     @property
-    def _connected(self) -> Session:
+    def _connected(self) -> OpcUaSession:
         if self._session is None:
             raise DriveLost(f"drive {self._settings.url}: not connected")
         return self._session
 
-    def _look(self, session: Session) -> None:
+    def _look(self, session: OpcUaSession) -> None:
         """Take what is new in the rings."""
         machine, before, *signals, version, since, after = session.read(model.STATE)
         if machine != self.machine:
@@ -127,7 +127,7 @@ class OpcUaDrive:
         if not self._changes or self._changes[-1] != change:
             self._changes.append(change)
 
-    def _wait_for(self, session: Session, commit: int) -> None:
+    def _wait_for(self, session: OpcUaSession, commit: int) -> None:
         """Until the drive has decided."""
         deadline = self._clock() + self._settings.silence_s
         while True:

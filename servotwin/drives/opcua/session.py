@@ -29,7 +29,7 @@ NEVER = (
 """How the names of errors begin that trying again does not mend."""
 
 
-class Session:
+class OpcUaSession:
     """One connection, open from the start.
 
     Parameters
@@ -127,9 +127,9 @@ class Session:
     def _meaning(self, error: BaseException) -> Exception:
         """Convert an error of the OPC UA stack to one of the drive's."""
         name, url = type(error).__name__, self._settings.url
-        told = f"drive {url}: {name}" + (f" ({error})" if str(error) else "")
+        message = f"drive {url}: {name}" + (f" ({error})" if str(error) else "")
         missing = isinstance(error, ValueError) and not isinstance(error, OSError)
-        return InvalidInput(told) if missing or name.startswith(NEVER) else DriveLost(told)
+        return InvalidInput(message) if missing or name.startswith(NEVER) else DriveLost(message)
 
     async def _end(self) -> None:
         """Leave in order if the server lets us, and let no task go on."""

@@ -89,8 +89,8 @@ class MachineConnection:
     def lost(self, error: OSError) -> DriveLost:
         """Make the error to raise when it is gone."""
         self.close()
-        told = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
-        return DriveLost(f"machine {self._address}: {told}")
+        reason = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
+        return DriveLost(f"machine {self._address}: {reason}")
 
     def close(self) -> None:
         """Let go of it."""
@@ -104,7 +104,7 @@ class SimulatedControl:
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
         self._connection = MachineConnection(address, "control", silence)
-        self._owed = False
+        self._voltage_due = False
         self._lag = 0.0
 
     @property
@@ -125,22 +125,22 @@ class SimulatedControl:
     def connect(self) -> None:
         """Reach the machine; its voltage is what it was left with until the first `write`."""
         self._connection.connect()
-        self._owed = False
+        self._voltage_due = False
 
     def read(self) -> DriveSample | None:
         """The next sample; one that was not answered lets the voltage hold."""
-        if self._owed:
+        if self._voltage_due:
             self.write(nan)
         number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._connection.receive(wire.SAMPLE.size))
         if number == wire.LAST:
             return None
-        self._owed = True
+        self._voltage_due = True
         return DriveSample(number, reference, theta_m, position)
 
     def write(self, voltage: float) -> None:
         """Answer the last sample, once."""
-        if self._owed:
-            self._owed = False
+        if self._voltage_due:
+            self._voltage_due = False
             self._connection.send(wire.VOLTAGE.pack(voltage))
 
     def close(self) -> None:

@@ -76,7 +76,9 @@ class SuperviseServer:
         """Let the plant run until the client says something."""
         while True:
             again = self.run_alone()
-            if again is None or select.select([connection], [], [], max(0.0, again - time.monotonic()))[0]:
+            # In lock-step without limit: a twin may take longer over one request than a client may over a reply.
+            patience = None if again is None else max(0.0, again - time.monotonic())
+            if select.select([connection], [], [], patience)[0]:
                 return
 
     def _read(self, connection: socket.socket, asked: DriveRequest) -> bool:

@@ -1,4 +1,4 @@
-"""The link process without a process: handler, boots, counts, troubles."""
+"""Frame handler of the link process, without processes; boot names, tick histogram, log of troubles."""
 
 import math
 from collections.abc import Iterator

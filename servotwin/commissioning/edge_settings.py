@@ -1,0 +1,294 @@
+"""Settings that an edge starts with, made of a servo's model and a policy.
+
+A fallback set is verified for every gap, step and input bias of the stated range, so that it needs no estimate:
+the loop begins on it, and comes back to it. The limits admit what the policy may send and little else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, NamedTuple
+
+from servotwin.config.keys import key, settings
+from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.edge.limits import Limits
+from servotwin.edge.parameters import FallbackSet, Parameters
+from servotwin.edge.probe import ProbeLimits
+from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.errors import InvalidInput
+from servotwin.estimation.gap import shortest_window
+from servotwin.messages import Gains, Setting
+from servotwin.novelty.score import model_of
+from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
+from servotwin.redesign.dead_zones import HysteresisPolicy
+from servotwin.redesign.registry import certified_policy, policy_of
+from servotwin.runtime.retry import Retry
+from servotwin.twin.settings import TwinSettings
+
+PATIENCE = 1.0
+"""s that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
+WINDOW = 1.0  # s, section 4.2
+CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+MOST_SAMPLES = 1e8  # some 10 GB of signals
+
+_ROUNDING = 1.0 + 1e-9
+
+
+@settings("recording")
+@dataclass(frozen=True)
+class Recording:
+    """What the edge records and sends.
+
+    Parameters
+    ----------
+    probe : ProbeLimits, optional
+        Probing moves of the reference that the twin may request; None: none. In a file, [edge.probe].
+    novelty : NoveltyRules, optional
+        Rules of the windows that the edge finds worth sending; None: it sends every one. In a file, [novelty].
+    """
+
+    sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
+    window: Annotated[
+        float | None,
+        key("window_s", above=0.0, help="Length of a window; by the controller where absent."),
+    ] = None
+    pre_trigger: Annotated[
+        float | None,
+        key(
+            "pre_trigger_s",
+            minimum=0.0,
+            help="Part of a window before the change of the reference; where absent it follows from the controller.",
+        ),
+    ] = None
+    retry: Annotated[Retry, key(prefix="retry_", help="When an unacknowledged window is sent again.")] = field(
+        default_factory=Retry
+    )
+    limits: Annotated[Limits, key(help="Limits that an update must respect.")] = field(default_factory=Limits)
+    fine_angle: Annotated[
+        bool,
+        key(
+            help="Send theta_m with 32 bits. With 16 a window of two turns is resolved to 0.01 deg, which moves the "
+            "estimate of the gap by up to 0.02 deg (docs/decisions/0008-int16-planar-windows.md); the paper's do."
+        ),
+    ] = True
+    longest_window: Annotated[
+        float | None,
+        key("longest_window_s", above=0.0, help="Longest window that the twin may request; window_s where absent."),
+    ] = None
+    longest_pre_trigger: Annotated[
+        float | None,
+        key(
+            "longest_pre_trigger_s",
+            minimum=0.0,
+            help="Longest pre-trigger that it may request; pre_trigger_s where absent.",
+        ),
+    ] = None
+    probe: ProbeLimits | None = None
+    novelty: NoveltyRules | None = None
+
+
+class Guarding(NamedTuple):
+    """Supervision of the edge, limits of updates, and the middle of their box for gains."""
+
+    supervision: Supervision
+    limits: Limits
+    middle: Gains
+
+
+def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
+    """Supervision and limits for a policy that sends gains; None for one that sets the tolerance only.
+
+    A twin may be silent for as long as its settings are verified for.
+
+    Parameters
+    ----------
+    servo : Servo
+        With the controller that runs.
+    settings : TwinSettings
+    noise : float
+        m rms on the measured position.
+
+    Raises
+    ------
+    InvalidInput
+        No fallback set is verified for the whole stated range.
+    """
+    if settings.policy not in ("certified", "hysteresis"):
+        return None
+    policy = certified_policy(servo, settings)
+    verified = policy.fallback()
+    gains, band = gains_of(verified.setting.controller), band_of(verified, noise)
+    supervision = Supervision(FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon))
+    sent = policy_of(servo, settings)
+    return Guarding(
+        supervision, *(hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else certified_box(policy))
+    )
+
+
+def start_of(fallback: FallbackSet) -> Parameters:
+    """The fallback set from the first sample on; an update may replace it at once."""
+    return Parameters(setting=fallback.setting, fallback=True)
+
+
+def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
+    """Every candidate's gains and dead zone, and the middle between them."""
+    own, demands = policy.servo.controller, policy.demands_within_band()
+    scales = [setting.controller.Kp / own.Kp for setting in candidates_of(policy.servo, demands, 0.0, True, False)]
+    middle, factor = math.sqrt(min(scales) * max(scales)), math.sqrt(max(scales) / min(scales)) * _ROUNDING
+    leave = max((leave for _, leave in demands.hysteresis), default=1.0)
+    limits = Limits(
+        maximum=demands.tolerance,
+        gain_factor=factor,
+        integral_factor=max(demands.integral, default=0.0) * _ROUNDING,
+        feedforward=policy.feedforward_limit * _ROUNDING,
+        patience_s=PATIENCE,
+    )
+    return limits, Gains(own.Kp * middle, own.Ki, own.Kd * middle, own.Tf, 0.0, max(leave, own.leave) / factor)
+
+
+def hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
+    """The servo's own gains; a dead zone may be as wide as the twin finds the gap."""
+    own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
+    return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=PATIENCE), gains_of(own)
+
+
+@dataclass(frozen=True)
+class Commissioning:
+    """A servo, the law that runs on it and its twin: all that the settings of its edge follow from.
+
+    Parameters
+    ----------
+    servo : Servo
+        Its own controller's gains are the middle of the box for updates.
+    law : Controller
+        The controller that runs.
+    twin : TwinSettings
+    recording : Recording
+    supervision : Supervision, optional
+        None: made for the policy.
+    noise : float
+        m rms on the measured position.
+    """
+
+    servo: Servo
+    law: Controller
+    twin: TwinSettings
+    recording: Recording = field(default_factory=Recording)
+    supervision: Supervision | None = None
+    noise: float = 0.0
+
+    @cached_property
+    def guarding(self) -> Guarding | None:
+        """Supervision and limits where they are left to the policy; None: nothing.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is verified for the whole stated range.
+        """
+        if self.supervision is not None:
+            return None
+        return guarding(self.servo.replace(controller=self.law), self.twin, self.noise)
+
+    @property
+    def start(self) -> Parameters:
+        """Parameters before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
+        if self.twin.policy == "certified":
+            fallback = guarded.supervision.fallback if guarded is not None and own else None
+            return Parameters() if fallback is None else start_of(fallback)
+        return Parameters(setting=Setting(self.twin.initial_tolerance(self.servo)))
+
+    @property
+    def calm(self) -> bool:
+        """True for a loop with hardly any integral action, and so nothing that makes it hunt through the gap."""
+        return self.law.Ki == 0.0 or self.twin.policy == "certified"
+
+    @property
+    def window(self) -> float:
+        """Length of a window, s."""
+        given = self.recording.window
+        return given if given is not None else (CALM_WINDOW if self.calm else WINDOW)
+
+    @property
+    def pre_trigger(self) -> float:
+        """Part of a window before the change of the reference, s."""
+        given = self.recording.pre_trigger
+        fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
+        return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
+
+    def check_window(self) -> None:
+        """Refuse a window that does not fit into memory, or in which the estimator does not find enough.
+
+        Raises
+        ------
+        InvalidInput
+            With the length that is allowed.
+        """
+        rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
+        check_samples("window", self.recording.longest_window or self.window, rate)
+        needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
+        if self.window < needed * (1.0 - 1e-9):
+            raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")
+
+    def agent_settings(self, servo: str, boot: str) -> AgentSettings:
+        """Settings of the agent of a servo (by name) for one boot.
+
+        Raises
+        ------
+        InvalidInput
+            No fallback set is verified for the whole stated range.
+        """
+        agent = dataclasses.replace(self.recorder_settings(servo, boot), parameters=self.start)
+        own, guarded = gains_of(self.servo.controller), self.guarding
+        if guarded is not None:
+            open_limits = self.recording.limits == Limits()
+            return dataclasses.replace(
+                agent,
+                limits=guarded.limits if open_limits else self.recording.limits,
+                controller=self.law,
+                own=guarded.middle if open_limits else own,
+                supervision=guarded.supervision,
+            )
+        if self.supervision is not None:
+            return dataclasses.replace(agent, controller=self.law, own=own, supervision=self.supervision)
+        return agent
+
+    def recorder_settings(self, servo: str, boot: str) -> AgentSettings:
+        """The part of the agent's settings that is about windows."""
+        r = self.recording
+        return AgentSettings(
+            servo=servo,
+            boot=boot,
+            sample_rate=r.sample_rate,
+            window_s=self.window,
+            pre_trigger_s=self.pre_trigger,
+            fine_angle=r.fine_angle,
+            retry=r.retry,
+            limits=r.limits,
+            model_version=self.servo.version,
+            window_filter=self._novelty(),
+            longest_window_s=r.longest_window,
+            longest_pre_trigger_s=r.longest_pre_trigger,
+            probe=r.probe,
+        )
+
+    def _novelty(self) -> NoveltySettings | None:
+        rules = self.recording.novelty
+        if rules is None:
+            return None
+        return NoveltySettings(model_of(self.servo, self.recording.sample_rate), rules, self.twin.initial_gap)
+
+
+def check_samples(name: str, seconds: float, rate: float) -> None:
+    """Refuse a time whose samples do not fit into memory."""
+    if not seconds * rate <= MOST_SAMPLES:
+        count = f"has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} are allowed"
+        raise InvalidInput(f"{name} = {seconds!r} s: {count}")
