@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -22,8 +21,8 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     scenario : Path
         A scenario's TOML.
     output : Path
-        NAME.parquet (needs the extra `parquet`), NAME.npz or NAME.csv (12 significant digits, metadata in a first line
-        that begins with #).
+        NAME.parquet (needs the extra `parquet`), NAME.npz or NAME.csv (12 significant digits, metadata in the first row
+        of a last column).
     console : Console, optional
         Where progress is shown.
 
@@ -61,18 +60,6 @@ def convert(log: Path, output: Path) -> Path:
 def recording(loop: Loop, scenario_text: str) -> SignalTable:
     """Make the table of a co-simulation."""
     run, scenario = loop.run, loop.scenario
-    columns = {
-        "time_s": run.time,
-        "position_m": run.position,
-        "measured_position_m": run.measured_position,
-        "reference_m": run.reference,
-        "theta_m_rad": run.theta_m,
-        "theta_d_rad": run.theta_d,
-        "voltage_v": run.voltage,
-        "gap_rad": run.gap,
-        "tolerance_m": run.tolerance,
-        **{f"q{i + 1}_m": np.ascontiguousarray(run.q[:, i]) for i in range(scenario.servo.n)},
-    }
     metadata = {
         "servotwin": st.__version__,
         "name": scenario.name,
@@ -84,7 +71,7 @@ def recording(loop: Loop, scenario_text: str) -> SignalTable:
         "pre_trigger_s": scenario.commissioning.pre_trigger,
         "scenario": scenario_text,
     }
-    return SignalTable(columns, metadata)
+    return SignalTable(run.columns, metadata)
 
 
 def _read(path: Path) -> tuple[str, st.Scenario]:

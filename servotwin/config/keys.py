@@ -321,22 +321,6 @@ def documented(described: type) -> str:
     return f"{head.rstrip()}\n\n{section}\n" + (f"\nRaises\n------{tail}" if separator else "")
 
 
-def choice(what: str, word: object, choices: typing.Iterable[str]) -> str:
-    """A word that is one of those allowed.
-
-    Raises
-    ------
-    InvalidInput
-        With the closest of them.
-    """
-    words = tuple(choices)
-    if isinstance(word, str) and word in words:
-        return word
-    raise InvalidInput(
-        f"{what} = {word!r} does not exist{did_you_mean(str(word), words)}; give one of {', '.join(words)}"
-    )
-
-
 def _parameter(item: Item) -> list[str]:
     kind = getattr(item.type, "__name__", str(item.type)) if isinstance(item.type, type) else str(item.type)
     optional = ", optional" if item.optional else ""

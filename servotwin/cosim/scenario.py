@@ -134,7 +134,7 @@ class Scenario:
         ------
         InvalidInput
             The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
-            is unstable on the servo even without a gap, nothing is proved for the stated range.
+            is unstable on the servo even without a gap, nothing is verified for the stated range.
         """
         return cls.from_table(read_toml(path), Path(path).parent)
 

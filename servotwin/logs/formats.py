@@ -16,6 +16,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
 _ROWS = 20_000  # of a CSV file written at a time
+_METADATA = "metadata"  # name of the last column of a CSV file, whose first row holds them
 
 
 class LogColumns(NamedTuple):
@@ -62,7 +63,11 @@ class LogFormat(NamedTuple):
 
 
 def _read_csv(path: Path, wanted: Collection[str]) -> LogColumns:
-    """Read an optional first line of metadata (# and JSON), a line of names, then numbers."""
+    """Read a line of names, then numbers.
+
+    Metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is; in
+    files of the version before they stand in a first line that begins with #.
+    """
     try:
         with path.open(encoding="utf-8-sig") as file:
             line, skipped = file.readline(), 1
@@ -78,6 +83,9 @@ def _read_csv(path: Path, wanted: Collection[str]) -> LogColumns:
                     f"log {path}: line {skipped} must name the columns ({first}, ...); it is: {found:.80}"
                 )
             text = file.readlines()
+        if not metadata and text and names[-1] == _METADATA:
+            quoted = text[0].partition(',"')[2].rstrip().removesuffix('"')
+            metadata = _parsed(quoted.replace('""', '"'))
         values = np.loadtxt(text, delimiter=",", usecols=places, ndmin=2) if text else np.empty((0, len(places)))
     except UnicodeDecodeError as error:
         raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
@@ -91,10 +99,18 @@ def _read_csv(path: Path, wanted: Collection[str]) -> LogColumns:
 
 def _write_csv(table: SignalTable, path: Path) -> None:
     values = np.column_stack(list(table.columns.values()))
+    names, end = list(table.columns), "\n"
+    if table.metadata:
+        names, end = [*names, _METADATA], ",\n"
     with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(f"# {json.dumps(table.metadata)}\n{','.join(table.columns)}\n")
+        file.write(f"{','.join(names)}\n")
+        if table.metadata and len(values):
+            np.savetxt(file, values[:1], fmt="%.12g", delimiter=",", newline=",")
+            quoted = json.dumps(table.metadata).replace('"', '""')
+            file.write(f'"{quoted}"\n')
+            values = values[1:]
         for first in range(0, len(values), _ROWS):
-            np.savetxt(file, values[first : first + _ROWS], fmt="%.12g", delimiter=",")
+            np.savetxt(file, values[first : first + _ROWS], fmt="%.12g", delimiter=",", newline=end)
 
 
 def _read_npz(path: Path, wanted: Collection[str]) -> LogColumns:

@@ -42,7 +42,7 @@ def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path:
         ModelRegistry.loads(path.read_text(), "twin.toml", tmp_path)
     console = quiet()
     (table,) = certify(path, grid=COARSE, console=console)
-    assert "1 of 1 cells of gaps from 0 to 60 deg are proved" in console.file.getvalue()
+    assert "1 of 1 cells of gaps from 0 to 60 deg are verified" in console.file.getvalue()
     assert len(table.cells) == 1
     assert ModelRegistry.loads(path.read_text(), "twin.toml", tmp_path).models[0].settings.table == str(
         tmp_path / "one.table"
@@ -84,7 +84,7 @@ def test_a_policy_that_proves_nothing_is_named(tmp_path: Path) -> None:
     path.write_text(
         '[models.one]\nservo = "paper"\n[models.one.twin]\npolicy = "paper"\n[servos]\n"a" = "one"\n', encoding="utf-8"
     )
-    with pytest.raises(InvalidInput, match="model 'one': policy 'paper' proves nothing"):
+    with pytest.raises(InvalidInput, match="model 'one': policy 'paper' verifies nothing"):
         certify(path, out=tmp_path / "x.table", grid=COARSE, console=quiet())
 
 

@@ -1,6 +1,8 @@
 """`servotwin simulate`: the same numbers in every format, units in the names, metadata, nothing half written."""
 
+import csv
 import json
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from pyarrow import parquet
 import servotwin as st
 from servotwin.cli import simulate as record
 from servotwin.errors import InvalidInput
+from servotwin.logs.formats import FORMATS
+from servotwin.logs.log import check_output, read_log
 
 SCENARIO = """
 servo = "paper"
@@ -68,7 +72,8 @@ def test_parquet_holds_the_same(written):
 
 
 def test_csv_holds_twelve_digits(written, expected):
-    found = np.genfromtxt(written[".csv"], delimiter=",", names=True, skip_header=1)
+    columns = range(len(COLUMNS))
+    found = np.genfromtxt(written[".csv"], delimiter=",", names=True, usecols=columns)
     assert list(found.dtype.names) == COLUMNS
     assert found["theta_m_rad"] == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
 
@@ -80,7 +85,11 @@ def test_metadata_tells_what_was_run(written):
     assert metadata["scenario"] == SCENARIO
     assert metadata["servotwin"] == st.__version__
     assert metadata["model"] == st.Servo.preset("paper").version
-    assert json.loads(written[".csv"].read_text().splitlines()[0].removeprefix("# ")) == metadata
+    with written[".csv"].open(newline="") as file:
+        names, first, second = islice(csv.reader(file), 3)
+    assert names == [*COLUMNS, "metadata"]
+    assert json.loads(first[-1]) == metadata
+    assert second[-1] == ""
     assert parquet.read_schema(written[".parquet"]).metadata[b"scenario"].decode() == SCENARIO
 
 
@@ -89,13 +98,37 @@ def test_a_failing_writer_leaves_nothing(written, tmp_path, monkeypatch):
         path.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setitem(record._WRITERS, ".npz", fail)
+    monkeypatch.setitem(FORMATS, ".npz", FORMATS[".npz"]._replace(write=fail))
     with pytest.raises(InvalidInput, match=r"cannot be written \(disk full\)"):
         record.record(written[".npz"].parent / "scenario.toml", tmp_path / "run.npz")
     assert not list(tmp_path.iterdir())
 
 
 def test_parquet_without_pyarrow_is_refused_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(record.importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr("servotwin.logs.formats.importlib.util.find_spec", lambda _name: None)
     with pytest.raises(InvalidInput, match="servotwin\\[parquet\\]"):
-        record.writer(tmp_path / "run.parquet")
+        check_output(tmp_path / "run.parquet")
+
+
+def test_pandas_reads_the_csv_as_it_is(written, expected):
+    pandas = pytest.importorskip("pandas", reason="the extra pandas is not installed")
+    found = pandas.read_csv(written[".csv"])
+    assert list(found.columns) == [*COLUMNS, "metadata"]
+    assert found["time_s"].dtype == float
+    assert found["theta_m_rad"].to_numpy() == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
+    assert json.loads(found["metadata"][0])["seed"] == 7
+    table = expected.to_pandas()
+    assert np.array_equal(table["theta_m_rad"], expected.theta_m)
+
+
+def test_a_csv_of_the_version_before_is_read_the_same(written, tmp_path):
+    """Its metadata stood in a first line that began with #."""
+    with written[".csv"].open(newline="") as file:
+        names, first, *rows = csv.reader(file)
+    lines = [",".join(row[:-1]) for row in (names, first, *rows)]
+    old = tmp_path / "old.csv"
+    old.write_text("\n".join([f"# {first[-1]}", *lines]) + "\n")
+    before, now = read_log(old), read_log(written[".csv"])
+    assert before.metadata == now.metadata
+    assert before.metadata["seed"] == 7
+    assert np.array_equal(before.whole.position, now.whole.position)

@@ -61,9 +61,11 @@ def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple
             delayed(_performed)(function, task) for task in tasks
         )
     try:
-        yield from outcomes
+        # Not `yield from`: that would close `outcomes` before `finally` begins, and joblib warn of unfinished tasks.
+        for outcome in outcomes:  # noqa: UP028
+            yield outcome
     finally:
-        with warnings.catch_warnings(action="ignore"):  # joblib's, that not all was wanted
+        with warnings.catch_warnings(action="ignore"):  # joblib's, of unfinished tasks
             outcomes.close()
 
 

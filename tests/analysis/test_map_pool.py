@@ -1,0 +1,21 @@
+"""The pool of processes that computes a map."""
+
+import time
+import warnings
+
+from servotwin.analysis.maps.pool import shared, workplace
+
+
+def wait_and_return(task: int) -> int:
+    time.sleep(0.2)
+    return task
+
+
+def test_leaving_tasks_undone_warns_of_nothing():
+    """As Ctrl-C does: joblib's warning would stand before the message."""
+    with workplace(workers=2), warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        outcomes = shared(wait_and_return, range(20))
+        next(outcomes)
+        outcomes.close()
+    assert [str(one.message) for one in noted] == []
