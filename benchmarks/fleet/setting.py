@@ -20,7 +20,7 @@ from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, MessageKind, WorkResult
 from servotwin.store.store import Store, open_store
-from servotwin.twin.models import ModelRegistry, models_of
+from servotwin.twin.model_registry import ModelRegistry, models_of
 from servotwin.twin.state import TwinState
 
 STORE, TABLE = "fleet.db", "axis.table"

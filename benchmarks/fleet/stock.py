@@ -13,7 +13,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Update, WindowMessage, decode, encode
 from servotwin.plant.noise import Noise
 from servotwin.store.records import Lease, MessageKind, StoredMessage
-from servotwin.twin.models import ModelRegistry
+from servotwin.twin.model_registry import ModelRegistry
 from servotwin.twin.settings import TriageSettings
 from servotwin.twin.state import TwinState
 from servotwin.twin.work import work

@@ -19,7 +19,7 @@ from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.registry import certified_policy
-from servotwin.twin.models import models_of
+from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
 
 

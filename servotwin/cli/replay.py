@@ -14,7 +14,7 @@ from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
 from servotwin.messages.compression import decompress
 from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
-from servotwin.twin.models import ServoModel
+from servotwin.twin.model_registry import ServoModel
 from servotwin.twin.replay import ReplayResult, replay
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of

@@ -154,7 +154,7 @@ class Fallback(Struct, frozen=True, tag="fallback/2"):
         First sample under the fallback set.
     cause : Cause
     measured, allowed : float
-        What was seen and what was allowed: m, V or s, as the cause says; 0 where it is a drive's refusal.
+        The measured and the allowed value: m, V or s, as the cause says; 0 where it is a drive's refusal.
     replaced : int
         The version that was in force.
     parameter_version : int

@@ -83,7 +83,7 @@ class WindowSummary:
         s, on any steady clock.
     status : GapStatus
     long : bool
-        Whether it is of the length and pre-trigger that would be asked for, or was cut for a probing move.
+        True where it has the length and pre-trigger that would be requested, or was cut for a probing move.
     upper : float
         rad: the gap is at most this.
     slack : float
@@ -121,9 +121,9 @@ class ExcitationState:
         return ExcitationState(probed=self.probed)
 
     def answered(self, ask: Ask, outcome: RequestOutcome | None) -> ExcitationState:
-        """After the edge's last word on a request; None: it never said anything.
+        """State after the edge's last answer to a request; None: it never answered.
 
-        What it does not allow is not asked for again.
+        A request that the edge does not allow is not repeated.
         """
         refused = outcome in (RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE)
         stage = Stage.REFUSED if refused else Stage.TAKEN if outcome is RequestOutcome.TAKEN else Stage.OPEN
@@ -181,24 +181,24 @@ class ExcitationPolicy:
         return f"{several} too little of the gap{enough}{refused}"
 
     def _window(self, state: ExcitationState) -> Decision:
-        """Shorter windows than could be had: they count until longer ones are asked for, and not against those."""
+        """Request longer windows: shorter ones count until then, and not against the longer ones."""
         s = self.settings
         if state.window is not Stage.OPEN:
             return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
         if state.misses < s.after:
             return Decision(state, None, self._missed(state))
         why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
-        asked = replace(state, misses=0, window=Stage.ASKED)
-        return Decision(asked, LongerWindow(s.window, s.pre_trigger), why)
+        after = replace(state, misses=0, window=Stage.ASKED)
+        return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 
     def _probe(self, state: ExcitationState, window: WindowSummary) -> Decision:
         s, needed = self.settings, self.needed(window)
         why_not = self._why_not(state, window, needed)
         if why_not:
             return Decision(state, None, f"{self._missed(state)}, and {why_not}")
-        asked = replace(state, misses=0, probing=Stage.ASKED, probed=window.time)
+        after = replace(state, misses=0, probing=Stage.ASKED, probed=window.time)
         why = f"{self._missed(state)}: a move of {_mm(needed)} crosses a gap of {math.degrees(window.upper):.3g} deg"
-        return Decision(asked, Probe(needed, s.hold, s.strokes), why)
+        return Decision(after, Probe(needed, s.hold, s.strokes), why)
 
     def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
         """Reason against a probing move; empty where there is none."""

@@ -45,7 +45,7 @@ class Policy(Protocol):
     Attributes
     ----------
     needs_estimate : bool
-        Whether it is asked only where something may stand on the estimate.
+        True where it is consulted only if something may stand on the estimate.
     """
 
     @property
@@ -91,6 +91,6 @@ class PaperPolicy:
         """The tolerance for an estimate; smoothed only where there was a gap to tune for before."""
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
-        kept = self.smoothing if evidence.tuned_for is not None else 0.0
-        gap = (1.0 - kept) * evidence.estimate.gap + kept * (evidence.tuned_for or 0.0)
+        share = self.smoothing if evidence.tuned_for is not None else 0.0
+        gap = (1.0 - share) * evidence.estimate.gap + share * (evidence.tuned_for or 0.0)
         return Redesign(Setting(self.k_dz * self.servo.p * gap), gap, "")

@@ -1,6 +1,6 @@
 """Map of the dead zones for which the loop settles, behind the policy `margin`.
 
-Settling is not monotone in the tolerance; what is told is therefore the least tolerance from which on every wider one
+Settling is not monotone in the tolerance; the map therefore gives the least tolerance from which on every wider one
 settled too.
 """
 

@@ -13,7 +13,7 @@ from servotwin.messages import InvalidMessage, WindowMessage
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
 from servotwin.twin.evidence import StoredEstimate, plain
-from servotwin.twin.models import ServoModel
+from servotwin.twin.model_registry import ServoModel
 
 
 class ReplayResult(NamedTuple):

@@ -245,16 +245,16 @@ def _take_answer(model: TwinModel, state: TwinState, answer: Answer, now: float)
 
 def _wake(model: TwinModel, state: TwinState, now: float) -> StepResult:
     """The pending update and request once more when their answers are overdue; given up after some attempts."""
-    asked: tuple[Message, ...] = ()
+    repeated: tuple[Message, ...] = ()
     if model.requests is not None and state.requests is not None:
-        requests, asked = model.requests.wake(state.requests, now)
+        requests, repeated = model.requests.wake(state.requests, now)
         state = replace(state, requests=requests)
     pending = state.versions.pending
     if pending is None or now < state.attempts.sent_at + model.settings.retry:
-        return StepResult(state, asked)
+        return StepResult(state, repeated)
     if state.attempts.count >= model.settings.attempts:
-        return StepResult(replace(state, versions=state.versions.without_pending()), asked)
-    return StepResult(replace(state, attempts=state.attempts.another(now)), (pending, *asked))
+        return StepResult(replace(state, versions=state.versions.without_pending()), repeated)
+    return StepResult(replace(state, attempts=state.attempts.another(now)), (pending, *repeated))
 
 
 def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) -> StepResult:

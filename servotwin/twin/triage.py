@@ -72,9 +72,9 @@ class TriageState(Struct, frozen=True):
         """With a reason for which the next window is estimated, whatever it shows."""
         return replace(self, doubt=why, glances=0, vain=0)
 
-    def glanced(self, seen: Glance) -> TriageState:
+    def glanced(self, found: Glance) -> TriageState:
         """After a window of which a glance was enough."""
-        usual = self.misfit if math.isnan(seen.misfit) else max(_FADES * self.misfit, seen.misfit)
+        usual = self.misfit if math.isnan(found.misfit) else max(_FADES * self.misfit, found.misfit)
         return replace(self, misfit=usual, glances=self.glances + 1)
 
 
@@ -159,10 +159,10 @@ def glance(
         return _blind("the window has no theta_m, or too few samples: what to make of it, the estimator says")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _blind(state.doubt or "the motor's angle is constant")
-    seen = quick_fit(window, servo, state.gap, offset)
+    fit = quick_fit(window, servo, state.gap, offset)
     bias, bias_std = quick_bias(window, servo)
-    found = Glance(seen.gap, seen.std, seen.misfit, bias, bias_std, True, "")
-    why = due(message, state, settings) or _unclear(seen, settings) or _moved(found, state, settings)
+    found = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "")
+    why = due(message, state, settings) or _unclear(fit, settings) or _moved(found, state, settings)
     return replace(found, moved=bool(why), why=why or "nothing moved")
 
 
@@ -170,26 +170,26 @@ def _blind(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
-def _unclear(seen: QuickFit, settings: TriageSettings) -> str:
+def _unclear(fit: QuickFit, settings: TriageSettings) -> str:
     """Reason why a glance cannot decide whether the gap moved; empty: none."""
-    if not seen.settled:
+    if not fit.settled:
         return "the plain fit did not converge"
-    if not seen.std <= settings.widest:
-        return f"at a glance the window shows the gap to {math.degrees(seen.std):.3g} deg only"
+    if not fit.std <= settings.widest:
+        return f"at a glance the window shows the gap to {math.degrees(fit.std):.3g} deg only"
     return ""
 
 
-def _moved(seen: Glance, state: TriageState, settings: TriageSettings) -> str:
+def _moved(found: Glance, state: TriageState, settings: TriageSettings) -> str:
     """Change since the last estimate, in words; empty: none."""
-    off = abs(seen.gap - state.gap)
-    if not off <= allowed(math.hypot(seen.std, state.std), settings):
-        now, before = math.degrees(seen.gap), math.degrees(state.gap)
+    off = abs(found.gap - state.gap)
+    if not off <= allowed(math.hypot(found.std, state.std), settings):
+        now, before = math.degrees(found.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
-    if not seen.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
-        return f"{1e6 * seen.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
-    spread = settings.deviations * math.hypot(seen.bias_std, state.bias_std)
-    if abs(seen.bias - state.bias) > max(settings.bias, spread):
-        return f"the input bias moved: {seen.bias:.4g} V, {state.bias:.4g} V before"
+    if not found.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
+        return f"{1e6 * found.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
+    spread = settings.deviations * math.hypot(found.bias_std, state.bias_std)
+    if abs(found.bias - state.bias) > max(settings.bias, spread):
+        return f"the input bias moved: {found.bias:.4g} V, {state.bias:.4g} V before"
     return ""
 
 

@@ -19,7 +19,7 @@ from servotwin.twin.context import context_of
 from servotwin.twin.evidence import failure_row, rows
 from servotwin.twin.lookups import VerificationRequest, decode_request, encode_request
 from servotwin.twin.model import TwinModel
-from servotwin.twin.models import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.state import TwinState, encode_state
 from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 

@@ -20,7 +20,7 @@ from servotwin.store.group_commit import CommitLimits, GroupCommit
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin.models import ModelRegistry
+from servotwin.twin.model_registry import ModelRegistry
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota

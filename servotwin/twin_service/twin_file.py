@@ -7,7 +7,7 @@ from pathlib import Path
 
 from servotwin.config.table import read_inner, read_toml
 from servotwin.errors import InvalidInput
-from servotwin.twin.models import ModelRegistry
+from servotwin.twin.model_registry import ModelRegistry
 from servotwin.twin_service.config import ServiceConfig, read_service
 from servotwin.twin_service.worker import WorkerStart
 

@@ -101,7 +101,7 @@ def _attempt(work: Work, lease: Lease, now: float) -> LeaseResult:
 
 
 def _load_work(start: bytes) -> Work:
-    from servotwin.twin.models import ModelRegistry
+    from servotwin.twin.model_registry import ModelRegistry
     from servotwin.twin.work import work
 
     given = _decode_start(start)

@@ -14,7 +14,7 @@ from servotwin.cli.app import app
 from servotwin.cli.certify import certify, grid_of
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.lookup import Grid
-from servotwin.twin.models import ModelRegistry
+from servotwin.twin.model_registry import ModelRegistry
 
 COARSE = Grid(math.radians(60.0), (1e-2,), (0.0,))
 MODEL = """

@@ -91,7 +91,7 @@ def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, s
     assert list(applied) == sorted(applied)
     times = [made[version].data_time for version in applied]
     assert times == sorted(times)
-    assert [(s, made[v].tolerance) for v, s in applied.items()] == loop.machine.tolerances
+    assert [(s, made[v].setting.tolerance) for v, s in applied.items()] == loop.machine.tolerances
     assert all(sample / RATE < made[version].not_after for version, sample in applied.items())
     assert len(loop.store.windows) == len(loop.store.estimates)
     records = loop.loop(None)

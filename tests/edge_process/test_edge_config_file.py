@@ -1,5 +1,6 @@
 """edge.toml: what is written is read back bit for bit; what is wrong is refused by name."""
 
+import tomllib
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -143,3 +144,10 @@ def test_a_token_is_read_from_a_private_file_or_the_environment(tmp_path: Path) 
     assert token_of(TwinLink("https://h", token_env="T"), tmp_path, {"T": "other"}) == "other"
     with pytest.raises(InvalidInput, match="variable T: holds no token"):
         token_of(TwinLink("https://h", token_env="T"), tmp_path, {})
+
+
+def test_a_file_of_the_version_before_is_read_and_written_as_it_was() -> None:
+    folder = Path(__file__).parents[2] / "tests/data/version-0/edge"
+    text = (folder / "edge.toml").read_text(encoding="utf-8")
+    config = load(folder / "edge.toml")
+    assert tomllib.loads(edge_toml(config)) == tomllib.loads(text)

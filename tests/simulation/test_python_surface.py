@@ -134,3 +134,20 @@ def test_a_run_becomes_an_arrow_table(run):
     assert table.column_names[:3] == ["time_s", "position_m", "measured_position_m"]
     assert table.num_rows == run.samples
     assert np.array_equal(table["position_m"].to_numpy(), run.position)
+
+
+def test_tune_at_the_top_finds_what_was_asked_for(servo):
+    tuned = st.tune(servo, 10.0, math.radians(14.0))
+    first = max(tuned.margins.gain_crossovers, key=lambda crossover: -abs(crossover.omega - 10.0))
+    assert first.omega == pytest.approx(10.0)
+    assert math.degrees(first.phase_margin) == pytest.approx(14.0)
+    with pytest.raises(InvalidInput, match=r"did you mean math\.radians\(14\)\?"):
+        st.tune(servo, 10.0, 14.0)
+
+
+def test_a_stability_map_at_the_top_tells_which_dead_zones_settle(servo):
+    found = st.stability_map(servo, gap=(0.5 * TEN_DEGREES, TEN_DEGREES), k_dz=(0.0, 1.0), members=1, duration=60.0)
+    settled = found.grid("settled")[:, 0, :, 0]
+    assert settled.tolist() == [[0.0, 1.0], [0.0, 1.0]]
+    with pytest.raises(InvalidInput, match="either"):
+        st.stability_map(servo)

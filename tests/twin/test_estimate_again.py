@@ -25,7 +25,7 @@ from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differing, parts_of
 from servotwin.twin.evidence import plain
-from servotwin.twin.models import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.replay import replay
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.work import work

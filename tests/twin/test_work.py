@@ -25,7 +25,7 @@ from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResul
 from servotwin.twin import step as stepping
 from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.evidence import MAX_STATUS, plain
-from servotwin.twin.models import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.wear import TrendState
 from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work

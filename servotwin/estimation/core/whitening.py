@@ -74,6 +74,27 @@ def burg(series: Array, most: int) -> Autoregression:
     return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
 
 
+def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
+    """(2, n) equally likely series of the noise in a residual (n,), with what the fit may have taken put back.
+
+    A fit takes noise away with every parameter, and most where the gap shows, so that the residual looks quieter there
+    than the noise was. It is put back one standard deviation up and down along every direction of the parameters.
+
+    Parameters
+    ----------
+    left : (n,) array
+        Residual of the fit.
+    columns : (k, n) array
+        Rows that were fitted.
+    root : (d, k) array
+        `LeastSquares.root` of the whitened fit.
+    scale : float
+        Standard deviation of the whitened noise.
+    """
+    taken = scale * math.sqrt(len(root)) * (root @ columns)
+    return np.vstack([left + taken, left - taken])
+
+
 def _criterion(power: float, order: int, size: int) -> float:
     """AICc of a Gaussian autoregression; the power itself is one more parameter."""
     count = order + 1

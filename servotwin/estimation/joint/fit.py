@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import Decimation, decimation
 from servotwin.estimation.core.least_squares import least_squares, orthonormal, spread
-from servotwin.estimation.core.whitening import Autoregression, recursion
+from servotwin.estimation.core.whitening import Autoregression, recursion, with_noise_put_back
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, Reduce
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
@@ -172,14 +172,12 @@ def tolerance_of(model: JointModel) -> Array:
 _LEAST = 1e-300
 
 
-def noise_left(
+def estimate_noise(
     model: JointModel, found: FitPoint, reduce: Decimation, before: Autoregression, order: int, put: bool
 ) -> Autoregression:
-    """The noise in the residual of a fit that was made with a first idea of it.
+    """Estimate the noise from the residual of a fit that was made with a first idea of it.
 
-    A fit takes noise away with every parameter, and most where the gap shows, so that what is left looks quieter there
-    than the noise was. With `put`, what it may have taken is put back, as equally likely series: one standard deviation
-    up and down along every direction of the parameters.
+    With `put`, the noise that the fit may have taken away is put back.
     """
     table = _kept(model, model.table(dict(zip(model.names, found.point.tolist(), strict=True)), reduce.rows))
     rows = before.whiten(table)
@@ -191,8 +189,7 @@ def noise_left(
         return likeliest(left[None], table, order)
     rest = rows[0] - solved.coefficients @ rows[1:]
     scale = math.sqrt(float(rest @ rest) / max(1, rest.size - len(solved.root)))
-    taken = scale * math.sqrt(len(solved.root)) * (solved.root @ table[1:])
-    return likeliest(np.vstack([left + taken, left - taken]), table, order)
+    return likeliest(with_noise_put_back(left, table[1:], solved.root, scale), table, order)
 
 
 def likeliest(series: Array, table: Array, most: int) -> Autoregression:
@@ -290,7 +287,7 @@ def searched(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Win
     fit = _unwhitened(unsearched(model, prior, settings), settings)
     for number in range(settings.whitenings):
         put = number == settings.whitenings - 1
-        noise = noise_left(model, fit.best, fit.reduce, fit.noise, settings.noise_order, put)
+        noise = estimate_noise(model, fit.best, fit.reduce, fit.noise, settings.noise_order, put)
         fit = _descended(replace(fit, noise=noise), fit.known, fit.minima)
     return fit
 

@@ -22,7 +22,6 @@ from servotwin.estimation.whitened.gate import (
     judge,
     lower_bound,
     model_shift,
-    noise_left,
     observer_shift,
     one_sided,
     slow_share,
@@ -163,7 +162,7 @@ def _evidence(
 
 def _left(found: WhitenedFit) -> float:
     """m rms, what the fit leaves."""
-    return float(np.sqrt(np.mean(noise_left(found) ** 2)))
+    return float(np.sqrt(np.mean(found.left**2)))
 
 
 def _travel(found: WhitenedFit) -> Travel:

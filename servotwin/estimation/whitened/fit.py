@@ -15,7 +15,7 @@ import numpy as np
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares, spread
 from servotwin.estimation.core.response import response
-from servotwin.estimation.core.whitening import Autoregression, burg
+from servotwin.estimation.core.whitening import Autoregression, burg, with_noise_put_back
 from servotwin.estimation.estimate import Interval
 from servotwin.estimation.whitened.reduction import (
     CONSTANT,
@@ -72,6 +72,11 @@ class WhitenedFit:
     noise: Autoregression
     rows: Array
     evaluations: int
+
+    @property
+    def left(self) -> Array:
+        """(m,) m, residual of the reduced position."""
+        return residual(self.reduction.table(self.point), self.rows)
 
     @property
     def point(self) -> Point:
@@ -132,7 +137,7 @@ def refine(
     fit = off_the_plain(white, fit, largest, tolerance)
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
-        noise = noise_left(reduction, fit.point, noise, order, number >= _PLAIN)
+        noise = estimate_noise(reduction, fit.point, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, fit.point)
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
@@ -153,23 +158,26 @@ def _elsewhere(point: Point) -> list[Point]:
     return [point._replace(place=place) for place in _PLACES]
 
 
-def noise_left(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:
-    """The noise in the residual of a fit that was made with a first idea of it.
+def residual(table: Array, rows: Array) -> Array:
+    """(m,) m, residual of a fit off its nuisances, for the table and what `Reduction.prepared` makes of it."""
+    shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
+    return np.asarray(table[RESIDUAL] - shares @ table[CONSTANT:])
 
-    A fit takes noise away with every parameter, and most where the gap shows. What it may have taken is put back, as
-    as many equally likely series: one standard deviation up and down along every direction of the parameters.
+
+def estimate_noise(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:
+    """Estimate the noise from the residual of a fit that was made with a first idea of it.
+
+    With `put`, the noise that the fit may have taken away is put back.
     """
     table = reduction.table(point)
     rows = reduction.prepared(noise, table, CONSTANT)
-    shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
-    left = table[RESIDUAL] - shares @ table[CONSTANT:]
+    left = residual(table, rows)
     if not np.any(left):
         return Autoregression.white(1.0)
     if not put:
         return burg(left[None], order).at_least(reduction.rounding)
     root = least_squares(rows[GAP:], rows[RESIDUAL]).root
-    taken = math.sqrt(len(root)) * (root @ table[GAP:])
-    return burg(np.vstack([left + taken, left - taken]), order).at_least(reduction.rounding)
+    return burg(with_noise_put_back(left, table[GAP:], root), order).at_least(reduction.rounding)
 
 
 PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached

@@ -32,13 +32,6 @@ _SLOW_S = 0.06  # s: motions faster than this are averaged away, twice
 _CHANCE = 6.0  # times what white noise would leave when averaged; decimated, it leaves twice that
 
 
-def noise_left(found: WhitenedFit) -> Array:
-    """(m,) m, what the fit and its nuisances leave of the reduced position."""
-    table = found.reduction.table(found.point)
-    rows = found.reduction.prepared(found.noise, table, CONSTANT)
-    return np.asarray(table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:])
-
-
 def slow_share(found: WhitenedFit) -> float:
     """Slow part of what is left over the slow variation of the position, rms both; 0 where it can be noise.
 
@@ -46,7 +39,7 @@ def slow_share(found: WhitenedFit) -> float:
     """
     interval = found.reduction.response.interval * found.reduction.decimation.factor
     variation = float(np.std(slow(found.reduction.position, interval)))
-    left = noise_left(found)
+    left = found.left
     remains = _rms(slow(left, interval))
     if remains <= _CHANCE * averaged_noise(left, interval) and _rms(left) <= loudest(found):
         return 0.0

@@ -12,7 +12,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.twin.models import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
 
 TEXT = """

@@ -54,7 +54,7 @@ class ServoModel:
     settings : TwinSettings
     start : Setting or None
         What the edge runs before the first update, as far as it does not say so itself (`messages.Hello`). None: the
-        fallback set that is proved for the whole stated range, as the edge of a policy "certified" begins with; it is
+        fallback set certified for the whole stated range, as the edge of a policy "certified" begins with; it is
         made when a twin first needs it, which takes seconds.
     """
 

@@ -21,7 +21,7 @@ from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.lookups import VerificationRequest, decode_request
-from servotwin.twin.models import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
