@@ -39,7 +39,7 @@ class _Commands(TyperGroup):
                 raise
             _end(f"error: {missing_extra(str(error.name), f'servotwin {ctx.invoked_subcommand}')}", INVALID)
         except KeyboardInterrupt as interrupt:
-            _end(str(interrupt) or "interrupted; nothing half written was left behind", INTERRUPTED)
+            _end(str(interrupt) or "interrupted; no partly written file is left", INTERRUPTED)
 
 
 app = typer.Typer(
@@ -56,8 +56,8 @@ def _end(message: str, code: int) -> None:
     raise typer.Exit(code) from None
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         from importlib.metadata import version
 
         print(f"servotwin {version('servotwin')}")

@@ -25,12 +25,12 @@ from servotwin.twin_service.twin_file import service_of
 
 TIMEOUT_S = 30.0
 BEFORE_S = 60.0
-"""Events of no window are shown from this long before the first window, s."""
+"""Events that belong to no window are shown from so many s before the first window on."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Source of the evidence: the store of a twin's file, or, where there is a URL, a service.
+    """Source of the evidence: a service where there is a URL, otherwise the store that a twin's file names.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class ServoEvidence(NamedTuple):
     """A servo, its windows and the events of no window, as the API returns them."""
 
     servo: JsonObject
-    links: list[JsonObject]
+    traces: list[JsonObject]
     events: list[JsonObject]
 
 
@@ -66,22 +66,25 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     limit : int
         Windows at most.
     changes : bool
-        Leave out windows from which nothing followed.
+        Leave out windows that led to nothing but an estimate.
     json : bool
-        The links of the chain as JSON, as the API tells them.
+        Print the evidence chains as JSON, in the form of the API.
 
     Raises
     ------
     InvalidInput
         No window of the servo is stored, or the source cannot be read.
     """
-    story = _of_store(servo, source.config, limit) if source.url is None else _of_service(servo, source, limit)
-    if not story.links:
+    if source.url is None:
+        evidence = _read_store(servo, source.config, limit)
+    else:
+        evidence = _read_service(servo, source, limit)
+    if not evidence.traces:
         raise InvalidInput(f"servo {servo!r}: no window of it was ever stored")
     if json:
-        print(msgspec.json.format(msgspec.json.encode(story.links)).decode())
+        print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
         return
-    for line in lines_of(*story, changes=changes):
+    for line in lines_of(*evidence, changes=changes):
         print(line)
 
 
@@ -94,83 +97,83 @@ def servos(source: Source, json: bool) -> None:
         The source cannot be read.
     """
     if source.url is not None:
-        ask = _asking(source)
-        found = _pages(lambda after: ask(f"/v1/servos?limit={MAX_ROWS}&after={quote(after, safe='')}"))
+        get_json = _json_client(source)
+        rows = _all_pages(lambda after: get_json(f"/v1/servos?limit={MAX_ROWS}&after={quote(after, safe='')}"))
     else:
         store = open_existing_store(service_of(source.config))
         try:
-            found = _pages(lambda after: [each._asdict() for each in store.servos(after)])
+            rows = _all_pages(lambda after: [each._asdict() for each in store.servos(after)])
         finally:
             store.close()
     if json:
-        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        print(msgspec.json.format(msgspec.json.encode(rows)).decode())
         return
     print(SERVOS)
-    for each in found:
+    for each in rows:
         print(servo_line(each))
 
 
-def _pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
-    """All servos; a page holds those after a name."""
-    found: list[JsonObject] = []
-    while more := page(found[-1]["servo"] if found else ""):
-        found += more
-    return found
+def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
+    """All servos, page by page; `page` returns those after a name."""
+    rows: list[JsonObject] = []
+    while more := page(rows[-1]["servo"] if rows else ""):
+        rows += more
+    return rows
 
 
-def _of_store(servo: str, config: Path, limit: int) -> ServoEvidence:
+def _read_store(servo: str, config: Path, limit: int) -> ServoEvidence:
     store = open_existing_store(service_of(config))
     try:
-        links, found = store.audit(servo, limit=limit), store.servo(servo)
-        if found is None or not links:
+        traces, summary = store.audit(servo, limit=limit), store.servo(servo)
+        if summary is None or not traces:
             return ServoEvidence({}, [], [])
-        events = store.events(servo, _since(links[-1].window.received), MAX_ROWS)
+        events = store.events(servo, _since(traces[-1].window.received), MAX_ROWS)
         return ServoEvidence(
-            found._asdict(), [trace_as_json(link) for link in links], [evidence_as_json(each) for each in events]
+            summary._asdict(), [trace_as_json(trace) for trace in traces], [evidence_as_json(each) for each in events]
         )
     finally:
         store.close()
 
 
-def _of_service(servo: str, source: Source, limit: int) -> ServoEvidence:
-    ask, name = _asking(source), quote(servo, safe="")
-    links = ask(f"/v1/servos/{name}/audit?limit={limit}")
-    if not links:
+def _read_service(servo: str, source: Source, limit: int) -> ServoEvidence:
+    get_json, name = _json_client(source), quote(servo, safe="")
+    traces = get_json(f"/v1/servos/{name}/audit?limit={limit}")
+    if not traces:
         return ServoEvidence({}, [], [])
-    since = _since(links[-1]["window"]["received"])
+    since = _since(traces[-1]["window"]["received"])
     return ServoEvidence(
-        ask(f"/v1/servos/{name}"), links, ask(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
+        get_json(f"/v1/servos/{name}"), traces, get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
     )
 
 
 def _since(oldest: float) -> float:
-    """A start comes before its first window."""
+    """Time from which events are read: an edge starts before its first window."""
     return max(0.0, oldest - BEFORE_S)
 
 
-def _asking(source: Source) -> Callable[[str], Any]:
+def _json_client(source: Source) -> Callable[[str], Any]:
     """Function that requests JSON from the service; raises InvalidInput."""
     url, headers = str(source.url).rstrip("/"), {}
     if not _is_address(url):
-        raise InvalidInput(f"url {url!r}: give that of a twin, such as https://twin:8765")
+        raise InvalidInput(f"url {url!r}: give the URL of a twin, such as https://twin:8765")
     if source.token is not None and in_clear(url):
         raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
-    # What goes to this machine itself goes through no proxy: it would read the token.
-    way = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
-    opener = build_opener(_NoRedirect, way)
+    # A request in clear goes to this machine itself and must not pass a proxy, which could read the token.
+    handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
+    opener = build_opener(_NoRedirect, handler)
 
-    def ask(path: str) -> Any:
+    def get_json(path: str) -> Any:
         try:
-            with opener.open(Request(url + path, headers=headers), timeout=TIMEOUT_S) as answer:
-                return jsons.load(answer)
+            with opener.open(Request(url + path, headers=headers), timeout=TIMEOUT_S) as response:
+                return jsons.load(response)
         except HTTPError as error:
             raise InvalidInput(f"{url}: {_refusal(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
-            raise InvalidInput(f"{url}: cannot be asked ({getattr(error, 'reason', error)})") from None
+            raise InvalidInput(f"{url}: cannot be reached ({getattr(error, 'reason', error)})") from None
 
-    return ask
+    return get_json
 
 
 def _is_address(url: str) -> bool:
@@ -185,7 +188,7 @@ class _NoRedirect(HTTPRedirectHandler):
     """Follows no redirect: the token is for this service alone."""
 
     def redirect_request(self, *_args: Any) -> None:
-        """Follow none: a redirect is a refusal."""
+        """Refuse every redirect."""
 
 
 def _context(ca: Path | None) -> ssl.SSLContext:
@@ -196,9 +199,9 @@ def _context(ca: Path | None) -> ssl.SSLContext:
 
 
 def _refusal(error: HTTPError) -> str:
-    """Reason in a refusing response."""
+    """Reason in the body of an error response."""
     with error:
         try:
             return str(jsons.load(error)["detail"])
         except (ValueError, KeyError, TypeError):
-            return f"answers {error.code}"
+            return f"responds with status {error.code}"

@@ -1,4 +1,4 @@
-"""The evidence chain for people: a line per window in the order of time, and beside it what followed from it."""
+"""Evidence chain as text: a line per window in order of time, with what followed from it beside it."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap ± 95 %, deg':>15}  {'error,
 _OPEN = "a setting was found and waits to be sent"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
 JsonObject = Mapping[str, Any]
-"""A servo, a link of the evidence chain or a piece of evidence, as the API returns it."""
+"""A servo, the trace of a window or a piece of evidence, as the API returns it."""
 Entry = tuple[float, str, str]
 """Time (s since the epoch), boot (empty: of none), and the line."""
 
 
 def lines_of(
-    servo: JsonObject, links: Sequence[JsonObject], events: Iterable[JsonObject], changes: bool = False
+    servo: JsonObject, traces: Sequence[JsonObject], events: Iterable[JsonObject], changes: bool = False
 ) -> Iterator[str]:
     """All lines, oldest first.
 
     Parameters
     ----------
     servo : mapping
-        A `store.records` summary.
-    links : sequence of mappings
-        Of `store.links.Link`, newest first.
+        `store.records.ServoSummary` as the API returns it.
+    traces : sequence of mappings
+        `store.records.WindowTrace` as the API returns them, newest first.
     events : iterable of mappings
-        What belongs to no window.
+        Evidence that belongs to no window.
     changes : bool
-        Only windows from which something followed.
+        Only windows that led to more than an estimate.
     """
-    yield from _head(servo, links)
-    chosen = [link for link in links if not changes or _matters(link)]
-    entries = [entry for link in chosen for entry in _window(link)] + [_event(event) for event in events]
+    yield from _head(servo, traces)
+    chosen = [trace for trace in traces if not changes or _matters(trace)]
+    entries = [entry for trace in chosen for entry in _window(trace)] + [_event(event) for event in events]
     yield ""
     yield HEAD
     boot = ""
-    for _, of, line in sorted(entries, key=lambda entry: entry[0]):
-        if of not in ("", boot):
-            boot = of
+    for _, line_boot, line in sorted(entries, key=lambda entry: entry[0]):
+        if line_boot not in ("", boot):
+            boot = line_boot
             yield f"boot {boot}"
         yield line
 
@@ -56,10 +56,10 @@ def lines_of(
 def servo_line(servo: JsonObject) -> str:
     """One row of the table of servos."""
     version = "-" if servo["version"] is None else servo["version"]
-    heard = "never" if servo["heard"] is None else _time(servo["heard"])
+    received = "never" if servo["heard"] is None else _time(servo["heard"])
     receipt = servo["receipt"][:12] or "-"
     status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
-    return f"{servo['servo']:24}  {status}  {heard}"
+    return f"{servo['servo']:24}  {status}  {received}"
 
 
 def _status(servo: JsonObject) -> str:
@@ -67,23 +67,23 @@ def _status(servo: JsonObject) -> str:
     return "unchanged" if servo["status"] == _UNCHANGED else str(servo["status"])
 
 
-def _head(servo: JsonObject, links: Sequence[JsonObject]) -> Iterator[str]:
-    """The servo as it stands, and what its newest window with a trend says."""
+def _head(servo: JsonObject, traces: Sequence[JsonObject]) -> Iterator[str]:
+    """Summary of the servo, and its newest trend and disturbance."""
     gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
     receipt = f" ({servo['receipt']})" if servo["receipt"] else ""
-    heard = "" if servo["heard"] is None else f", last message {_time(servo['heard'])} UTC"
+    last = "" if servo["heard"] is None else f", last message {_time(servo['heard'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
-    yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{heard}"
-    newest = [line for line in (_wear(_of(links, "trend")), _disturbance(_of(links, "disturbance"))) if line]
+    yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
+    newest = [line for line in (_wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"))) if line]
     if newest:
         yield f"  {', '.join(newest)}"
 
 
-def _of(links: Sequence[JsonObject], kind: str) -> JsonObject:
+def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
     """Body of the newest evidence of a kind."""
-    found = (one["body"] for link in links for one in reversed(link["found"]) if one["kind"] == kind and one["body"])
-    return next(found, {})
+    evidence = (one for trace in traces for one in reversed(trace["found"]) if one["kind"] == kind)
+    return next((one["body"] for one in evidence if one["body"]), {})
 
 
 def _wear(trend: JsonObject) -> str:
@@ -94,52 +94,53 @@ def _wear(trend: JsonObject) -> str:
         return ""
 
 
-def _disturbance(found: JsonObject) -> str:
-    known = (("bias", "input bias {:.1f} mV", 1e3), ("noise", "noise {:.1f} um", 1e6))
-    given = ((text, scale, found.get(name)) for name, text, scale in known)
-    return ", ".join(text.format(x * scale) for text, scale, x in given if isinstance(x, float) and math.isfinite(x))
+def _disturbance(body: JsonObject) -> str:
+    fields = (("bias", "input bias {:.1f} mV", 1e3), ("noise", "noise {:.1f} um", 1e6))
+    values = ((text, scale, body.get(name)) for name, text, scale in fields)
+    return ", ".join(text.format(x * scale) for text, scale, x in values if isinstance(x, float) and math.isfinite(x))
 
 
-def _matters(link: JsonObject) -> bool:
+def _matters(trace: JsonObject) -> bool:
     """True where more followed from the window than an estimate."""
-    quiet = all(one["kind"] in _REMARKS for one in link["found"])
-    return bool(link["steps"]) or not quiet or any(_failed(one) for one in link["found"])
+    quiet = all(one["kind"] in _REMARKS for one in trace["found"])
+    return bool(trace["steps"]) or not quiet or any(_failed(one) for one in trace["found"])
 
 
-def _window(link: JsonObject) -> Iterator[Entry]:
-    window, seen = link["window"], _seen(link)
-    remarks = [*_remarks(link)] or [""]
-    of_version = "" if seen is None or seen["version"] is None else seen["version"]
-    values = f"{_gap(seen):>15}  {_error(seen):>9}  {of_version:>7}"
+def _window(trace: JsonObject) -> Iterator[Entry]:
+    window, estimate = trace["window"], _estimate(trace)
+    remarks = [*_remarks(trace)] or [""]
+    version = "" if estimate is None or estimate["version"] is None else estimate["version"]
+    values = f"{_gap(estimate):>15}  {_error(estimate):>9}  {version:>7}"
     line = f"{_time(window['received'])}  {window['sequence']:>6}  {values}  {remarks[0]}".rstrip()
     yield window["received"], window["boot"], line
     for remark in remarks[1:]:
         yield window["received"], window["boot"], f"{'':{len(HEAD) - len('what followed')}}{remark}"
 
 
-def _seen(link: JsonObject) -> JsonObject | None:
-    """The estimate, or the glance where there is none."""
-    found = [one for one in link["found"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
-    return found[-1] if found else None
+def _estimate(trace: JsonObject) -> JsonObject | None:
+    """The estimate of a window; the glance where there is none."""
+    estimates = [one for one in trace["found"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
+    return estimates[-1] if estimates else None
 
 
-def _remarks(link: JsonObject) -> Iterator[str]:
+def _remarks(trace: JsonObject) -> Iterator[str]:
     """Remarks on a window."""
-    window = link["window"]
+    window = trace["window"]
     if window["done"] is None:
         yield "waits to be processed"
-    later = {"glance": "estimate", "estimate": "redesign"}  # which says it all once more
-    said = {one["kind"] for one in link["found"] if one["status"]}
-    for one in link["found"]:
+    # Evidence of the second kind has a remark of its own, which repeats that on the first.
+    repeated_by = {"glance": "estimate", "estimate": "redesign"}
+    with_remark = {one["kind"] for one in trace["found"] if one["status"]}
+    for one in trace["found"]:
         if _failed(one):
             yield one["status"]
-        elif one["kind"] == "redesign" and not one["status"] and not link["steps"]:
+        elif one["kind"] == "redesign" and not one["status"] and not trace["steps"]:
             yield _OPEN
-        elif later.get(one["kind"]) not in said:
-            yield from _said(one)
-    for step in link["steps"]:
-        yield _sent(step["update"])
-        yield from (_received(answer) for answer in step["answers"] if answer["kind"] == "receipt")
+        elif repeated_by.get(one["kind"]) not in with_remark:
+            yield from _remark(one)
+    for step in trace["steps"]:
+        yield _sent_update(step["update"])
+        yield from (_receipt(answer) for answer in step["answers"] if answer["kind"] == "receipt")
         if step["effect"] is not None:
             yield _effect(step["effect"])
 
@@ -155,8 +156,8 @@ _REMARKS = {
 """Kinds of evidence of windows from which nothing else follows, and the remark on each."""
 
 
-def _said(one: JsonObject) -> Iterator[str]:
-    """Of a piece of evidence that is no update; nothing where it says nothing."""
+def _remark(one: JsonObject) -> Iterator[str]:
+    """Remark on a piece of evidence that is no update; none where it has no status."""
     kind, status, version = one["kind"], one["status"], one["version"]
     if kind in _REMARKS:
         if kind == "estimate" and status != "ok":
@@ -180,22 +181,22 @@ def _reasons(one: JsonObject) -> Sequence[str]:
         return ("no reason noted",)
 
 
-def _sent(update: JsonObject) -> str:
+def _sent_update(update: JsonObject) -> str:
     """Contents of an update, and its verification."""
     body = update["body"] or {}
     setting = body.get("setting") or {}
     tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
-    gains, proof = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
+    gains, verification = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
     parts = [] if tolerance is None else [f"dead zone {tolerance * 1e6:.4g} um" if tolerance else "no dead zone"]
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
-    if proof:
-        parts.append(f"verified on {proof['members']} simulated machines")
+    if verification:
+        parts.append(f"verified on {verification['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"
 
 
-def _received(receipt: JsonObject) -> str:
+def _receipt(receipt: JsonObject) -> str:
     body = receipt["body"] or {}
     if body.get("applied"):
         return f"version {receipt['version']} applied at sample {body.get('sample')}"
@@ -211,7 +212,7 @@ def _effect(effect: JsonObject) -> str:
 def _event(one: JsonObject) -> Entry:
     kind, body = one["kind"], one["body"] or {}
     if kind == "hello":
-        text = f"edge in touch: boot {one['status']}, version {one['version']} in force"
+        text = f"edge connected: boot {one['status']}, version {one['version']} in force"
     elif kind == "fallback":
         text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body)}"
     elif kind == "answer":
@@ -236,15 +237,15 @@ def _failed(one: JsonObject) -> bool:
     return str(one["status"]).startswith("failed: ")
 
 
-def _gap(found: JsonObject | None) -> str:
-    if found is None or found["gap"] is None:
+def _gap(estimate: JsonObject | None) -> str:
+    if estimate is None or estimate["gap"] is None:
         return ""
-    spread = "" if found["std"] is None else f" ± {NORMAL_95 * found['std'] * DEG:.3f}"
-    return f"{found['gap'] * DEG:.3f}{spread}"
+    spread = "" if estimate["std"] is None else f" ± {NORMAL_95 * estimate['std'] * DEG:.3f}"
+    return f"{estimate['gap'] * DEG:.3f}{spread}"
 
 
-def _error(found: JsonObject | None) -> str:
-    return "?" if found is None or found["tail"] is None else f"{found['tail'] * 1e6:.1f}"
+def _error(estimate: JsonObject | None) -> str:
+    return "?" if estimate is None or estimate["tail"] is None else f"{estimate['tail'] * 1e6:.1f}"
 
 
 def _time(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""`servotwin backup` and `servotwin restore`: the twin's store copied while it is written to, and put back."""
+"""`servotwin backup` and `servotwin restore`: copy the twin's store while the twin runs, and restore it."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.twin_service.twin_file import service_of
 
 
-def back_up(config: Path, to: Path) -> None:
+def backup_store(config: Path, to: Path) -> None:
     """Copy the store of a twin's file to a new file; raises InvalidInput as `store.backup.backup` does."""
-    with _shown("copying") as report:
+    with _progress("copying") as report:
         counts = backup(service_of(config).store, to, report)
-    _say(to, counts)
+    _print_counts(to, counts)
 
 
-def put_back(config: Path, backed_up: Path) -> None:
-    """Make a backup the store of a twin's file; raises InvalidInput as `store.backup.restore` does."""
+def restore_store(config: Path, backed_up: Path) -> None:
+    """Restore a backup to the store of a twin's file; raises InvalidInput as `store.backup.restore` does."""
     store = service_of(config).store
-    with _shown("putting back") as report:
+    with _progress("restoring") as report:
         counts = restore(backed_up, store, report)
-    _say(store, counts)
+    _print_counts(store, counts)
 
 
 @contextmanager
-def _shown(what: str) -> Iterator[Report]:
+def _progress(description: str) -> Iterator[Report]:
     with Progress(transient=True) as progress:
-        task = progress.add_task(what, total=None)
+        task = progress.add_task(description, total=None)
 
-        def report(left: int, whole: int) -> None:
-            progress.update(task, total=whole, completed=whole - left)
+        def report(left: int, total: int) -> None:
+            progress.update(task, total=total, completed=total - left)
 
         yield report
 
 
-def _say(where: Path | str, counts: RowCounts) -> None:
+def _print_counts(where: Path | str, counts: RowCounts) -> None:
     print(f"written: {where}: {counts.twins} servos, {counts.messages} messages, {counts.evidence} pieces of evidence")

@@ -39,15 +39,15 @@ def certify(
     grid: Grid | None = None,
     console: Console | None = None,
 ) -> tuple[CertifiedTable, ...]:
-    """Verify the tables that a twin's file or a scenario names, or go on with them.
+    """Verify the tables that a twin's file or a scenario names, or continue an interrupted verification.
 
     Parameters
     ----------
     file : Path
     model : str, optional
-        One of a twin's file; all that have a `table` without.
+        Only this model of a twin's file; None: all that have a key `table`.
     out : Path, optional
-        Instead of the file that `table` names; for one model.
+        File of the table of one model; None: the one that `table` names.
     grid : Grid, optional
     console : Console, optional
         Where progress and summary are shown.
@@ -58,10 +58,10 @@ def certify(
         There is nothing to verify, a file belongs to another model or grid or cannot be written, or there is no
         fallback set.
     KeyboardInterrupt
-        With a sentence on what is finished and how to go on.
+        Its message says how many cells are finished and how to continue.
     """
     console = console or Console()
-    return tuple(_verified(job, grid or Grid(), console) for job in _jobs(file, model, out))
+    return tuple(_verify(job, grid or Grid(), console) for job in _jobs(file, model, out))
 
 
 def grid_of(finest_deg: float, bias_mv: str, noise_um: str) -> Grid:
@@ -86,24 +86,24 @@ def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:
 def _jobs(file: Path, model: str | None, out: Path | None) -> list[TableJob]:
     """Tables that a file names."""
     table = read_toml(file)
-    known = _described(table, file)
+    known = _models(table, file)
     if model is not None and model not in known:
         raise InvalidInput(f"--model {model!r}: {file} has no such model{did_you_mean(model, known)}")
-    chosen = {name: what for name, what in known.items() if name == (model or name)}
+    chosen = {name: pair for name, pair in known.items() if name == (model or name)}
     if out is None:
-        chosen = {name: what for name, what in chosen.items() if what[1].table is not None}
+        chosen = {name: pair for name, pair in chosen.items() if pair[1].table is not None}
     if not chosen:
         raise InvalidInput(f'{file}: no model has a key table = "NAME{SUFFIX}" in [twin]: give it, or --out')
     if out is not None and len(chosen) > 1:
-        raise InvalidInput(f"--out {out}: {file} has {len(chosen)} models; say which with --model")
-    return [_one(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
+        raise InvalidInput(f"--out {out}: {file} has {len(chosen)} models; choose one with --model")
+    return [_table_job(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
 
 
-def _described(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
+def _models(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
     """Model and settings by name: of a twin's file, or of a scenario, whose table need not be there yet."""
     if "models" in table.values:
-        found = models_of(table, file.parent, checked=False)
-        return {model.name: (model.servo, model.settings) for model in found}
+        models = models_of(table, file.parent, checked=False)
+        return {model.name: (model.servo, model.settings) for model in models}
     twin = dict(table.values.get("twin") or {})  # type: ignore[call-overload]
     name = twin.pop("table", None)
     scenario = Scenario.from_table(Table(table.source, {**table.values, "twin": twin}), file.parent)
@@ -111,19 +111,26 @@ def _described(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 
-def _one(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> TableJob:
+def _table_job(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> TableJob:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
     return TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
 
 
-def _verified(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
-    """One table, under a progress bar."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+def _verify(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
+    """Verify one table, under a progress bar."""
     done = total = 0
     try:
         with (
-            Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress,
+            Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                console=console,
+                transient=True,
+            ) as progress,
             closing(build(job.path, job.policy, grid)) as steps,
         ):
             bar = progress.add_task(f"verifying {job.name}", total=None)
@@ -133,16 +140,16 @@ def _verified(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
         raise KeyboardInterrupt(
             f"interrupted: {done} of {total} cells are in {job.path}; the same command goes on from there"
         ) from None
-    found = load(job.path, job.policy)
-    console.print(_summary(job, found), soft_wrap=True, highlight=False)
-    return found
+    table = load(job.path, job.policy)
+    console.print(_summary(job, table), soft_wrap=True, highlight=False)
+    return table
 
 
-def _summary(job: TableJob, found: CertifiedTable) -> str:
-    shares = Counter(cell is not None for cell in found.cells.values())
-    settings = {cell.setting for cell in found.cells.values() if cell is not None}
-    low, high = (math.degrees(gap) for gap in found.stated)
+def _summary(job: TableJob, table: CertifiedTable) -> str:
+    shares = Counter(cell is not None for cell in table.cells.values())
+    settings = {cell.setting for cell in table.cells.values() if cell is not None}
+    low, high = (math.degrees(gap) for gap in table.stated)
     return (
-        f"written: {job.path}: {shares[True]} of {len(found.cells)} cells of gaps from {low:g} to {high:g} deg are"
+        f"written: {job.path}: {shares[True]} of {len(table.cells)} cells of gaps from {low:g} to {high:g} deg are"
         f" verified, with {len(settings)} different settings; in the others the twin sends the fallback set"
     )

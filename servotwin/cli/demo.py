@@ -76,12 +76,12 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
     console = console or Console()
     published, certified = scenarios(preset)
     files.make_directory(out)
-    found = compare(published, certified, console)
-    rows = demo_steps(found)
-    _tell(rows, console)
+    comparison = compare(published, certified, console)
+    rows = demo_steps(comparison)
+    _print_steps(rows, console)
     with style.look():
-        vector = style.save(plot(found), out, NAME)
-    path = files.write_text(out / "report.html", _report(found, rows, vector.read_bytes(), preset))
+        vector = style.save(plot(comparison), out, NAME)
+    path = files.write_text(out / "report.html", _report(comparison, rows, vector.read_bytes(), preset))
     console.print(f"report: {path}", soft_wrap=True, highlight=False)
     return path
 
@@ -103,33 +103,37 @@ def compare(published: st.Scenario, certified: st.Scenario, console: Console) ->
         ThreadPoolExecutor(len(jobs)) as pool,
     ):
 
-        def watched(name: str) -> Callable[[float], None]:
+        def progress_bar(name: str) -> Callable[[float], None]:
             bar = progress.add_task(
                 name, total=1.0, note="the first run ever compiles" if name == "certified twin" else ""
             )
             return lambda share: progress.update(bar, completed=share, note="")
 
-        bars = [watched(name) for name in jobs]
+        bars = [progress_bar(name) for name in jobs]
         runs = pool.map(lambda job, bar: run_twin(job, progress=bar), jobs.values(), bars)
         return Comparison(published.servo, *runs)
 
 
-def demo_steps(found: Comparison) -> list[DemoStep]:
+def demo_steps(comparison: Comparison) -> list[DemoStep]:
     """One row per step; the estimates are those from that step's window."""
-    steps = zip(found.alone.trace.steps, found.published.trace.steps, found.twinned.trace.steps, strict=True)
-    estimates = zip(found.published.estimates, found.twinned.estimates, strict=True)
+    steps = zip(
+        comparison.alone.trace.steps, comparison.published.trace.steps, comparison.twinned.trace.steps, strict=True
+    )
+    estimates = zip(comparison.published.estimates, comparison.twinned.estimates, strict=True)
     parts = enumerate(zip(steps, estimates, strict=True), start=1)
     return [DemoStep(i, *three, *two, abs(three[2].bias) + three[2].amplitude) for i, (three, two) in parts]
 
 
-def plot(found: Comparison) -> Figure:
+def plot(comparison: Comparison) -> Figure:
     """Position three times, gap and estimates."""
     figure, panels = wear_panels.sheet(4)
     names = ("position without a twin", "position, twin as published", "position, certified twin")
-    for axes, each, name in zip(panels, (found.alone, found.published, found.twinned), names, strict=False):
+    for axes, each, name in zip(
+        panels, (comparison.alone, comparison.published, comparison.twinned), names, strict=False
+    ):
         wear_panels.position(axes, each.trace, name)
-    wear_panels.true_gap(panels[-1], found.twinned.trace)
-    wear_panels.estimates(panels[-1], found.twinned)
+    wear_panels.true_gap(panels[-1], comparison.twinned.trace)
+    wear_panels.estimates(panels[-1], comparison.twinned)
     style.legend(panels[-1])
     return figure
 
@@ -149,26 +153,32 @@ SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled",
 
 def cells(row: DemoStep) -> tuple[str, ...]:
     """A verdict as texts, in the order of `HEADS`."""
-    swings = (f"{word(step)} {step.amplitude * MM:.3f}" for step in (row.alone, row.published, row.twinned))
+    swings = (f"{verdict(step)} {step.amplitude * MM:.3f}" for step in (row.alone, row.published, row.twinned))
     truth = f"{math.degrees(row.estimate.truth):.2f}"
     return str(row.number), truth, _estimate(row.estimate), *swings, f"{row.left * UM:.1f}"
 
 
 def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
     """An update as texts, in the order of `SENT`; gains in the servo's own."""
-    law, proof, own = update.setting.gains, update.verification, servo.controller
-    if law is None or proof is None:
+    new, verification, own = update.setting.gains, update.verification, servo.controller
+    if new is None or verification is None:
         return (f"{update.data_time:.0f}", *("-" for _ in SENT[1:]))
-    gains = f"x {law.Kp / own.Kp:.2f}", f"x {law.Ki / own.Ki:.2f}", f"{law.feedforward * MM:+.2f}"
-    worst = f"{proof.tail * UM:.1f}", f"{proof.Ms:.2f}"
-    return f"{update.data_time:.0f}", *gains, f"{proof.members} machines", f"{100.0 * proof.settled:.1f} %", *worst
+    gains = f"x {new.Kp / own.Kp:.2f}", f"x {new.Ki / own.Ki:.2f}", f"{new.feedforward * MM:+.2f}"
+    worst = f"{verification.tail * UM:.1f}", f"{verification.Ms:.2f}"
+    return (
+        f"{update.data_time:.0f}",
+        *gains,
+        f"{verification.members} machines",
+        f"{100.0 * verification.settled:.1f} %",
+        *worst,
+    )
 
 
 def _estimate(one: EstimateRecord) -> str:
     return f"{math.degrees(one.gap):.2f}" if one.ok else "refused"
 
 
-def word(step: MeasuredStep) -> str:
+def verdict(step: MeasuredStep) -> str:
     """Verdict on a step: it rests or it swings."""
     return "rests" if step.settled else "swings"
 
@@ -195,7 +205,7 @@ def definition() -> str:
     return f"A step settles, and rests, when its swing, half the peak-to-peak over the last {length}, is below {share}."
 
 
-def _tell(rows: Sequence[DemoStep], console: Console) -> None:
+def _print_steps(rows: Sequence[DemoStep], console: Console) -> None:
     table = Table(*(head.replace(", ", "\n") for head in HEADS), box=None, pad_edge=False)
     for row in rows:
         table.add_row(*(_colored(cell) for cell in cells(row)))
@@ -211,12 +221,12 @@ def _colored(cell: str) -> str:
     return cell
 
 
-def _report(found: Comparison, rows: Sequence[DemoStep], vector: bytes, preset: str) -> str:
+def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes, preset: str) -> str:
     caption = (
         f"Preset {preset}: a square wave of ±1 mm while the gap wears from 0 to 20 deg in 200 s, with a bias of "
         f"{BIAS * MM:g} mV on the motor's input. (a) The servo's own controller; (b) the paper's twin: after each step "
         "a dead zone as wide as the gap it estimates; (c) the certified twin: the loop begins on a setting that is "
-        "verified for every gap of the stated range, and gets settings verified for what the twin has learnt; (d) the "
+        "verified for every gap of the stated range, and gets settings verified for the twin's estimates; (d) the "
         "gap and the certified twin's estimates."
     )
     published = _accuracy([row.published_estimate for row in rows]).replace(
@@ -232,7 +242,7 @@ def _report(found: Comparison, rows: Sequence[DemoStep], vector: bytes, preset: 
             page.table((*HEADS, *MORE), [(*cells(row), _estimate(row.published_estimate)) for row in rows]),
             f"<p>Off by: largest error that remains at the end of the step. {escape(published)}</p>",
             "<h2>What the certified twin sent</h2>",
-            page.table(SENT, [sent(update, found.servo) for update in found.twinned.updates]),
+            page.table(SENT, [sent(update, comparison.servo) for update in comparison.twinned.updates]),
             "<p>Gains are relative to the servo's own. Each setting was verified on simulated machines within the "
             "uncertainty of model and estimate.</p>",
             "<p class='soft small'>Every figure and claim of the paper: <code>servotwin reproduce</code>.</p>",

@@ -74,9 +74,18 @@ def enroll(
     if operator is not None:
         made = enrolment.enroll_operator(twin, name, operator, again)
     else:
-        told = enrolment.drive_of(drive), url, again, noise_um * 1e-6, ca
-        wanted = name, edge or Path(name), role, sample_rate_hz, *told
-        made = enrolment.enroll(twin, enrolment.Enrolment(*wanted))
+        request = enrolment.Enrolment(
+            servo=name,
+            folder=edge or Path(name),
+            role=role,
+            sample_rate=sample_rate_hz,
+            drive=enrolment.drive_of(drive),
+            url=url,
+            again=again,
+            noise=noise_um * 1e-6,
+            ca=ca,
+        )
+        made = enrolment.enroll(twin, request)
     for path in made:
         print(f"written: {path}")
 
@@ -93,7 +102,7 @@ def revoke(
 
 def servos(
     config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),
-    url: Annotated[str | None, typer.Option(help="Ask a service instead: https://twin:8765.")] = None,
+    url: Annotated[str | None, typer.Option(help="Read from a service instead: https://twin:8765.")] = None,
     token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the service's is checked.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON array instead of lines.")] = False,
@@ -108,7 +117,7 @@ def servos(
 def audit(
     servo: Annotated[str, typer.Argument(help="The servo's name.")],
     config: Annotated[Path, typer.Option(help="The twin's file: its store is read.")] = Path("twin.toml"),
-    url: Annotated[str | None, typer.Option(help="Ask a service instead: https://twin:8765.")] = None,
+    url: Annotated[str | None, typer.Option(help="Read from a service instead: https://twin:8765.")] = None,
     token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the service's is checked.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of windows.")] = 20,
@@ -131,9 +140,9 @@ def replay(
     ] = False,
 ) -> None:
     """Repeat stored estimates and compare them bit for bit; exit code 1 if any differs."""
-    from servotwin.cli.replay import tell
+    from servotwin.cli.replay import print_replay
 
-    if not tell(servo, config, window, present):
+    if not print_replay(servo, config, window, present):
         raise typer.Exit(1)
 
 
@@ -142,9 +151,9 @@ def backup(
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
 ) -> None:
     """Copy the twin's SQLite store as of one moment, while the twin runs on."""
-    from servotwin.cli.backup import back_up
+    from servotwin.cli.backup import backup_store
 
-    back_up(config, to)
+    backup_store(config, to)
 
 
 def restore(
@@ -154,6 +163,6 @@ def restore(
     ),
 ) -> None:
     """Restore the twin's store from a backup."""
-    from servotwin.cli.backup import put_back
+    from servotwin.cli.backup import restore_store
 
-    put_back(config, backed_up)
+    restore_store(config, backed_up)

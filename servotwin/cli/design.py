@@ -20,9 +20,9 @@ def limit_cycle(
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """Compute the exact limit cycle, stable or not, beside the describing function's prediction."""
-    from servotwin.cli.limit_cycle import tell
+    from servotwin.cli.limit_cycle import print_limit_cycle
 
-    tell(servo, gap_deg, tolerance_mm, step_mm, enter, leave, json)
+    print_limit_cycle(servo, gap_deg, tolerance_mm, step_mm, enter, leave, json)
 
 
 def tune(
@@ -40,9 +40,20 @@ def tune(
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """Find gains for a crossover and a phase margin, and compare them with the present controller."""
-    from servotwin.cli.tune import TuneOptions, tell
+    from servotwin.cli.tune import TuneOptions, print_tuning
 
-    tell(TuneOptions(servo, kind, crossover, phase_margin_deg, ms_max, prefer, delay_ms, b, c), json)
+    options = TuneOptions(
+        servo=servo,
+        kind=kind,
+        crossover=crossover,
+        phase_margin_deg=phase_margin_deg,
+        Ms_max=ms_max,
+        prefer=prefer,
+        delay_ms=delay_ms,
+        b=b,
+        c=c,
+    )
+    print_tuning(options, json)
 
 
 def map_(
@@ -107,7 +118,7 @@ def certify(
     ] = "1,10,50",
     noise_um: Annotated[str, typer.Option(help="Noise for which settings are ranked, rms: VALUE,...")] = "0,10",
 ) -> None:
-    """Verify settings beforehand, for twins that look them up; an interrupted run goes on where it stopped."""
+    """Verify settings beforehand, for twins that look them up; an interrupted run continues where it stopped."""
     from servotwin.cli.certify import certify as run
     from servotwin.cli.certify import grid_of
 

@@ -30,7 +30,7 @@ _ROUNDING = 1e-6  # of a sample
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """Options of the command; times in s, angles in deg. None: as the log or the default says."""
+    """Options of the command; times in s, angles in deg. None: the value of the log, or the default."""
 
     log: Path
     servo: str | None = None
@@ -102,7 +102,7 @@ def cut(log: Log, options: IdentifyOptions) -> tuple[Window, ...]:
         return (_one(whole, options),)
     if whole.reference is None:
         raise InvalidInput(
-            f"{whole.where}without column 'reference_m' there is no telling the steps: give --start and --duration"
+            f"{whole.where}there is no column 'reference_m' to find the steps in: give --start and --duration"
         )
     length = _option("window", options.window, log.metadata.get("window_s"), WINDOW)
     before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
@@ -136,9 +136,9 @@ def _one(whole: Window, options: IdentifyOptions) -> Window:
     return whole.slice(start, duration)
 
 
-def _option(name: str, given: float | None, noted: Any, default: float) -> float:
+def _option(name: str, given: float | None, logged: Any, default: float) -> float:
     """Choose the given value, else the log's, else the default."""
-    value = given if given is not None else (noted if isinstance(noted, int | float) else default)
+    value = given if given is not None else (logged if isinstance(logged, int | float) else default)
     if not (math.isfinite(value) and value >= 0.0):
         raise InvalidInput(f"--{name} {value!r} s: must be a finite number of at least 0")
     return float(value)
@@ -149,7 +149,7 @@ def _servo(options: IdentifyOptions, log: Log) -> Servo:
         return Servo.resolve(options.servo)
     text = log.metadata.get("servo")
     if not isinstance(text, str):
-        raise InvalidInput(f"{log.whole.where}it does not say of which servo it is: give --servo, a preset or a TOML")
+        raise InvalidInput(f"{log.whole.where}the log does not describe its servo: give --servo, a preset or a TOML")
     return Servo.loads(text, f"log {options.log}, servo")
 
 
@@ -166,47 +166,44 @@ def _settings(options: IdentifyOptions) -> TwinSettings:
 
 def show(options: IdentifyOptions, as_json: bool) -> None:
     """Print tables, or one JSON object, on the standard output."""
-    found = identify(options)
+    identification = identify(options)
     if as_json:
-        print(json.dumps(as_dict(found, options), indent=2, allow_nan=False))
+        print(json.dumps(as_dict(identification, options), indent=2, allow_nan=False))
         return
     console = Console()
-    count = sum(estimate.ok for estimate in found.estimates)
+    count = sum(estimate.ok for estimate in identification.estimates)
     console.print(
-        f"{options.log}: {len(found.windows)} windows, {count} OK, model {found.servo.version}", highlight=False
+        f"{options.log}: {len(identification.windows)} windows, {count} OK, model {identification.servo.version}",
+        highlight=False,
     )
-    console.print(_table(found), highlight=False)
-    for line in _trend_lines(found, options):
+    console.print(_table(identification), highlight=False)
+    for line in _trend_lines(identification, options):
         console.print(line, highlight=False)
 
 
-def _table(found: Identification) -> Table:
-    heads = ("window, s", "gap, deg", "std, deg", "95 % interval, deg", "status")
-    table = Table(*heads, box=None, pad_edge=False)
-    for window, estimate in zip(found.windows, found.estimates, strict=True):
-        low, high = map(math.degrees, estimate.interval)
-        known = (
-            f"{math.degrees(estimate.gap):.3f}",
-            f"{math.degrees(estimate.std_total):.3f}",
-            f"{low:.3f} .. {high:.3f}",
-        )
+def _table(identification: Identification) -> Table:
+    table = Table("window, s", "gap, deg", "std, deg", "95 % interval, deg", "status", box=None, pad_edge=False)
+    for window, estimate in zip(identification.windows, identification.estimates, strict=True):
         end = window.start + window.duration
-        shown = known if estimate.ok else _unsure(estimate)
         color = "green" if estimate.ok else "yellow"
-        table.add_row(f"{window.start:.2f} .. {end:.2f}", *shown, f"[{color}]{estimate.status.value}[/]")
+        table.add_row(f"{window.start:.2f} .. {end:.2f}", *_cells(estimate), f"[{color}]{estimate.status.value}[/]")
         for reason in estimate.reasons:
             table.add_row("", "", "", "", f"[dim]{reason}[/]")
     return table
 
 
-def _unsure(estimate: GapEstimate) -> tuple[str, str, str]:
-    """Format a bound where there is one; the prior is no result of the window."""
+def _cells(estimate: GapEstimate) -> tuple[str, str, str]:
+    """Gap, standard deviation and interval, or a bound; without either the prior is not shown as a result."""
+    if estimate.ok:
+        low, high = map(math.degrees, estimate.interval)
+        gap, std = math.degrees(estimate.gap), math.degrees(estimate.std_total)
+        return f"{gap:.3f}", f"{std:.3f}", f"{low:.3f} .. {high:.3f}"
     bounded = estimate.status is GapStatus.LOWER_BOUND
     return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-", "-")
 
 
-def _trend_lines(found: Identification, options: IdentifyOptions) -> list[str]:
-    trend = found.trend
+def _trend_lines(identification: Identification, options: IdentifyOptions) -> list[str]:
+    trend = identification.trend
     if trend is None:
         return ["no window shows the gap, so there is no trend"]
     low, high = map(math.degrees, trend.gap_interval)
@@ -214,22 +211,24 @@ def _trend_lines(found: Identification, options: IdentifyOptions) -> list[str]:
     lines = [f"gap at {trend.time:.2f} s: {math.degrees(trend.gap):.3f} deg (95 %: {low:.3f} .. {high:.3f})"]
     if trend.updates > 1:
         lines.append(f"wear: {math.degrees(trend.rate):.3g} deg/s (95 %: {slow:.3g} .. {fast:.3g})")
-    if found.until_limit is not None:
-        early, late = found.until_limit.interval
+    if identification.until_limit is not None:
+        early, late = identification.until_limit.interval
         median = (
-            f"median {found.until_limit.median:.4g} s" if math.isfinite(found.until_limit.median) else "perhaps never"
+            f"median {identification.until_limit.median:.4g} s"
+            if math.isfinite(identification.until_limit.median)
+            else "perhaps never"
         )
         lines.append(f"{options.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
     return lines
 
 
-def as_dict(found: Identification, options: IdentifyOptions) -> dict[str, Any]:
+def as_dict(identification: Identification, options: IdentifyOptions) -> dict[str, Any]:
     """Make the JSON object: angles in deg, times in s, null where there is no number."""
-    trend, until = found.trend, found.until_limit
-    pairs = zip(found.windows, found.estimates, strict=True)
+    trend, until = identification.trend, identification.until_limit
+    pairs = zip(identification.windows, identification.estimates, strict=True)
     return {
         "log": str(options.log),
-        "model": found.servo.version,
+        "model": identification.servo.version,
         "method": options.method,
         "windows": [_row(window, estimate) for window, estimate in pairs],
         "trend": None if trend is None else _finite(_trend(trend)),

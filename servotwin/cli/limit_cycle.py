@@ -1,4 +1,4 @@
-"""`servotwin limit-cycle`: the exact orbit, its multipliers and the describing function's prediction, told."""
+"""`servotwin limit-cycle`: the exact orbit, its multipliers and the describing function's prediction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 
 _MM = 1e3
-# Orbits whose frequencies agree to this part are one.
+# Orbits whose frequencies differ by a smaller share are the same orbit.
 _SAME = 1e-6
 
 
@@ -32,7 +32,7 @@ class Findings:
     predictions : tuple of (Prediction, CycleResult)
         Each prediction, and the exact orbit that it leads to.
     no_prediction : str
-        Why the describing function says nothing; empty otherwise.
+        Reason why the describing function predicts nothing; empty where it does.
     """
 
     result: CycleResult
@@ -41,20 +41,20 @@ class Findings:
 
 
 def findings(servo: Servo, gap: float, tolerance: float | None, step: float) -> Findings:
-    """Everything known about the limit cycles of a servo with a gap (rad), a tolerance (m) and after a step (m)."""
+    """Compute the limit cycles and predictions of a servo with a gap (rad), a tolerance (m) and after a step (m)."""
     result = limit_cycle(servo, gap, tolerance, step=step)
     if tolerance:
         return Findings(result, (), "a dead zone is a second nonlinearity, which the describing function leaves out")
     if gap == 0.0:
         return Findings(result, (), "there is no gap")
     try:
-        found = predictions(servo, gap)
+        predicted = predictions(servo, gap)
     except InvalidInput as error:
         return Findings(result, (), str(error))
-    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in found), "")
+    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in predicted), "")
 
 
-def tell(
+def print_limit_cycle(
     name: str,
     gap_deg: float,
     tolerance_mm: float | None,
@@ -63,8 +63,9 @@ def tell(
     leave: float | None,
     as_json: bool,
 ) -> None:
-    """The command: a table, or one JSON object, on the standard output."""
+    """Print a table, or one JSON object, on the standard output."""
     servo = Servo.resolve(name)
+    # The exact orbit is that of the continuous-time loop.
     servo = servo.replace(sample_rate=None)
     servo = servo if enter is None else servo.replace(enter=enter)
     servo = servo if leave is None else servo.replace(leave=leave)
@@ -81,7 +82,7 @@ def tell(
 
 
 def as_dict(found: Findings) -> dict[str, Any]:
-    """The findings as plain numbers; units in the keys."""
+    """Make the JSON object: plain numbers, with units in the keys."""
     return {
         "status": found.result.status.value,
         "reason": found.result.reason,
@@ -131,8 +132,13 @@ def _print(console: Console, found: Findings) -> None:
     if orbit is not None:
         table.add_row("exact, after the step", *_cells(orbit))
     for one, near in found.predictions:
-        numbers = (f"{one.frequency:.4f}", f"{one.amplitude * _MM:.4f}", f"{math.degrees(one.motor_amplitude):.2f}")
-        table.add_row("describing function", *numbers, _stability(one.stable))
+        table.add_row(
+            "describing function",
+            f"{one.frequency:.4f}",
+            f"{one.amplitude * _MM:.4f}",
+            f"{math.degrees(one.motor_amplitude):.2f}",
+            _stability(one.stable),
+        )
         if near.orbit is not None and (orbit is None or abs(near.orbit.frequency / orbit.frequency - 1.0) > _SAME):
             table.add_row("exact, near that", *_cells(near.orbit))
     if table.rows:

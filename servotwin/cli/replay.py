@@ -1,4 +1,4 @@
-"""`servotwin replay`: a servo's stored estimates made again from what the store holds, and compared bit for bit."""
+"""`servotwin replay`: repeat a servo's stored estimates from the store alone, and compare them bit for bit."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from servotwin.twin_service.twin_file import read_twin, service_of
 DEG = 180.0 / math.pi
 PAGE = 100
 SAME, OTHER = "the same, bit for bit", "NOT the same"
-UNREADABLE = "NOT made again, as what is stored is not understood"
-EMPTIED = "not made again, as retention took the window"
-GLANCED = "not estimated, as a glance was enough"
-FAILED = "not estimated, as nothing could be made of the window"
-WAITING = "not yet worked on"
+UNREADABLE = "NOT repeated: the stored data cannot be decoded"
+EMPTIED = "not repeated: retention deleted the window's body"
+GLANCED = "not estimated: screening was enough"
+FAILED = "not estimated: the window could not be processed"
+WAITING = "not yet processed"
 BAD = (OTHER, UNREADABLE)
 
 
-class Again(NamedTuple):
+class ReplayedWindow(NamedTuple):
     """Result of estimating one window again.
 
     Attributes
@@ -38,21 +38,21 @@ class Again(NamedTuple):
     window : str
         "boot/sequence".
     result : str
-        SAME, OTHER, or why there was nothing to compare.
-    said : str
-        In words, where it is one of BAD.
+        SAME, OTHER, or the reason why nothing was compared.
+    detail : str
+        Sentence on a result that is one of BAD; empty otherwise.
     differs : tuple of str
-        What is not as it was then: versions, sources, processor, model, settings; each with both values.
+        Differences from the time of the estimate: versions, sources, processor, model, settings; each with both values.
     """
 
     window: str
     result: str
-    said: str = ""
+    detail: str = ""
     differs: tuple[str, ...] = ()
 
 
-def tell(servo: str, config: Path, window: str | None, present: bool) -> bool:
-    """Make the estimates of a servo's windows again and print what came of it; whether all are the same.
+def print_replay(servo: str, config: Path, window: str | None, present: bool) -> bool:
+    """Repeat the estimates of a servo's windows and print the comparison; returns True where none differs.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def tell(servo: str, config: Path, window: str | None, present: bool) -> bool:
     window : str, optional
         "boot/sequence": only this one.
     present : bool
-        With model and settings as the twin's file has them now, not as they were then.
+        Use the model and settings of the twin's present file, not the stored ones.
 
     Raises
     ------
@@ -73,61 +73,65 @@ def tell(servo: str, config: Path, window: str | None, present: bool) -> bool:
     counts, differing = Counter[str](), Counter[str]()
     store = open_existing_store(service_of(config))
     try:
-        for again in replayed(store, servo, model, only):
-            counts[again.result] += 1
-            differing.update(again.differs)
-            if again.said:
-                print(f"window {again.window}: {again.said}")
+        for replayed in _replay_windows(store, servo, model, only):
+            counts[replayed.result] += 1
+            differing.update(replayed.differs)
+            if replayed.detail:
+                print(f"window {replayed.window}: {replayed.detail}")
     finally:
         store.close()
     if not counts:
         raise InvalidInput(f"servo {servo!r}: no window{'' if window is None else f' {window}'} of it was ever stored")
-    print(summary(servo, counts, differing))
+    print(_summary(servo, counts, differing))
     return not any(counts[bad] for bad in BAD)
 
 
-def replayed(store: Store, servo: str, model: ServoModel | None, only: tuple[str, int] | None) -> Iterator[Again]:
-    """Each window of a servo, newest first."""
+def _replay_windows(
+    store: Store, servo: str, model: ServoModel | None, only: tuple[str, int] | None
+) -> Iterator[ReplayedWindow]:
+    """Replay the windows of a servo, newest first."""
     before = None
-    while links := store.audit(servo, limit=PAGE, window=only, before=before):
-        contexts = store.contexts({found.context for link in links for found in link.found if found.context})
-        for link in links:
-            yield _again(store, link, contexts, model)
-        before = links[-1].window.id
+    while traces := store.audit(servo, limit=PAGE, window=only, before=before):
+        contexts = store.contexts({record.context for trace in traces for record in trace.found if record.context})
+        for trace in traces:
+            yield _replay_window(store, trace, contexts, model)
+        before = traces[-1].window.id
 
 
-def summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
-    """Counts by result, and what differs since."""
+def _summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
+    """Text with the counts by result, and the differences from the time of the estimates."""
     lines = [f"servo {servo}: {_windows(sum(counts.values()))}"]
     lines += [f"  {number:6d} {result}" for result, number in counts.most_common()]
-    lines += [f"  otherwise since {_windows(number)}: {part}" for part, number in sorted(differing.items())]
+    lines += [f"  changed since {_windows(number)}: {part}" for part, number in sorted(differing.items())]
     return "\n".join(lines)
 
 
-def _again(store: Store, link: WindowTrace, contexts: dict[str, str], model: ServoModel | None) -> Again:
-    held = link.window
-    name = f"{held.boot}/{held.sequence}"
-    found = next((one for one in reversed(link.found) if one.kind == "estimate"), None)
-    if found is None:
-        return Again(name, WAITING if held.done is None else GLANCED)
-    if found.status.startswith("failed"):
-        return Again(name, FAILED)
-    kept = store.window(held.servo, held.boot, held.sequence)
-    if kept is None or not kept.body:
-        return Again(name, EMPTIED)
+def _replay_window(
+    store: Store, trace: WindowTrace, contexts: dict[str, str], model: ServoModel | None
+) -> ReplayedWindow:
+    window = trace.window
+    name = f"{window.boot}/{window.sequence}"
+    estimate = next((one for one in reversed(trace.found) if one.kind == "estimate"), None)
+    if estimate is None:
+        return ReplayedWindow(name, WAITING if window.done is None else GLANCED)
+    if estimate.status.startswith("failed"):
+        return ReplayedWindow(name, FAILED)
+    message = store.window(window.servo, window.boot, window.sequence)
+    if message is None or not message.body:
+        return ReplayedWindow(name, EMPTIED)
     try:
-        window = decompress(kept.body, kept.encoding, MAX_BYTES)
-        return _compared(name, found, replay(window, found.body, contexts.get(found.context, ""), model))
+        data = decompress(message.body, message.encoding, MAX_BYTES)
+        return _compare(name, estimate, replay(data, estimate.body, contexts.get(estimate.context, ""), model))
     except (InvalidInput, InvalidMessage) as error:
-        return Again(name, UNREADABLE, str(error))
+        return ReplayedWindow(name, UNREADABLE, str(error))
 
 
-def _compared(name: str, found: StoredEvidence, again: ReplayResult) -> Again:
+def _compare(name: str, stored: StoredEvidence, again: ReplayResult) -> ReplayedWindow:
     if again.same:
-        return Again(name, SAME, "", again.differs)
-    gaps = f"gap {_degrees(found.gap)} deg then, {_degrees(again.estimate.gap)} deg now"
-    why = "" if again.differs else "; no version, model or setting that was noted explains it"
-    return Again(name, OTHER, f"{gaps}; changed: {', '.join(again.changed)}{why}", again.differs)
+        return ReplayedWindow(name, SAME, "", again.differs)
+    gaps = f"gap {_degrees(stored.gap)} deg then, {_degrees(again.estimate.gap)} deg now"
+    why = "" if again.differs else "; no recorded version, model or setting explains it"
+    return ReplayedWindow(name, OTHER, f"{gaps}; changed: {', '.join(again.changed)}{why}", again.differs)
 
 
 def _degrees(gap: float | None) -> str:

@@ -1,4 +1,4 @@
-"""`servotwin simulate` and `convert`: a table of signals, of one scenario that is run or of a log in another format."""
+"""`servotwin simulate` and `convert`: write the signals of a simulated scenario, or a log in another format."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     """
     check_output(output)
     text, described = _read(scenario)
-    found = recording(_run(described, console or Console()), text)
-    write_log(found, output)
-    (console or Console()).print(f"{_rows(found)} samples: {output}", soft_wrap=True, highlight=False)
+    table = recording(_run(described, console or Console()), text)
+    write_log(table, output)
+    (console or Console()).print(f"{len(table.columns['time_s'])} samples: {output}", soft_wrap=True, highlight=False)
     return output
 
 
 def convert(log: Path, output: Path) -> Path:
-    """Write a log in another format, with the channels that windows are made of: a gateway replays .csv only.
+    """Write a log in another format, with the channels that windows are made of; the drive "replay" reads .csv only.
 
     Raises
     ------
@@ -81,11 +81,7 @@ def _read(path: Path) -> tuple[str, st.Scenario]:
 
 def _run(scenario: st.Scenario, console: Console) -> Loop:
     """Co-simulate under a progress bar."""
-    columns = (TextColumn("simulating"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    percent = TextColumn("{task.percentage:3.0f} %")
+    with Progress(TextColumn("simulating"), BarColumn(), percent, TimeElapsedColumn(), console=console) as progress:
         bar = progress.add_task("", total=1.0)
         return st.cosimulate(scenario, lambda share: progress.update(bar, completed=share))
-
-
-def _rows(found: SignalTable) -> int:
-    return len(found.columns["time_s"])

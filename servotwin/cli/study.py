@@ -50,7 +50,7 @@ def convert(
     log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
     output: Annotated[Path, typer.Argument(help="run.csv, which an edge can replay, run.npz or run.parquet.")],
 ) -> None:
-    """A recorded log in another format."""
+    """Convert a recorded log to another format."""
     from servotwin.cli.simulate import convert as run
 
     run(log, output)
@@ -61,25 +61,40 @@ def identify(
     servo: Annotated[
         str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
     ] = None,
-    start: Annotated[float | None, typer.Option(help="One window from here on, s; not one per step.")] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Start of a single window, s, instead of a window at each step.")
+    ] = None,
     duration: Annotated[
-        float | None, typer.Option(help="Length of that window, s; to the log's end by default.")
+        float | None, typer.Option(help="Length of that window, s; to the end of the log by default.")
     ] = None,
     window: Annotated[
         float | None, typer.Option(help="Length of the windows at the steps, s; the log's, or 1.")
     ] = None,
-    pre_trigger: Annotated[float | None, typer.Option(help="How much of it lies before the step, s.")] = None,
+    pre_trigger: Annotated[float | None, typer.Option(help="Part of a window before the step, s.")] = None,
     method: Annotated[str, typer.Option(help="whitened or paper.")] = "whitened",
-    wear_deg: Annotated[float | None, typer.Option(help="The gap grows by about so much ...")] = None,
-    wear_over_s: Annotated[float | None, typer.Option(help="... in so long; 0.2 deg/s by default.")] = None,
-    gap_limit_deg: Annotated[float | None, typer.Option(help="Tell how long until the gap is that large.")] = None,
+    wear_deg: Annotated[
+        float | None, typer.Option(help="Typical growth of the gap, deg, in the time of --wear-over-s.")
+    ] = None,
+    wear_over_s: Annotated[float | None, typer.Option(help="Time of that growth, s; 0.2 deg/s by default.")] = None,
+    gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
-    """The gap and its trend from a recorded log."""
+    """Estimate the gap and its trend from a recorded log."""
     from servotwin.cli.identify import IdentifyOptions, show
 
-    cut = (start, duration, window, pre_trigger)
-    show(IdentifyOptions(log, servo, *cut, method, wear_deg, wear_over_s, gap_limit_deg), json)
+    options = IdentifyOptions(
+        log=log,
+        servo=servo,
+        start=start,
+        duration=duration,
+        window=window,
+        pre_trigger=pre_trigger,
+        method=method,
+        wear_deg=wear_deg,
+        wear_over_s=wear_over_s,
+        gap_limit_deg=gap_limit_deg,
+    )
+    show(options, json)
 
 
 def bench(context: typer.Context) -> None:

@@ -1,4 +1,4 @@
-"""`servotwin tune`: a specification in, gains, all crossovers and Ms out, beside the servo's present controller."""
+"""`servotwin tune`: gains, all crossovers and Ms for a specification, beside the servo's present controller."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from servotwin.design import tune, tuned_system
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 
-# With a delay there is no end of phase crossovers; beyond this gain margin they are not shown.
+# A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
 
 
@@ -36,8 +36,8 @@ class TuneOptions:
     c: float | None
 
 
-def tell(request: TuneOptions, as_json: bool) -> None:
-    """The command: a table, or one JSON object, on the standard output."""
+def print_tuning(request: TuneOptions, as_json: bool) -> None:
+    """Print a table, or one JSON object, on the standard output."""
     servo = Servo.resolve(request.servo)
     servo = servo.replace(sample_rate=None)
     delay = 1e-3 * request.delay_ms
@@ -51,9 +51,9 @@ def tell(request: TuneOptions, as_json: bool) -> None:
         delay=delay,
     )
     overshoots = None
-    weights = (request.b, request.b if request.c is None else request.c)
+    b, c = request.b, request.b if request.c is None else request.c
     if delay == 0.0:
-        weighted = overshoot(servo, tuning.controller, *weights)
+        weighted = overshoot(servo, tuning.controller, b, c)
         overshoots = (overshoot(servo, tuning.controller), weighted)
     if as_json:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
@@ -66,14 +66,14 @@ def tell(request: TuneOptions, as_json: bool) -> None:
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
     console.print(f"{tuning.stable} of {tuning.candidates} candidates are stable", style="dim", highlight=False)
     if overshoots is not None:
-        more = f"; with setpoint weights b = {weights[0]:g}, c = {weights[1]:g}: {100 * overshoots[1]:.1f} %"
-        more = more if weights != (1.0, 1.0) else ""
+        more = f"; with setpoint weights b = {b:g}, c = {c:g}: {100 * overshoots[1]:.1f} %"
+        more = more if (b, c) != (1.0, 1.0) else ""
         console.print(f"overshoot without a gap {100 * overshoots[0]:.1f} %{more}", highlight=False)
 
 
 def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str, Any]:
-    """The tuning as plain numbers; what is infinite or unknown is null."""
-    law, found = tuning.controller, tuning.margins
+    """Make the JSON object; null for a number that is infinite or unknown."""
+    law, margins = tuning.controller, tuning.margins
     return {
         "Kp": law.Kp,
         "Ki": law.Ki,
@@ -82,12 +82,12 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
         "K": tuning.factors.K,
         "angles_deg": {name: math.degrees(getattr(tuning.factors, name)) for name in ("phz", "be", "al")},
         "crossovers": [
-            {"omega": x.omega, "phase_margin_deg": math.degrees(x.phase_margin)} for x in found.gain_crossovers
+            {"omega": x.omega, "phase_margin_deg": math.degrees(x.phase_margin)} for x in margins.gain_crossovers
         ],
-        "gain_margins": [{"omega": x.omega, "gain_margin": x.gain_margin} for x in found.phase_crossovers],
-        "Ms": found.Ms,
-        "Ms_omega": found.Ms_omega,
-        "bandwidth": found.bandwidth if math.isfinite(found.bandwidth) else None,
+        "gain_margins": [{"omega": x.omega, "gain_margin": x.gain_margin} for x in margins.phase_crossovers],
+        "Ms": margins.Ms,
+        "Ms_omega": margins.Ms_omega,
+        "bandwidth": margins.bandwidth if math.isfinite(margins.bandwidth) else None,
         "candidates": tuning.candidates,
         "stable_candidates": tuning.stable,
         "overshoot": None if overshoots is None else overshoots[0],
@@ -96,15 +96,16 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
 
 
 def _print(console: Console, rows: dict[str, tuple[Controller, Margins]]) -> None:
-    heads = ("", "Kp\nV/m", "Ki\nV/(m s)", "Kd\nV s/m", "Tf\ns", "Ms")
-    table = Table(*heads, box=None, pad_edge=False)
-    for name, (law, found) in rows.items():
-        gains = tuple(f"{value:.6g}" for value in (law.Kp, law.Ki, law.Kd, law.Tf))
-        table.add_row(name, *gains, f"{found.Ms:.4f}")
+    table = Table("", "Kp\nV/m", "Ki\nV/(m s)", "Kd\nV s/m", "Tf\ns", "Ms", box=None, pad_edge=False)
+    for name, (law, margins) in rows.items():
+        gains = (f"{value:.6g}" for value in (law.Kp, law.Ki, law.Kd, law.Tf))
+        table.add_row(name, *gains, f"{margins.Ms:.4f}")
     console.print(table, highlight=False)
-    for name, (_, found) in rows.items():
-        crossovers = [f"{x.omega:.4f} rad/s ({math.degrees(x.phase_margin):.2f} deg)" for x in found.gain_crossovers]
+    for name, (_, margins) in rows.items():
+        crossovers = [f"{x.omega:.4f} rad/s ({math.degrees(x.phase_margin):.2f} deg)" for x in margins.gain_crossovers]
         console.print(f"{name}, crossovers (phase margins): {', '.join(crossovers)}", highlight=False)
-        first = [f"{x.gain_margin:.3f} at {x.omega:.2f} rad/s" for x in found.phase_crossovers if x.gain_margin < _FAR]
+        first = [
+            f"{x.gain_margin:.3f} at {x.omega:.2f} rad/s" for x in margins.phase_crossovers if x.gain_margin < _FAR
+        ]
         if first:
             console.print(f"{name}, gain margins: {', '.join(first)}", highlight=False)

@@ -1,1 +1,1 @@
-"""The settings that an edge starts with, made of a servo's model and a policy."""
+"""Settings that an edge starts with, made of a servo's model and a policy."""

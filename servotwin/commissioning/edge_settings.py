@@ -38,20 +38,21 @@ WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
 MOST_SAMPLES = 1e8  # some 10 GB of signals
 
+# Widens a box so that rounding does not exclude its own corner.
 _ROUNDING = 1.0 + 1e-9
 
 
 @settings("recording")
 @dataclass(frozen=True)
 class Recording:
-    """What the edge records and sends.
+    """Settings of the windows that an edge records and sends.
 
     Parameters
     ----------
     probe : ProbeLimits, optional
         Probing moves of the reference that the twin may request; None: none. In a file, [edge.probe].
     novelty : NoveltyRules, optional
-        Rules of the windows that the edge finds worth sending; None: it sends every one. In a file, [novelty].
+        Rules that select the windows to send; None: the edge sends every one. In a file, [novelty].
     """
 
     sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
@@ -138,7 +139,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
 
 
 def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
-    """Every candidate's gains and dead zone, and the middle between them."""
+    """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
     own, demands = policy.servo.controller, policy.demands_within_band()
     scales = [setting.controller.Kp / own.Kp for setting in candidates_of(policy.servo, demands, 0.0, True, False)]
     middle, factor = math.sqrt(min(scales) * max(scales)), math.sqrt(max(scales) / min(scales)) * _ROUNDING
@@ -154,14 +155,14 @@ def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
 
 
 def hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
-    """The servo's own gains; a dead zone may be as wide as the twin finds the gap."""
+    """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
     own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
     return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=PATIENCE), gains_of(own)
 
 
 @dataclass(frozen=True)
 class Commissioning:
-    """A servo, the law that runs on it and its twin: all that the settings of its edge follow from.
+    """Servo, running controller and twin, from which the settings of an edge follow.
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ class Commissioning:
 
     @cached_property
     def guarding(self) -> Guarding | None:
-        """Supervision and limits where they are left to the policy; None: nothing.
+        """Supervision and limits by the policy; None: the supervision was given, or the policy needs none.
 
         Raises
         ------
@@ -208,7 +209,7 @@ class Commissioning:
 
     @property
     def calm(self) -> bool:
-        """True for a loop with hardly any integral action, and so nothing that makes it hunt through the gap."""
+        """True for a loop with hardly any integral action, which therefore does not hunt through the gap."""
         return self.law.Ki == 0.0 or self.twin.policy == "certified"
 
     @property
@@ -225,7 +226,7 @@ class Commissioning:
         return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
 
     def check_window(self) -> None:
-        """Refuse a window that does not fit into memory, or in which the estimator does not find enough.
+        """Refuse a window that does not fit into memory, or that is too short for the estimator.
 
         Raises
         ------

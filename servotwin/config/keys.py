@@ -51,7 +51,7 @@ class Unit:
 
     @property
     def exact(self) -> bool:
-        """The key has the attribute's unit, so that no digit is lost on the way."""
+        """True where the key has the attribute's unit, so that conversion loses no digit."""
         return self.factor == self.divisor == 1.0
 
     def to_si(self, value: float) -> float:
@@ -59,7 +59,7 @@ class Unit:
         return value * self.factor / self.divisor
 
     def from_si(self, value: float) -> float:
-        """A key's value that `to_si` turns into this one, to the last bit where a float does that."""
+        """The key's value that `to_si` converts to this one; the nearest where no float does so exactly."""
         near = value * self.divisor / self.factor
         close = (near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf))
         return next((number for number in close if self.to_si(number) == value), near)
@@ -163,17 +163,18 @@ def key(
     required : bool
         A file has to give the key, though the attribute has a default.
     makers : mapping
-        What makes the attribute of an inner table, by kind; the table's key `kind` says which, or `select`, and neither
-        is needed for a single one.
+        Makers of the attribute from an inner table, by kind. The table's key `kind` chooses one, or `select` does; a
+        single one needs neither.
     parse : callable
-        Takes the table, the key and its value, and gives the attribute; raises `table.invalid`.
+        Converts (table, key, value) to the attribute; raises `table.invalid`.
     dump : callable
         Keys and values of an attribute that `makers` makes.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
-        names, unit, allowed, help, table, choices, prefix, switch, relative, required, makers, select, parse, dump
-    )
+        names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
+        relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump,
+    )  # fmt: skip
 
 
 def value(
@@ -193,7 +194,7 @@ def value(
 
 
 class Form(StrEnum):
-    """What an attribute is in a file."""
+    """Form of an attribute's value in a file."""
 
     NUMBER = "number"
     INTEGER = "integer"
@@ -235,12 +236,12 @@ class Item:
 
     @property
     def required(self) -> bool:
-        """A file has to give it."""
+        """True where a file has to give the attribute."""
         return self.default is MISSING or self.key.required
 
     @property
     def makers(self) -> Mapping[str, Maker]:
-        """What makes the attribute of an inner table, by kind."""
+        """Makers of the attribute from an inner table, by kind."""
         return {"": self.type} if self.key.makers is None else self.key.makers
 
 
@@ -255,7 +256,7 @@ def items_of(maker: Any) -> tuple[Item, ...]:
 
 
 def name_of(described: Any) -> str:
-    """What messages call a declared class or its object."""
+    """Name of a declared class, or of its object, in messages."""
     return str(getattr(described, "settings_name", ""))
 
 
@@ -296,7 +297,7 @@ def check(described: Any, but: Collection[str] = ()) -> None:
 
 
 def allowed(item: Item) -> str:
-    """What an attribute may be, in words."""
+    """Allowed values of an attribute, in words."""
     if item.key.choices is not None:
         return f"one of {', '.join(item.key.choices)}"
     if item.form is Form.BOOLEAN:
@@ -315,7 +316,7 @@ def documented(described: type) -> str:
         return text
     section = "\n".join(["Parameters", "----------", *lines])
     head, separator, tail = text.partition("\nParameters\n----------\n")
-    if separator:  # what is declared stands first, what the class says by hand after it
+    if separator:  # declared attributes come first, those documented by hand after them
         return f"{head}\n{section}\n{tail}"
     head, separator, tail = text.partition("\nRaises\n------")
     return f"{head.rstrip()}\n\n{section}\n" + (f"\nRaises\n------{tail}" if separator else "")
@@ -372,7 +373,7 @@ def _form(bare: Any, declared: Key) -> Form:
 
 
 def _fits(item: Item, given: object) -> bool:
-    """A value is of its type, a number in its range too."""
+    """True where a value has the declared type and, if it is a number, lies in the range."""
     form = item.form
     if form is Form.NUMBER or form is Form.INTEGER:
         return _number_fits(item, given)

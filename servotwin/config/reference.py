@@ -1,4 +1,4 @@
-"""The reference of a file's keys, as Markdown and as JSON Schema, made of the declarations of `config.keys`."""
+"""Reference of a file's keys as Markdown and JSON Schema, generated from the declarations of `config.keys`."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class TableSpec:
     kinds : mapping of str to TableSpec
         The table is of one of these kinds.
     only : tuple of str, optional
-        Attributes that count.
+        Attributes to include; None: all.
     partial : bool
         No key has to be given, as another table has the values.
     repeated : str
         Name of the inner tables, where the table holds any number of them.
     text : bool
-        Any key with a text.
+        True: the table holds any keys, with texts as values.
     """
 
     makers: tuple[Maker, ...] = ()
@@ -103,7 +103,7 @@ def _sections(path: str, spec: TableSpec) -> list[str]:
 
 
 def _describe(kind: str, spec: TableSpec) -> str:
-    """A kind's key, or its sentence."""
+    """Heading of a kind of table: its key and first sentence."""
     text = inspect.getdoc(spec.makers[0]) if spec.makers else ""
     sentence = (text or "").partition("\n")[0].rstrip(".")
     return f"`{kind}`, {sentence[:1].lower()}{sentence[1:]}" if "=" in kind else sentence

@@ -1,6 +1,6 @@
-"""A strict reader of TOML tables: every value is asked for by name, type and range, and nothing unknown is left over.
+"""Strict reader of TOML tables: every value is read by name, type and range; an unknown key is an error.
 
-Each refusal is one `InvalidInput` sentence that names the file, the key, the value and what is allowed.
+Each error is one `InvalidInput` sentence that names the file, the key, the value and what is allowed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Range:
     infinite: bool = False
 
     def accepts(self, value: float) -> bool:
-        """Whether a number lies in the range; NaN never does, an infinite one only where `infinite`."""
+        """True where a number lies in the range; NaN never does, an infinite one only where `infinite`."""
         if not (isinstance(value, int) or math.isfinite(value) or (self.infinite and not math.isnan(value))):
             return False
         if (self.above > -math.inf and value <= self.above) or (self.below < math.inf and value >= self.below):
@@ -107,7 +107,7 @@ class Table:
         return self.number_in(key, Range(minimum, maximum, 0.0 if positive else -math.inf, infinite=infinite))
 
     def number_in(self, key: str, allowed: Range) -> float:
-        """The number that is there, within a range."""
+        """Value of a present key, a number within a range."""
         return self._number(key, self.values[key], allowed)
 
     def numbers(
@@ -125,7 +125,7 @@ class Table:
         return self.numbers_in(key, Range(minimum, maximum, 0.0 if positive else -math.inf))
 
     def numbers_in(self, key: str, allowed: Range) -> float | tuple[float, ...]:
-        """The number or the list of at least one that is there, each within a range."""
+        """Value of a present key, a number or a list of at least one, each within a range."""
         value = self.values[key]
         if not isinstance(value, list):
             return self._number(key, value, allowed, " or a list of such")
@@ -147,7 +147,7 @@ class Table:
         return self.integer_in(key, Range(minimum, maximum))
 
     def integer_in(self, key: str, allowed: Range) -> int:
-        """The integer that is there, within a range."""
+        """Value of a present key, an integer within a range."""
         value = self.values[key]
         if isinstance(value, bool) or not isinstance(value, int) or not allowed.accepts(value):
             raise self.invalid(key, allowed.whole)
@@ -194,11 +194,11 @@ class Table:
         return [Table(self.source, item, f"{self.path(key)}[{i}]") for i, item in enumerate(value)]
 
     def known(self, *keys: str) -> None:
-        """These keys are allowed here, whether they are read or not."""
+        """Allow keys in this table, whether they are read or not."""
         self._known.update(keys)
 
     def done(self) -> None:
-        """Refuse whatever was never asked for."""
+        """Refuse keys that were neither read nor declared known; raises InvalidInput."""
         for key in self.values:
             if key not in self._known:
                 allowed = _listed(sorted(self._known)) or "no key at all"
@@ -242,7 +242,7 @@ class Table:
 
 @contextmanager
 def named(table: Table) -> Iterator[None]:
-    """Let what a constructor refuses be known by its file and table."""
+    """Prefix an InvalidInput that a constructor raises with the file and the table."""
     try:
         yield
     except InvalidInput as error:
@@ -253,7 +253,7 @@ def named(table: Table) -> Iterator[None]:
 
 
 def read_inner(table: Table, key: str, read: Callable[[Table], _Value]) -> _Value:
-    """What `read` makes of an inner table, read to its last key."""
+    """Read an inner table with `read`; every key must be read."""
     inner = table.table(key)
     with named(inner):
         value = read(inner)

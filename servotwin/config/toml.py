@@ -1,4 +1,4 @@
-"""Tables of a TOML file as declared settings, and back; see `config.keys` for the declaration."""
+"""Conversion of TOML tables to declared settings and back; `config.keys` describes the declaration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read(table: Table, maker: Any, folder: Path = Path(), base: Any = None, **gi
     base : object, optional
         Settings of that class, whose values hold where the table gives none. None: the declared defaults.
     given
-        Values of further parameters; what is given is not read.
+        Values of further parameters, which are not read from the table.
 
     Raises
     ------
@@ -136,10 +136,10 @@ def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
         return table.integer_in(name, item.key.range)
     limits = item.key.range.scaled(unit.from_si)
     if form in (Form.PAIR, Form.NUMBERS):
-        found = table.numbers_in(name, limits)
-        if form is Form.PAIR and (not isinstance(found, tuple) or len(found) != 2):
+        numbers = table.numbers_in(name, limits)
+        if form is Form.PAIR and (not isinstance(numbers, tuple) or len(numbers) != 2):
             raise table.invalid(name, "two numbers")
-        converted = tuple(unit.to_si(each) for each in found) if isinstance(found, tuple) else unit.to_si(found)
+        converted = tuple(map(unit.to_si, numbers)) if isinstance(numbers, tuple) else unit.to_si(numbers)
         return (converted,) if item.type == tuple[float, ...] and not isinstance(converted, tuple) else converted
     if form in (Form.NUMBER, Form.INTEGER):
         number = unit.to_si(table.number_in(name, limits))
@@ -222,6 +222,7 @@ def _literal(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
+        # JSON strings are TOML strings, except that TOML also requires an escape for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_literal, value))}]"

@@ -90,7 +90,7 @@ def pack_finely(name: str, unit: str, samples: Iterable[float]) -> tuple[Channel
 
 
 def unpack_channel(channel: Channel) -> "array[float]":
-    """The samples, in the channel's unit."""
+    """Return the samples in the channel's unit."""
     codes = array("h")
     codes.frombytes(channel.data)
     scale, offset = channel.scale, channel.offset

@@ -30,7 +30,7 @@ class Refusal(StrEnum):
 
     @property
     def passing(self) -> bool:
-        """True where the same message may be taken later: the edge keeps it; otherwise it drops and counts it."""
+        """True where the same message may be accepted later: the edge keeps it; any other it drops and counts."""
         return self in (
             Refusal.BAD_TOKEN,
             Refusal.FUTURE,
@@ -47,7 +47,7 @@ class InvalidMessage(ValueError):
     ----------
     text : str
     refusal : Refusal
-        The same as a code.
+        The reason as a code.
     """
 
     def __init__(self, text: str, refusal: Refusal = Refusal.NOT_UNDERSTOOD) -> None:

@@ -6,9 +6,9 @@ from servotwin.messages.checks import InvalidMessage, Refusal, require
 
 IDENTITY, DEFLATE, ZSTD = "", "deflate", "zstd"
 ENCODINGS = (IDENTITY, DEFLATE, ZSTD)
-"""As in HTTP's Content-Encoding; nothing stands for identity."""
+"""Names as in HTTP's Content-Encoding; the empty one is identity."""
 ZSTD_WINDOW = 8 * 1024 * 1024
-"""Bytes of memory that a zstd frame may ask its reader to hold: what RFC 8878 recommends."""
+"""Bytes of memory that a zstd frame may require of its reader: the limit that RFC 8878 recommends."""
 
 
 def compress(data: bytes, encoding: str) -> bytes:
@@ -42,16 +42,16 @@ def decompress(data: bytes, encoding: str, limit: int) -> bytes:
 def _inflated(data: bytes, limit: int) -> bytes:
     reader = zlib.decompressobj()
     try:
-        found = reader.decompress(data, limit + 1)
+        inflated = reader.decompress(data, limit + 1)
     except zlib.error as error:
         raise InvalidMessage(f"body is not deflate: {error}") from None
-    require(len(found) <= limit, _too_large(limit), Refusal.TOO_LARGE)
+    require(len(inflated) <= limit, _too_large(limit), Refusal.TOO_LARGE)
     require(reader.eof and not reader.unused_data, "body is not deflate: cut short, or followed by something else")
-    return found
+    return inflated
 
 
 def _unzstd(data: bytes, limit: int) -> bytes:
-    """A frame says how much it holds, or it is refused: so nothing larger is ever begun."""
+    """Decompress a frame that declares its size; one without is refused, so that nothing too large is ever started."""
     import zstandard
 
     try:

@@ -18,7 +18,7 @@ class LongerWindow(Struct, frozen=True, tag="window"):
     Attributes
     ----------
     window_s, pre_trigger_s : float
-        Length, and how much of it lies before the change.
+        Length of a window, and the part of it before the change, s.
     """
 
     window_s: float
@@ -39,9 +39,9 @@ class Probe(Struct, frozen=True, tag="probe"):
     size : float
         m, added to the reference.
     hold_s : float
-        How long it stays away, and how long it is watched after it came back, each time.
+        s at the offset, and s of observation after each return.
     strokes : int
-        How often it goes there and back.
+        Number of moves there and back.
     """
 
     size: float
@@ -68,14 +68,14 @@ class Request(Struct, frozen=True, tag="request/1"):
     Attributes
     ----------
     boot : str
-        Of the edge it was made for.
+        Boot of the edge for which the request was made.
     serial : int
-        Its own number; only rises within a boot of the edge.
+        Number of the request; rises within a boot of the edge.
     ask : LongerWindow or Probe
     not_after : float
-        Sample time of the edge from which on it must not be begun, s.
+        Sample time of the edge, s, from which on the request must not be started.
     reason : str
-        Why, in words.
+        Reason in words.
     """
 
     servo: Name
@@ -104,7 +104,7 @@ class RequestOutcome(StrEnum):
 
     @property
     def passing(self) -> bool:
-        """True where the same request may be taken later."""
+        """True where the same request may be accepted later."""
         return self in (RequestOutcome.BUSY, RequestOutcome.TOO_SOON)
 
 
@@ -116,10 +116,10 @@ class Answer(Struct, frozen=True, tag="answer/1"):
     serial : int
         The request's.
     sample : int
-        First sample at which it counts, or at which it was refused.
+        First sample at which the request is in effect, or at which it was refused.
     outcome : RequestOutcome
     newest : int
-        Highest serial decided so far: a twin that forgot goes on from there.
+        Highest serial decided so far: a twin that lost its state continues from there.
     """
 
     servo: Name

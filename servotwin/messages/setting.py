@@ -1,4 +1,4 @@
-"""The setting of a controller: what an update may change, and what of it crosses the link."""
+"""Setting of a controller: the dead zone, gains and predicted band that messages carry."""
 
 from math import isfinite
 

@@ -52,11 +52,11 @@ class Verification(Struct, frozen=True):
     settled : float
         Share of the machines that settled.
     tail, overshoot : float
-        Worst of all: m, error in the end; per step.
+        Largest of all machines: error at the end, m; overshoot as a share of the step.
     Ms, crossover, phase_margin : float
         Of the model without a gap: the sensitivity's peak; rad/s and rad.
     saturated : bool
-        Whether a machine met the voltage limit.
+        True where a machine reached the voltage limit.
     """
 
     members: Count
@@ -81,9 +81,9 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
     Attributes
     ----------
     version, base_version : int
-        Its own number; the version it replaces (compare-and-swap).
+        Number of the update, and of the version that it replaces (compare-and-swap).
     window : (str, int)
-        (boot, sequence) of the window it stands on.
+        (boot, sequence) of the window that it is based on.
     data_time : float
         Sample time of that window's first sample, s.
     gap, std, interval : float, float, (float, float)
@@ -93,7 +93,7 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
     setting : Setting
         Dead zone, gains and predicted band; gains None: the gains stay.
     not_after : float
-        Sample time of the edge from which on it must not be applied, s.
+        Sample time of the edge, s, from which on the update must not be applied.
     verification : Verification, optional
         Result of simulating the setting; None: it was not verified.
     """
@@ -132,7 +132,7 @@ class Receipt(Struct, frozen=True, tag="receipt/1"):
         First sample under the new parameters, or the sample at which it was refused.
     reason : Reason
     parameter_version : int
-        In force after the decision: what the twin has to base its next update on.
+        Version in force after the decision, on which the twin has to base its next update.
     boot : str
     """
 
@@ -154,11 +154,11 @@ class Fallback(Struct, frozen=True, tag="fallback/2"):
         First sample under the fallback set.
     cause : Cause
     measured, allowed : float
-        The measured and the allowed value: m, V or s, as the cause says; 0 where it is a drive's refusal.
+        The measured and the allowed value: m, V or s, as the cause says; 0 where a drive refused the parameters.
     replaced : int
         The version that was in force.
     parameter_version : int
-        The fallback set's: what the twin has to base its next update on.
+        Version of the fallback set, on which the twin has to base its next update.
     setting : Setting
         The fallback set; gains None: the gains stayed.
     """

@@ -26,7 +26,7 @@ class WindowMessage(Struct, frozen=True, tag="window/1"):
     parameter_version : int
         In force when the window was cut.
     model_version, reason : str
-        Which description of the servo the edge runs on; why the window was sent.
+        Version of the servo's model on the edge; reason for sending the window.
     crc : int
         `checksum(channels)`.
     """
@@ -83,9 +83,10 @@ class Hello(Struct, frozen=True, tag="hello/2"):
     parameter_version : int
         In force.
     setting : Setting
-        In force; after a restart, the one that the loop kept its band under last. Gains None: updates set none there.
+        Setting in force; after a restart, the last one under which the loop stayed in its band. Gains None: updates set
+        none at this edge.
     model_version : str
-        Which description of the servo it runs on.
+        Version of the servo's model on the edge.
     """
 
     servo: Name

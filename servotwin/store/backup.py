@@ -1,4 +1,4 @@
-"""Backup of an SQLite store while it is in use, and restore; PostgreSQL has its own tools for that."""
+"""Backup and restore of an SQLite store, while it is in use; PostgreSQL has its own tools."""
 
 from __future__ import annotations
 
@@ -89,31 +89,32 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         return counts
 
 
-def _source_file(url: str, instead: str, file: Path) -> Path:
+def _source_file(url: str, command: str, file: Path) -> Path:
     address = parse_address(url)
     path = sqlite_file(address)
     if path is not None:
         return path
     if address.get_backend_name() == POSTGRESQL:
-        raise InvalidInput(f"store {public_address(address)}: is in PostgreSQL; call {instead.format(file)}")
+        raise InvalidInput(f"store {public_address(address)}: is in PostgreSQL; call {command.format(file)}")
     raise InvalidInput(f"store {public_address(address)}: is in memory; give that of a file")
 
 
 def _copied(source: Path, target: Path, progress: Progress | None) -> RowCounts:
     """Copy the source as of one moment into the target, compare and check it."""
-    with _opened(source, "mode=ro") as there, _opened(target, "mode=rw") as here:
+    with _opened(source, "mode=ro") as original, _opened(target, "mode=rw") as copy:
         # The first read fixes the snapshot: later writes go to the log.
-        there.execute("BEGIN")
-        _check_revision(there, source)
-        expected = _counts(there)
-        there.backup(here, pages=PAGES, progress=None if progress is None else lambda _, left, of: progress(left, of))
-        there.execute("ROLLBACK")
-        # Without a log the copy is a single file.
-        here.execute("PRAGMA journal_mode = DELETE")
-        found = [row[0] for row in here.execute("PRAGMA integrity_check(1)")]
-        if found != ["ok"]:
-            raise InvalidInput(f"store {source}: is damaged ({found[0]}); restore an earlier backup")
-        if _counts(here) != expected:
+        original.execute("BEGIN")
+        _check_revision(original, source)
+        expected = _counts(original)
+        report = None if progress is None else lambda _, left, total: progress(left, total)
+        original.backup(copy, pages=PAGES, progress=report)
+        original.execute("ROLLBACK")
+        # Without a write-ahead log the copy is a single file.
+        copy.execute("PRAGMA journal_mode = DELETE")
+        faults = [row[0] for row in copy.execute("PRAGMA integrity_check(1)")]
+        if faults != ["ok"]:
+            raise InvalidInput(f"store {source}: is damaged ({faults[0]}); restore an earlier backup")
+        if _counts(copy) != expected:
             raise InvalidInput(f"store {source}: its copy does not hold the same rows; try again")
         return expected
 

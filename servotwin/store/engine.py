@@ -20,11 +20,15 @@ from servotwin.errors import InvalidInput
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
 BUSY_S = 10.0
+"""s that a connection waits for another one's transaction."""
 _PAGE_BYTES = 8192
 _LOG_PAGES = 2000
+"""Pages of the write-ahead log after which they are copied into the database: 16 MB."""
 _READERS = 8
 _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
+"""Raised as they are: the statement is wrong, and repeating it does not help."""
 _LOST_RACES = ("40001", "40P01")
+"""SQLSTATE of a serialization failure and of a deadlock."""
 
 
 class StoreUnavailable(RuntimeError):
@@ -46,13 +50,13 @@ def parse_address(url: str, password: str | None = None) -> sa.URL:
     if "://" not in url:
         return sa.URL.create(SQLITE, database=url) if url else _refuse("is empty")
     try:
-        found = sa.make_url(url)
+        address = sa.make_url(url)
     except (ArgumentError, ValueError):
         return _refuse("cannot be read")
-    system = found.get_backend_name()
+    system = address.get_backend_name()
     if system == POSTGRESQL:
-        return found.set(drivername="postgresql+psycopg", password=found.password if password is None else password)
-    return found.set(drivername=SQLITE) if system == SQLITE else _refuse(f"names {system!r}")
+        return address.set(drivername="postgresql+psycopg", password=address.password if password is None else password)
+    return address.set(drivername=SQLITE) if system == SQLITE else _refuse(f"names {system!r}")
 
 
 def public_address(address: sa.URL) -> str:
@@ -126,8 +130,8 @@ def lost_race(error: StoreUnavailable) -> bool:
     return getattr(error.__cause__, "sqlstate", None) in _LOST_RACES
 
 
-def _unavailable(engine: sa.Engine, said: str) -> StoreUnavailable:
-    reason = said.strip().splitlines()[0] if said.strip() else "no reason given"
+def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
+    reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
     return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason})")
 
 
@@ -150,16 +154,17 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
         pool_timeout=BUSY_S,
         connect_args={"timeout": BUSY_S, "check_same_thread": False},
     )
+    # IMMEDIATE takes the write lock at once: a transaction that reads first could not be upgraded and would fail.
     begin = "BEGIN" if reading else "BEGIN IMMEDIATE"
 
     @event.listens_for(engine, "connect")
-    def connected(connection: Any, _record: Any) -> None:
+    def configure(connection: Any, _record: Any) -> None:
         connection.isolation_level = None
         for pragma in _pragmas(reading):
             connection.execute(f"PRAGMA {pragma}")
 
     @event.listens_for(engine, "begin")
-    def begun(connection: sa.Connection) -> None:
+    def begin_transaction(connection: sa.Connection) -> None:
         connection.exec_driver_sql(begin)
 
     return engine
@@ -170,6 +175,7 @@ def _pragmas(reading: bool) -> tuple[str, ...]:
     if reading:
         return (*common, "query_only = ON")
     layout = (f"page_size = {_PAGE_BYTES}", "auto_vacuum = INCREMENTAL", "journal_mode = WAL")
+    # FULL: a commit is synced to the disk, so that an acknowledged message survives a power failure.
     safety = ("synchronous = FULL", f"wal_autocheckpoint = {_LOG_PAGES}", "journal_size_limit = 67108864")
     return (*layout, *safety, *common)
 

@@ -33,7 +33,7 @@ class CommitLimits(NamedTuple):
 
 
 class _Write(NamedTuple):
-    what: Incoming | WorkResult
+    record: Incoming | WorkResult
     size: int
     future: Future[Any]
 
@@ -83,7 +83,7 @@ class GroupCommit:
         with self._changed:
             if self._messages >= self._limits.waiting or self._bytes + size > self._limits.waiting_bytes:
                 raise StoreBusy(f"store {self._store.name}: {self._messages} messages wait to be committed; try later")
-            future: Future[PutResult] = self._queued(item, size)
+            future: Future[PutResult] = self._enqueue(item, size)
             self._messages, self._bytes = self._messages + 1, self._bytes + size
         return future
 
@@ -96,7 +96,7 @@ class GroupCommit:
             It is closed.
         """
         with self._changed:
-            return self._queued(result, sum(map(len, result.outgoing)))
+            return self._enqueue(result, sum(map(len, result.outgoing)))
 
     def close(self) -> None:
         """Accept nothing more, commit the waiting writes, end the thread; the store stays open."""
@@ -105,13 +105,13 @@ class GroupCommit:
             self._changed.notify()
         self._thread.join()
 
-    def _queued(self, what: Incoming | WorkResult, size: int) -> Future[Any]:
+    def _enqueue(self, record: Incoming | WorkResult, size: int) -> Future[Any]:
         if self._closing:
             raise StoreUnavailable(f"store {self._store.name}: is being closed")
         future: Future[Any] = Future()
         # From here on the future cannot be cancelled: the write will be done.
         future.set_running_or_notify_cancel()
-        self._jobs.append(_Write(what, size, future))
+        self._jobs.append(_Write(record, size, future))
         self._changed.notify()
         return future
 
@@ -121,17 +121,17 @@ class GroupCommit:
 
     def _take(self) -> list[_Write]:
         """Wait for the writes of the next transaction; none: closed, and all is written."""
-        taken: list[_Write] = []
+        batch: list[_Write] = []
         size = 0
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closing)
-            while self._jobs and len(taken) < self._limits.together and size < self._limits.together_bytes:
+            while self._jobs and len(batch) < self._limits.together and size < self._limits.together_bytes:
                 job = self._jobs.popleft()
-                taken.append(job)
+                batch.append(job)
                 size += job.size
-                if isinstance(job.what, Incoming):
+                if isinstance(job.record, Incoming):
                     self._messages, self._bytes = self._messages - 1, self._bytes - job.size
-        return taken
+        return batch
 
     def _write(self, jobs: Sequence[_Write]) -> None:
         try:
@@ -142,21 +142,22 @@ class GroupCommit:
             if len(jobs) == 1:
                 _fail(jobs, error)
                 return
+            # One write is invalid: each gets a transaction of its own, so that only that one fails.
             for job in jobs:
                 self._write([job])
 
     def _commit(self, jobs: Sequence[_Write]) -> None:
-        puts = [(job.what, job.future) for job in jobs if isinstance(job.what, Incoming)]
-        commits = [(job.what, job.future) for job in jobs if isinstance(job.what, WorkResult)]
+        puts = [(job.record, job.future) for job in jobs if isinstance(job.record, Incoming)]
+        commits = [(job.record, job.future) for job in jobs if isinstance(job.record, WorkResult)]
         items, results = [item for item, _ in puts], [result for result, _ in commits]
         stored, valid = self._store.write(items, results, self._clock())
         _resolve([future for _, future in puts], stored)
         _resolve([future for _, future in commits], valid)
 
 
-def _resolve(futures: Sequence[Future[Any]], answers: Sequence[object]) -> None:
-    for future, answer in zip(futures, answers, strict=True):
-        future.set_result(answer)
+def _resolve(futures: Sequence[Future[Any]], results: Sequence[object]) -> None:
+    for future, result in zip(futures, results, strict=True):
+        future.set_result(result)
 
 
 def _fail(jobs: Sequence[_Write], error: Exception) -> None:

@@ -89,20 +89,20 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
         {
             "_servo": servo,
             "_windows": windows[servo],
-            "_heard": max((i.received for i in of if i.kind is not MessageKind.VERIFICATION), default=None),
-            "_ready": min((i.received for i in of if i.kind is not MessageKind.VERIFICATION), default=None),
-            "_asked": min((i.received for i in of if i.kind is MessageKind.VERIFICATION), default=None),
+            "_heard": max((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_ready": min((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_asked": min((i.received for i in group if i.kind is MessageKind.VERIFICATION), default=None),
         }
-        for servo, of in _by_servo(new)
+        for servo, group in _by_servo(new)
     ]
     connection.execute(_MARK_READY, rows)
 
 
 def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:
-    found: dict[str, list[Incoming]] = {}
+    groups: dict[str, list[Incoming]] = {}
     for item in items:
-        found.setdefault(item.servo, []).append(item)
-    return sorted(found.items())
+        groups.setdefault(item.servo, []).append(item)
+    return sorted(groups.items())
 
 
 def _digests(connection: sa.Connection, names: Iterable[Name]) -> dict[Name, bytes]:
@@ -117,8 +117,8 @@ def rows_by_name(connection: sa.Connection, query: sa.Select[Any], names: Iterab
     keys: dict[str, list[str]] = {}
     for servo, key in sorted(names):
         keys.setdefault(servo, []).append(key)
-    for servo, of in keys.items():
-        yield from connection.execute(query, {"_servo": servo, "_keys": of})
+    for servo, of_servo in keys.items():
+        yield from connection.execute(query, {"_servo": servo, "_keys": of_servo})
 
 
 def select_by_name(*columns: sa.ColumnElement[Any]) -> sa.Select[Any]:

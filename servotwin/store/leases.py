@@ -1,4 +1,4 @@
-"""Leases: servos with work to do, each held by one worker at a time."""
+"""Leases: each servo with pending work belongs to one worker at a time."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def acquire(
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
     for query, share in _queues(frozenset(kinds), only is not None):
-        wanted = min(math.ceil(share * limit), limit - len(leased))
-        found = connection.scalars(query, bound | {"_wanted": wanted}).all()
-        if found:
-            connection.execute(_LEASE, {"_servos": found, "_owner": owner, "_until": until})
-            leased += found
+        count = min(math.ceil(share * limit), limit - len(leased))
+        servos = connection.scalars(query, bound | {"_count": count}).all()
+        if servos:
+            connection.execute(_LEASE, {"_servos": servos, "_owner": owner, "_until": until})
+            leased += servos
     return leased
 
 
@@ -67,15 +67,15 @@ def due(connection: sa.Connection, servos: Collection[str], now: float) -> set[s
 @lru_cache(maxsize=32)
 def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[Any], float]]:
     """(query of the next servos in a queue, largest share of the limit that it may take); of `one` servo only."""
-    found: list[tuple[sa.Select[Any], float]] = []
+    queues: list[tuple[sa.Select[Any], float]] = []
     if MessageKind.WINDOW in kinds or MessageKind.LETTER in kinds:
         due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
-        found.append((_next(due, twins.c.wake, one), 0.5))
-        found.append((_next(ready, twins.c.ready, one), 1.0))
-        found.append((_next(due, twins.c.wake, one), 1.0))
+        queues.append((_next(due, twins.c.wake, one), 0.5))
+        queues.append((_next(ready, twins.c.ready, one), 1.0))
+        queues.append((_next(due, twins.c.wake, one), 1.0))
     if MessageKind.VERIFICATION in kinds:
-        found.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
-    return found
+        queues.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
+    return queues
 
 
 def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: bool) -> sa.Select[Any]:
@@ -83,8 +83,8 @@ def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: boo
     until = twins.c.lease_until
     late = sa.bindparam("_late", type_=sa.Double)
     free = sa.or_(until.is_(None), until <= _NOW, until > late)
-    wanted = sa.bindparam("_wanted", type_=sa.Integer)
-    query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(wanted)
+    count = sa.bindparam("_count", type_=sa.Integer)
+    query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(count)
     query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
     # SQLite has one writer at a time and ignores this.
     return query.with_for_update(skip_locked=True)
@@ -93,15 +93,15 @@ def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: boo
 def _pending(
     connection: sa.Connection, servos: Sequence[str], kinds: Collection[MessageKind], per_servo: int
 ) -> dict[str, list[StoredMessage]]:
-    found: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
-    for of in ({MessageKind.WINDOW, MessageKind.LETTER}, {MessageKind.VERIFICATION}):
-        wanted = frozenset(of & set(kinds))
-        if wanted:
-            for row in connection.execute(_oldest(wanted), {"_servos": servos, "_per_servo": per_servo}):
-                found[row.servo].append(
+    pending: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
+    for queue in ({MessageKind.WINDOW, MessageKind.LETTER}, {MessageKind.VERIFICATION}):
+        selected = frozenset(queue & set(kinds))
+        if selected:
+            for row in connection.execute(_oldest(selected), {"_servos": servos, "_per_servo": per_servo}):
+                pending[row.servo].append(
                     StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
                 )
-    return found
+    return pending
 
 
 @lru_cache(maxsize=8)

@@ -32,9 +32,10 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
             return
         if connection.dialect.name == POSTGRESQL:
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
-        found = _revision(connection)
-        if found != to:
-            _check(connection, found, to)
+        # Read again under the lock: another process may have migrated meanwhile.
+        current = _revision(connection)
+        if current != to:
+            _check(connection, current, to)
             _upgrade(connection, to, scripts)
 
 
@@ -45,15 +46,15 @@ def _revision(connection: sa.Connection) -> str | None:
     return connection.execute(sa.text(f"SELECT version_num FROM {VERSIONS}")).scalar()
 
 
-def _check(connection: sa.Connection, found: str | None, to: str) -> None:
+def _check(connection: sa.Connection, current: str | None, to: str) -> None:
     where = public_address(connection.engine.url)
-    if found is None:
-        theirs = sorted(set(sa.inspect(connection).get_table_names()) & set(metadata.tables))
-        if theirs:
-            raise InvalidInput(f"store {where}: holds a table {theirs[0]!r} that is not servotwin's; give another one")
-    elif found > to:
+    if current is None:
+        foreign = sorted(set(sa.inspect(connection).get_table_names()) & set(metadata.tables))
+        if foreign:
+            raise InvalidInput(f"store {where}: holds a table {foreign[0]!r} that is not servotwin's; give another one")
+    elif current > to:
         raise InvalidInput(
-            f"store {where}: its schema {found} is newer than {to}, the newest that this servotwin knows; "
+            f"store {where}: its schema {current} is newer than {to}, the newest that this servotwin knows; "
             "install the newer servotwin"
         )
 

@@ -41,12 +41,12 @@ def outgoing(connection: sa.Connection, servo: str, after: int, limit: int) -> l
 
 def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
     """Serials of the newest messages to the edges of these servos."""
-    names, found = list(servos), dict[str, int]()
+    names, newest = list(servos), dict[str, int]()
     for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
         part = names[begin : begin + _NAMES_PER_QUERY]
         query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
-        found.update((servo, serial) for servo, serial in connection.execute(query))
-    return found
+        newest.update((servo, serial) for servo, serial in connection.execute(query))
+    return newest
 
 
 def backlog(connection: sa.Connection, now: float) -> Backlog:
@@ -73,9 +73,9 @@ def servo(connection: sa.Connection, name: str) -> ServoSummary | None:
 
 def window(connection: sa.Connection, servo: str, boot: str, sequence: int) -> StoredMessage | None:
     """A window with its body."""
-    columns = messages.c.id, messages.c.kind, bodies.c.body, messages.c.encoding, messages.c.received
     joined = messages.outerjoin(bodies, bodies.c.message == messages.c.id)
-    query = sa.select(*columns).select_from(joined).where(_is_window(servo, boot, sequence))
+    query = sa.select(messages.c.id, messages.c.kind, bodies.c.body, messages.c.encoding, messages.c.received)
+    query = query.select_from(joined).where(_is_window(servo, boot, sequence))
     row = connection.execute(query).one_or_none()
     if row is None:
         return None
@@ -172,12 +172,12 @@ def _window_trace(rows: list[Any]) -> WindowTrace:
 
 
 def _update_trace(update: StoredEvidence, rows: list[Any], before: StoredEvidence | None) -> UpdateTrace:
-    mine = [row for row in rows if row[_WIDTH] == update.id]
-    answers = {each.id: each for row in mine if (each := _evidence(row, _WIDTH + _EVIDENCE_WIDTH)) is not None}
-    after = _evidence(mine[0], _WIDTH + 2 * _EVIDENCE_WIDTH)
+    matching = [row for row in rows if row[_WIDTH] == update.id]
+    answers = {each.id: each for row in matching if (each := _evidence(row, _WIDTH + _EVIDENCE_WIDTH)) is not None}
+    after = _evidence(matching[0], _WIDTH + 2 * _EVIDENCE_WIDTH)
     if after is None:
         return UpdateTrace(update, tuple(answers.values()), None)
-    window = StoredWindow(*mine[0][_WIDTH + 3 * _EVIDENCE_WIDTH :])
+    window = StoredWindow(*matching[0][_WIDTH + 3 * _EVIDENCE_WIDTH :])
     return UpdateTrace(update, tuple(answers.values()), UpdateEffect(window, before, after))
 
 

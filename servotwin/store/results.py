@@ -48,8 +48,8 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
 
 def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
     """Make the serial of the next message to the edge exceed `serial`."""
-    behind = twins.c.servo == servo, twins.c.posted < serial
-    connection.execute(sa.update(twins).where(*behind).values(posted=serial))
+    behind = sa.update(twins).where(twins.c.servo == servo, twins.c.posted < serial)
+    connection.execute(behind.values(posted=serial))
 
 
 def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], now: float) -> None:
@@ -63,9 +63,9 @@ def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], n
         insert_once(connection.dialect.name, contexts),
         ({"key": key, "text": text} for key, text in sorted(known.items())),
     )
-    found = [(result.servo, one) for result in results for one in result.evidence]
-    windows = _windows(connection, found)
-    _insert_all(connection, sa.insert(evidence), (_evidence_row(servo, one, windows, now) for servo, one in found))
+    records = [(result.servo, record) for result in results for record in result.evidence]
+    windows = _windows(connection, records)
+    _insert_all(connection, sa.insert(evidence), (_evidence_row(servo, each, windows, now) for servo, each in records))
     _insert_all(
         connection, sa.insert(outgoing), (row for result, last in valid for row in _outgoing_rows(result, last, now))
     )
@@ -105,23 +105,23 @@ def _done(connection: sa.Connection, results: Sequence[WorkResult], now: float) 
 
 
 def _insert_all(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, Any]]) -> None:
-    found = list(rows)
-    if found:
-        connection.execute(statement, found)
+    bound = list(rows)
+    if bound:
+        connection.execute(statement, bound)
 
 
-def _windows(connection: sa.Connection, found: Sequence[tuple[str, EvidenceRecord]]) -> dict[tuple[str, str], int]:
+def _windows(connection: sa.Connection, records: Sequence[tuple[str, EvidenceRecord]]) -> dict[tuple[str, str], int]:
     """Ids of the windows that evidence names, by (servo, key)."""
-    rows = rows_by_name(connection, _WINDOW_IDS, {(servo, one.window) for servo, one in found if one.window})
+    rows = rows_by_name(connection, _WINDOW_IDS, {(servo, record.window) for servo, record in records if record.window})
     return {(row.servo, row.key): row.id for row in rows if row.kind == MessageKind.WINDOW}
 
 
 def _evidence_row(
-    servo: str, found: EvidenceRecord, windows: Mapping[tuple[str, str], int], now: float
+    servo: str, record: EvidenceRecord, windows: Mapping[tuple[str, str], int], now: float
 ) -> dict[str, Any]:
-    row = found._asdict()
-    message = windows.get((servo, row.pop("window")), found.message)
-    return row | {"message": message or None, "context": found.context or None, "servo": servo, "made": now}
+    row = record._asdict()
+    message = windows.get((servo, row.pop("window")), record.message)
+    return row | {"message": message or None, "context": record.context or None, "servo": servo, "made": now}
 
 
 def _outgoing_rows(result: WorkResult, last: int, now: float) -> list[dict[str, Any]]:
@@ -132,16 +132,16 @@ def _outgoing_rows(result: WorkResult, last: int, now: float) -> list[dict[str, 
     ]
 
 
-def _summary(found: Sequence[EvidenceRecord]) -> dict[str, Any]:
+def _summary(records: Sequence[EvidenceRecord]) -> dict[str, Any]:
     """Columns of the servo's row that a new estimate, update or receipt sets."""
     known: dict[str, Any] = {}
-    for one in found:
-        if one.kind in _ESTIMATES:
-            known |= {"gap": one.gap, "std": one.std, "status": one.status}
-        elif one.kind == "update":
-            known["version"] = one.version
-        elif one.kind == "receipt":
-            known["receipt"] = one.status
+    for record in records:
+        if record.kind in _ESTIMATES:
+            known |= {"gap": record.gap, "std": record.std, "status": record.status}
+        elif record.kind == "update":
+            known["version"] = record.version
+        elif record.kind == "receipt":
+            known["receipt"] = record.status
     return known
 
 

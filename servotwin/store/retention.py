@@ -13,6 +13,7 @@ from servotwin.store.schema import WINDOWS, bodies, evidence, messages
 from servotwin.store.store import Store
 
 _PAGES = 512
+"""Pages that are freed in one transaction: 4 MB."""
 
 
 class RetentionResult(NamedTuple):
@@ -73,13 +74,13 @@ def _next(store: Store, after: int, batch: int) -> Sequence[Any]:
 
 
 def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:
-    leaving = [row for row in old if not row.stays]
-    if leaving:
-        gone = [row.id for row in leaving]
+    deleted = [row for row in old if not row.stays]
+    if deleted:
+        ids = [row.id for row in deleted]
         with transaction(store.engines.writer) as connection:
-            connection.execute(sa.delete(bodies).where(bodies.c.message.in_(gone)))
+            connection.execute(sa.delete(bodies).where(bodies.c.message.in_(ids)))
         _shrink(store)
-    return RetentionResult(len(leaving), sum(row.size for row in leaving), len(old) - len(leaving))
+    return RetentionResult(len(deleted), sum(row.size for row in deleted), len(old) - len(deleted))
 
 
 def _shrink(store: Store) -> None:

@@ -37,7 +37,7 @@ from servotwin.store.records import (
 WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER)
 _RACES = 8
 _MAX_SERIAL = 2**52
-"""Largest serial that an edge may report as received: messages count to twice as far."""
+"""Largest serial that an edge may report as received; messages carry serials up to twice that."""
 
 _Result = TypeVar("_Result")
 
@@ -121,12 +121,12 @@ class Store:
         if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            found = leases.load(connection, leased, kinds, per_servo)
+            loaded = leases.load(connection, leased, kinds, per_servo)
             due = leases.due(connection, leased, now)
-        idle = {lease.servo for lease in found if not lease.messages and lease.servo not in due}
+        idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
         if idle:
             self.release(owner, idle)
-        return [lease for lease in found if lease.servo not in idle]
+        return [lease for lease in loaded if lease.servo not in idle]
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
@@ -135,13 +135,13 @@ class Store:
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first.
 
-        An edge that reports a higher serial than any that was posted has talked to the store before it was restored
-        from a backup: the next message gets a serial that the edge does not take for a duplicate.
+        An edge that reports a higher serial than any that was posted received it before the store was restored from a
+        backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        found = self._read(lambda connection: queries.outgoing(connection, servo, after, limit))
-        if not found and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
+        messages = self._read(lambda connection: queries.outgoing(connection, servo, after, limit))
+        if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
             self._write(lambda connection: results.skip_to_serial(connection, servo, after))
-        return found
+        return messages
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""

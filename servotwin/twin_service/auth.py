@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 
 PRIVATE = 0o600
 """Mode of files that only their owner may read."""
-_HEAD = "# Digests of tokens, as precious as the tokens themselves: for the service's own eyes.\n"
+_HEAD = "# Digests of tokens: keep this file as secret as the tokens themselves.\n"
 _VERIFIER = re.compile(r"[0-9a-f]{64}")
 _NO_VERIFIER = bytes(32)
-"""Verifier of no token: compared with where a servo has none, so that a guess takes as long."""
+"""Verifier of no token. A servo without a token is compared with it, so that a guess takes as long."""
 _OPEN = verifier_of("")
-"""Seals messages where there are no tokens: an edge without a token has the empty one."""
+"""Verifier of the empty token, which seals messages where no tokens are configured."""
 _MAX_TOKEN = 1024
 """Characters."""
 _MISSING = "a token is needed: Authorization: Bearer TOKEN"
@@ -41,7 +41,7 @@ _FOREIGN = "the token belongs to another name: it may not do this"
 
 @dataclass(frozen=True)
 class Verifiers:
-    """Digests of the tokens that count.
+    """Digests of the valid tokens.
 
     Attributes
     ----------
@@ -93,6 +93,7 @@ class AccessControl:
         if self._verifiers is None:
             return
         verifier = _digest(token)
+        # Every operator is compared: a loop that ended at a match would tell by its time which one it was.
         matches = [hmac.compare_digest(verifier, known) for known in self._verifiers.operators.values()]
         if not any(matches):
             raise self._rejected(verifier, "the token is not an operator's")
@@ -129,7 +130,7 @@ class EdgeGate:
     def admit_authenticated(self, servo: str, *, limited: bool = True) -> None:
         """`admit` for a servo whose seal was checked already."""
         if not self._knows(servo):
-            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo[:64]!r} is not looked after here")
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo[:64]!r}")
         if limited:
             self._limiter.take(servo)
 
@@ -139,18 +140,21 @@ class EdgeGate:
 
     def verifier(self, servo: str) -> bytes:
         """Verifier with which messages to the servo are sealed; raises RequestRejected where its token was revoked."""
-        found = self._access.verifier(servo)
-        if found is None:
-            raise RequestRejected(Refusal.BAD_TOKEN, "the token of this servo was taken away")
-        return found
+        verifier = self._access.verifier(servo)
+        if verifier is None:
+            raise RequestRejected(Refusal.BAD_TOKEN, "the token of this servo was revoked")
+        return verifier
 
 
 class TokenFile:
-    """Watches the file of tokens, so that `servotwin enroll` needs no restart; an invalid file changes nothing."""
+    """Reloads the file of tokens when it is replaced, so that `servotwin enroll` needs no restart.
+
+    An invalid file changes nothing: the tokens that were read last stay valid.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # Before reading: a file that is replaced meanwhile is then read again.
+        # Taken before the file is read: a file that is replaced meanwhile is then read again.
         self._stamp = self._stat()
         self.access = AccessControl(read_tokens(path))
 
@@ -163,17 +167,17 @@ class TokenFile:
         try:
             self.access.replace(read_tokens(self.path))
         except (InvalidInput, OSError) as error:
-            log.error("tokens not read again: the former ones stay", extra={"why": str(error)})
+            log.error("tokens not reloaded: the former ones stay", extra={"why": str(error)})
             return False
-        log.info("tokens read again")
+        log.info("tokens reloaded")
         return True
 
     def _stat(self) -> tuple[int, int, int] | None:
         try:
-            found = self.path.stat()
+            status = self.path.stat()
         except OSError:
             return None
-        return found.st_ino, found.st_mtime_ns, found.st_size
+        return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def bearer_token(header: bytes | None) -> bytes | None:
@@ -187,7 +191,7 @@ def _digest(token: bytes | None) -> bytes:
     if token is None:
         raise RequestRejected(Refusal.BAD_TOKEN, _MISSING)
     if len(token) > _MAX_TOKEN or not token.isascii():
-        raise RequestRejected(Refusal.BAD_TOKEN, "the token is not one that this service gives out")
+        raise RequestRejected(Refusal.BAD_TOKEN, "the token is not one that this service issues")
     return verifier_of(token.decode("ascii"))
 
 
@@ -206,14 +210,14 @@ def read_tokens(path: Path) -> Verifiers:
     if not path.read_bytes().strip():
         return Verifiers()
     table = read_toml(path)
-    found = Verifiers(_read_verifiers(table.table("servos")), _read_verifiers(table.table("operators")))
+    verifiers = Verifiers(_read_verifiers(table.table("servos")), _read_verifiers(table.table("operators")))
     table.done()
     owner: dict[bytes, str] = {}
-    for name, verifier in [*found.servos.items(), *found.operators.items()]:
+    for name, verifier in [*verifiers.servos.items(), *verifiers.operators.items()]:
         if verifier in owner:
             raise InvalidInput(f"{path}: {owner[verifier]!r} and {name!r} have the same token")
         owner[verifier] = name
-    return found
+    return verifiers
 
 
 def write_tokens(path: Path, verifiers: Verifiers) -> None:

@@ -1,4 +1,4 @@
-"""Configuration of the twin's service: its address, its store, who may speak to it, and how much."""
+"""Configuration of the twin's service: address, store, TLS, tokens and limits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MOST = 1_000_000
 
 @dataclass(frozen=True)
 class MqttConfig:
-    """Part that the service takes in a broker's traffic.
+    """Connection of the service to an MQTT broker.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class MqttConfig:
 
     @property
     def local(self) -> bool:
-        """Whether the broker runs on this machine."""
+        """True where the broker runs on this machine."""
         return is_here(self.broker.address[0])
 
 
@@ -88,7 +88,7 @@ def _file(table: Table, name: str, path: Path) -> Path:
 @settings("service")
 @dataclass(frozen=True)
 class ServiceConfig:
-    """How the service runs.
+    """Settings of the service.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class ServiceConfig:
         str,
         key(
             parse=_address,
-            help="IP address; anything but the machine itself asks for tokens and for TLS or a proxy that does it.",
+            help="IP address; any but the machine's own loopback requires tokens, and TLS or a proxy with TLS.",
         ),
     ] = "127.0.0.1"
     port: Annotated[int, key(minimum=0, maximum=65535, help="Port; 0: any free one.")] = 8765
@@ -113,34 +113,39 @@ class ServiceConfig:
     workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
     tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
     tls_key: Annotated[Path | None, key(parse=_file, help="PEM file with the certificate's key.")] = None
-    behind_proxy: Annotated[bool, key(help="A proxy on the way does TLS; that asks for tokens too.")] = False
+    behind_proxy: Annotated[bool, key(help="A proxy in front of the service does TLS; this requires tokens too.")] = (
+        False
+    )
     tokens: Annotated[
         Path | None,
         key(
-            help="File with the verifiers of servos and operators; where absent whoever reaches the machine itself may "
-            "do everything."
+            help="File with the verifiers of servos and operators; where absent, anyone who reaches the machine may do "
+            "everything."
         ),
     ] = None
-    lockstep: Annotated[bool, key(help="Time is what requests say; work is done on request only.")] = False
-    proofs_per_minute: Annotated[float, key(minimum=0.0, help="Most verifications begun.")] = 6.0
+    lockstep: Annotated[bool, key(help="Requests give the time, and the service works only on request.")] = False
+    proofs_per_minute: Annotated[float, key(minimum=0.0, help="Largest rate at which verifications are started.")] = 6.0
     retention_days: Annotated[
-        float, key(above=0.0, infinite=True, help="Time for which windows are kept that led to no update.")
+        float,
+        key(above=0.0, infinite=True, help="Time after which the body of a window that led to no update is deleted."),
     ] = 30.0
-    rate_limit_per_s: Annotated[float, key(above=0.0, help="Messages of one servo on average.")] = 20.0
-    rate_burst: Annotated[float, key(above=0.0, help="Messages of one servo at once.")] = 200.0
+    rate_limit_per_s: Annotated[float, key(above=0.0, help="Largest mean rate of messages from one servo.")] = 20.0
+    rate_burst: Annotated[float, key(above=0.0, help="Largest burst of messages from one servo.")] = 200.0
     max_body_bytes: Annotated[
-        int, key(minimum=1024, maximum=MAX_BYTES, help="Size of a body, as sent and as decompressed.")
+        int, key(minimum=1024, maximum=MAX_BYTES, help="Largest size of a body, as sent and as decompressed.")
     ] = MAX_BYTES
-    body_timeout_s: Annotated[float, key(above=0.0, help="Time by which a body has to be there.")] = 30.0
-    long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Long polls open at once.")] = 20_000
-    queue: Annotated[int, key(minimum=1, maximum=_MOST, help="Messages that wait for their commit.")] = 2000
-    speed: Annotated[float, key(above=0.0, help="Sample time passes at most so many times as fast as time.")] = 1.0
-    future_slack_s: Annotated[float, key(minimum=0.0, help="Sample time by which a window may lie ahead of that.")] = (
-        60.0
+    body_timeout_s: Annotated[float, key(above=0.0, help="Time within which a body must arrive.")] = 30.0
+    long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Largest number of long polls open at once.")] = (
+        20_000
     )
-    job_timeout_s: Annotated[float, key(above=0.0, help="A worker that takes longer over one servo is replaced.")] = (
-        300.0
-    )
+    queue: Annotated[
+        int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
+    ] = 2000
+    speed: Annotated[float, key(above=0.0, help="Largest ratio of sample time to real time.")] = 1.0
+    future_slack_s: Annotated[
+        float, key(minimum=0.0, help="Largest lead of a window's sample time over that ratio.")
+    ] = 60.0
+    job_timeout_s: Annotated[float, key(above=0.0, help="Time for one servo after which a worker is replaced.")] = 300.0
     log_level: Annotated[str, key(choices=LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
 
@@ -150,32 +155,32 @@ class ServiceConfig:
             raise InvalidInput("tls_certificate and tls_key belong together: give both or none")
         if not self.local and (self.tokens is None or (self.tls_key is None and not self.behind_proxy)):
             raise InvalidInput(
-                f"bind = {self.bind!r} can be reached from other machines: that is allowed only with tokens, and with "
-                "tls_certificate and tls_key or, where a proxy does the TLS, behind_proxy = true"
+                f"bind = {self.bind!r} can be reached from other machines: this requires tokens, and tls_certificate "
+                "with tls_key or, where a proxy does TLS, behind_proxy = true"
             )
         if self.behind_proxy and self.tokens is None:
-            raise InvalidInput("behind_proxy = true lets other machines reach the service: that asks for tokens")
+            raise InvalidInput("behind_proxy = true lets other machines reach the service: this requires tokens")
         if self.mqtt is not None and not self.mqtt.local and self.tokens is None:
-            raise InvalidInput(f"mqtt url = {self.mqtt.broker.url!r} is not on this machine: that asks for tokens")
+            raise InvalidInput(f"mqtt url = {self.mqtt.broker.url!r} is not on this machine: this requires tokens")
         if self.mqtt is not None and self.lockstep:
-            raise InvalidInput("lockstep = true and mqtt exclude each other: in lock-step edges ask over HTTP")
+            raise InvalidInput("lockstep = true and mqtt exclude each other: lock-step works over HTTP only")
 
     def __repr__(self) -> str:
         return f"ServiceConfig(bind={self.bind!r}, port={self.port!r}, store={self.store!r})"
 
     @property
     def local(self) -> bool:
-        """Whether only this machine reaches the service."""
+        """True where only this machine reaches the service."""
         return is_here(self.bind)
 
 
 def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os.environ) -> ServiceConfig:
-    """[service]; paths are relative to `folder`.
+    """Read the table [service]; paths are relative to `folder`.
 
     Raises
     ------
     InvalidInput
-        A key is unknown, a value is not allowed, a file that it names cannot be read, or is readable by others.
+        A key is unknown, a value is not allowed, or a file that it names cannot be read or is readable by others.
     """
     mqtt = None
     if "mqtt" in table.values:
@@ -203,6 +208,6 @@ def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[
 
 
 def sqlite_in(url: str, folder: Path) -> str:
-    """The URL, a relative path of SQLite taken from `folder`."""
+    """Return the URL of a store, a relative path of SQLite resolved against `folder`."""
     path = url.removeprefix(SQLITE)
     return url if path == url or not path else f"{SQLITE}{(folder / path).absolute()}"

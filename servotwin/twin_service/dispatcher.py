@@ -128,7 +128,7 @@ class Dispatcher:
         try:
             await self._executor.run(partial(self._store.release, self._owner))
         except StoreUnavailable as error:
-            log.warning("leases not given back", extra={"why": str(error)})
+            log.warning("leases not released", extra={"why": str(error)})
 
     async def process(self, servo: str, now: float) -> list[bytes]:
         """Work on one servo until nothing is pending, for lock-step; returns its outgoing messages.
@@ -250,7 +250,7 @@ class Dispatcher:
             valid = await self._commit(result)
         except StoreUnavailable as error:
             counts.add("not committed")
-            log.error("outcome not committed", extra={"servo": result.servo, "why": str(error)})
+            log.error("result not committed", extra={"servo": result.servo, "why": str(error)})
             self._to_release.add(result.servo)
             return False
         # A void result has no lease to release: the result before it ended that, and its present owner needs it.

@@ -30,6 +30,7 @@ Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
 MAX_INTEGER = 2**53
+"""Largest integer in a request: the largest that JSON readers with float64 numbers represent exactly."""
 _TITLE, _VERSION = "servotwin twin", "1"
 _DESCRIPTION = (
     """MessagePack in, MessagePack out; errors are JSON: {"code": ..., "detail": ...}. Times in s, angles in rad."""
@@ -330,11 +331,11 @@ def operation(
         described[str(status)] = {"description": description, **content}
     for status in errors:
         described.setdefault(str(status), {"description": "Rejected.", "content": {JSON: {"schema": _ERROR}}})
-    found: Operation = {"summary": summary, "parameters": list(parameters), "responses": described}
+    declared: Operation = {"summary": summary, "parameters": list(parameters), "responses": described}
     if body:
         schema = {**_BYTES, "maxLength": MAX_BYTES}
-        found["requestBody"] = {"required": True, "description": body, "content": {MSGPACK: {"schema": schema}}}
-    return found
+        declared["requestBody"] = {"required": True, "description": body, "content": {MSGPACK: {"schema": schema}}}
+    return declared
 
 
 def _openapi(routes: Iterable[HttpRoute]) -> Operation:
@@ -342,7 +343,7 @@ def _openapi(routes: Iterable[HttpRoute]) -> Operation:
     paths: Operation = {}
     for route in routes:
         name = f"{route.method.lower()} {route.path}"
-        found = {**route.operation, "operationId": re.sub(r"\W+", "_", name).strip("_")}
-        paths.setdefault(route.path, {})[route.method.lower()] = found
+        declared = {**route.operation, "operationId": re.sub(r"\W+", "_", name).strip("_")}
+        paths.setdefault(route.path, {})[route.method.lower()] = declared
     info = {"title": _TITLE, "description": _DESCRIPTION, "version": _VERSION}
     return {"openapi": "3.1.0", "info": info, "paths": paths}

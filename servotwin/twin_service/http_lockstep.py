@@ -87,8 +87,9 @@ class LockstepApi:
         now = request.seconds("now")
         body = await self._bodies.read(request.content_length, request.receive)
         incoming, message = self._ingest.read(servo, body, request.content_encoding)
+        # One sample of tolerance: a window that ends with the present sample is not from the future.
         if isinstance(message, WindowMessage) and end_of(message) > now + 1.0 / message.rate:
-            detail = f"the window ends at {end_of(message):g} s, and it is {now:g} s"
+            detail = f"the window ends at {end_of(message):g} s, after now = {now:g} s"
             raise RequestRejected(Refusal.FUTURE, detail)
         async with self._locks[servo]:
             new = await self._ingest.commit(incoming._replace(received=now)) is PutResult.NEW
@@ -97,7 +98,7 @@ class LockstepApi:
         return await self._response(servo, first + sent)
 
     async def _wake(self, request: HttpRequest) -> HttpResponse:
-        """It is `now`: returns what the twin sends by itself, and its next wake-up."""
+        """Wake the twin at `now`: returns the messages that it sends by itself, and its next wake-up."""
         servo = self._admitted_servo(request)
         now = request.seconds("now")
         async with self._locks[servo]:
@@ -124,5 +125,5 @@ class LockstepApi:
         try:
             return await self._dispatcher.process(servo, now)
         except (NoResult, StoreUnavailable, WorkerLost):
-            detail = "it could not be worked on now; the message is kept"
+            detail = "the message is stored but could not be processed now"
             raise RequestRejected(Refusal.UNAVAILABLE, detail) from None

@@ -43,7 +43,7 @@ MAX_ROWS = 1000
 _BACKLOG_S = 0.5
 """s for which a backlog that was read is served again."""
 Health = Callable[[], dict[str, Any]]
-"""Parts of the service -> whether each works, "ok" for all of them."""
+"""Returns the health of each part of the service, and "ok" for all of them."""
 
 
 class OperatorApi:
@@ -73,8 +73,8 @@ class OperatorApi:
         self._health, self._metrics, self._wall = health, metrics, wall
         self._backlog_lock = asyncio.Lock()
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
-        metrics.add_gauge("servotwin_waiting", "Messages and proofs not yet worked on.", self._counts, "kind")
-        metrics.add_gauge("servotwin_waiting_seconds", "For how long the oldest message waits.", self._age)
+        metrics.add_gauge("servotwin_waiting", "Messages and verifications not yet processed.", self._counts, "kind")
+        metrics.add_gauge("servotwin_waiting_seconds", "Age of the oldest message not yet processed.", self._age)
 
     def routes(self) -> list[HttpRoute]:
         """Declarations."""
@@ -110,7 +110,7 @@ class OperatorApi:
         window = operation(
             "A window as it came", {200: ("window/1.", MSGPACK)}, (SERVO, BOOT, SEQUENCE), errors=QUERY_ERRORS
         )
-        healthy = {200: ("All is well.", JSON), 503: ("Something is not; the body says what.", JSON)}
+        healthy = {200: ("All is well.", JSON), 503: ("A part is not healthy; the body names it.", JSON)}
         return [
             HttpRoute("GET", "/v1/servos", self._get_servos, servos),
             HttpRoute("GET", SERVO_PATH, self._get_servo, servo),
@@ -138,7 +138,7 @@ class OperatorApi:
         servo = self._admitted_servo(request)
         summary = await self._query(partial(self._store.servo, servo))
         if summary is None:
-            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} was never heard of")
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} has never sent a message")
         return json_response(summary._asdict())
 
     async def _get_audit(self, request: HttpRequest) -> HttpResponse:
@@ -159,10 +159,10 @@ class OperatorApi:
         servo = self._admitted_servo(request)
         boot, sequence = request.path["boot"], _sequence(request.path["sequence"])
         if not re.match(NAME_PATTERN, boot):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "boot: is no boot's name")
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "boot: give 1 to 64 letters, digits, . _ or -")
         window = await self._query(partial(self._store.window, servo, boot, sequence))
         if window is None or not window.body:
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "this window is not kept", 404)
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the body of this window is not stored", 404)
         headers = {"content-encoding": window.encoding} if window.encoding else {}
         return HttpResponse(200, window.body, MSGPACK, headers)
 
@@ -189,7 +189,7 @@ class OperatorApi:
         return math.nan if backlog is None else backlog.age
 
     async def _read_backlog(self) -> Backlog:
-        """Backlog, read at most every 0.5 s: anybody may ask for it, as often as he likes."""
+        """Backlog, read from the store at most every 0.5 s: requests for it need no token and have no rate limit."""
         async with self._backlog_lock:
             at, backlog = self._backlog
             if backlog is None or self._wall() - at >= _BACKLOG_S:
@@ -202,7 +202,7 @@ class OperatorApi:
         self._access.check_operator(request.token)
         servo = request.path["servo"]
         if not re.match(NAME_PATTERN, servo):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "servo: is no servo's name")
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "servo: give 1 to 64 letters, digits, . _ or -")
         return servo
 
     async def _query(self, call: Callable[[], Any]) -> Any:
@@ -249,5 +249,5 @@ def _limit(request: HttpRequest) -> int:
 
 def _sequence(text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 16):
-        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "sequence: is no whole number")
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "sequence: give a whole number of at most 16 digits")
     return int(text)

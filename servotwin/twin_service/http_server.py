@@ -20,10 +20,11 @@ from servotwin.twin_service.http_app import HttpApp
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
 _BACKLOG = 2048
+"""Connections that wait to be accepted: after an outage all edges connect at once."""
 _GRACE_S = 20
 """s that running requests may take when the service is told to stop."""
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
-"""For TLS 1.2; all of 1.3 are good. Older uvicorns would allow ciphers without any encryption."""
+"""For TLS 1.2; every cipher of 1.3 is allowed. The defaults of older uvicorns include ciphers without encryption."""
 _IDLE_S = 75
 """s after which an idle connection is closed."""
 

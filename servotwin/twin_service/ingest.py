@@ -145,14 +145,16 @@ class Ingest:
         except (StoreBusy, StoreUnavailable) as error:
             raise RequestRejected(Refusal.UNAVAILABLE, _unavailable(error)) from None
         if put is PutResult.CONFLICT:
-            raise RequestRejected(Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another one is kept")
+            raise RequestRejected(
+                Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another message is stored under this key"
+            )
         self._metrics.commit.observe(self._clocks.monotonic() - begun)
         self._metrics.stored.add(incoming.kind.value, put.value)
         return put
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
         if not self._knows(servo):
-            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} is not looked after here")
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo!r}")
         try:
             data = decompress(body, encoding, self._limit)
             message = decode(data, self._limit)
@@ -191,4 +193,4 @@ def _kind(message: Message) -> str:
 
 def _unavailable(error: Exception) -> str:
     busy = isinstance(error, StoreBusy)
-    return "so much waits to be committed that no more is taken now" if busy else "the store cannot take anything now"
+    return "too many messages wait to be committed" if busy else "the store cannot be written now"

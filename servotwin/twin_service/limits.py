@@ -12,7 +12,7 @@ from servotwin.messages import Refusal
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 """ASGI's: the next event of a request."""
 MAX_SERVOS = 50_000
-"""Servos and boots that are remembered; a forgotten one counts as new."""
+"""Servos and boots whose limits are in memory; one that was dropped counts as new."""
 _BODY_MEMORY = 256 * 1024 * 1024
 """Bytes of all bodies that are being received at once."""
 _MAX_UPTIME_S = 20.0 * 365.25 * 86400.0
@@ -72,13 +72,13 @@ class BodyReader:
 
     Attributes
     ----------
-    held : int
+    buffered : int
         Bytes of incomplete bodies in memory.
     """
 
     def __init__(self, limit: int, timeout: float, memory: int = _BODY_MEMORY) -> None:
         self.limit, self.timeout, self._memory = limit, timeout, memory
-        self.held = 0
+        self.buffered = 0
 
     async def read(self, length: str | None, receive: Receive) -> bytes:
         """Receive the body of one request; `length` is its Content-Length, where it has one.
@@ -100,6 +100,7 @@ class BodyReader:
 
     async def _receive_all(self, receive: Receive) -> bytes:
         event = await receive()
+        # Most bodies come in one event: nothing is accumulated then.
         if event["type"] == "http.request" and not event.get("more_body", False):
             body: bytes = event.get("body", b"")
             if len(body) > self.limit:
@@ -113,18 +114,18 @@ class BodyReader:
                 part = event.get("body", b"")
                 parts.append(part)
                 size += len(part)
-                self._hold(len(part), size)
+                self._count(len(part), size)
                 if not event.get("more_body", False):
                     return b"".join(parts)
                 event = await receive()
         finally:
-            self.held -= size
+            self.buffered -= size
 
-    def _hold(self, part: int, size: int) -> None:
-        self.held += part
+    def _count(self, part: int, size: int) -> None:
+        self.buffered += part
         if size > self.limit:
             raise self._too_large()
-        if self.held > self._memory:
+        if self.buffered > self._memory:
             raise RequestRejected(Refusal.UNAVAILABLE, "too many bodies are being received now", close=True)
 
     def _too_large(self) -> RequestRejected:
@@ -134,7 +135,7 @@ class BodyReader:
 class RateLimiter:
     """Token bucket per servo: a message takes one token, `rate` tokens per s are added up to `burst`.
 
-    The least recently used buckets are forgotten; a forgotten bucket is full.
+    The least recently used buckets are dropped; a bucket that was dropped is full when it is used again.
     """
 
     def __init__(self, rate: float, burst: float, monotonic: Callable[[], float]) -> None:

@@ -91,22 +91,23 @@ class LongPolls:
         until = loop.time() + wait
         while True:
             notifications = self._notifications[servo]
-            found = await self._look(servo, after)
+            messages = await self._read_newer(servo, after)
             left = until - loop.time()
-            if found or left <= 0.0 or self._closed:
-                return found
+            if messages or left <= 0.0 or self._closed:
+                return messages
+            # A notification that came while the store was read must not be slept through.
             if notifications == self._notifications[servo]:
                 await self._sleep(servo, after, left)
 
-    async def _look(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
+    async def _read_newer(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         """Read the store, unless it is known to hold nothing newer."""
         notifications = self._notifications[servo]
         if not self._shared and after >= self._empty_after.get(servo, _NEVER):
             return ()
-        found = await self._read(servo, after)
-        if not found and notifications == self._notifications[servo]:
+        messages = await self._read(servo, after)
+        if not messages and notifications == self._notifications[servo]:
             self._empty_after[servo] = after
-        return found
+        return messages
 
     async def _sleep(self, servo: str, after: int, seconds: float) -> None:
         """Sleep until a notification, at most `seconds`."""

@@ -61,11 +61,11 @@ class Gauge:
 
     def lines(self) -> Iterator[str]:
         """Sample lines."""
-        found = self._read()
-        if not isinstance(found, Mapping):
-            yield f"{self.name} {_number(found)}"
+        reading = self._read()
+        if not isinstance(reading, Mapping):
+            yield f"{self.name} {_number(reading)}"
             return
-        for value, number in sorted(found.items()):
+        for value, number in sorted(reading.items()):
             yield f"{self.name}{_labels((self._label,), (value,))} {_number(number)}"
 
 
@@ -103,14 +103,14 @@ class Metrics:
 
     def __init__(self) -> None:
         self.stored = Counter("servotwin_messages_total", "Messages committed, by kind and whether new.", "kind", "put")
-        self.rejected = Counter("servotwin_refused_total", "Messages and requests not taken, by reason code.", "code")
+        self.rejected = Counter("servotwin_refused_total", "Messages and requests rejected, by reason code.", "code")
         self.commit = Histogram("servotwin_commit_seconds", "From a message's last byte to its commit.")
-        self.age = Histogram("servotwin_queue_age_seconds", "From a message's commit to that of its outcome.")
+        self.age = Histogram("servotwin_queue_age_seconds", "From a message's commit to that of its result.")
         self.work = Histogram("servotwin_work_seconds", "A worker's time for one servo's messages.")
-        self.results = Counter("servotwin_outcomes_total", "What became of servos lent to workers.", "result")
-        self.evidence = Counter("servotwin_evidence_total", "What twins found and did, by kind.", "kind")
-        self.sent = Counter("servotwin_posted_total", "Messages made for edges.")
-        self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that had to be replaced.")
+        self.results = Counter("servotwin_outcomes_total", "Results of leases that workers processed.", "result")
+        self.evidence = Counter("servotwin_evidence_total", "Pieces of evidence committed, by kind.", "kind")
+        self.sent = Counter("servotwin_posted_total", "Messages posted to edges.")
+        self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that were replaced.")
         self._all: list[Counter | Gauge | Histogram] = [
             self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.sent,
             self.workers_lost,
@@ -174,11 +174,11 @@ def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handl
     """
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(JsonLines())
-    ours = logging.getLogger("servotwin")
-    ours.setLevel(level.upper())
-    ours.addHandler(handler)
-    theirs = logging.getLogger("uvicorn")
-    theirs.setLevel(logging.WARNING)
-    theirs.addHandler(handler)
-    ours.propagate = theirs.propagate = False
+    service = logging.getLogger("servotwin")
+    service.setLevel(level.upper())
+    server = logging.getLogger("uvicorn")
+    server.setLevel(logging.WARNING)
+    for logger in (service, server):
+        logger.addHandler(handler)
+        logger.propagate = False
     return handler

@@ -38,13 +38,13 @@ from servotwin.twin_service.monitoring import Metrics
 log = logging.getLogger(__name__)
 
 _RETRY_AFTER_S = 1.0
-"""Wait that an edge is asked for when nothing is accepted for the moment."""
+"""Pause that a rejection asks of an edge while nothing can be accepted."""
 _SESSION_S = 0
 """No session outlives its connection: the broker would send a share of the requests to a twin that is gone."""
 _MAX_IN_FLIGHT = 1000
 """Unacknowledged requests to one twin."""
 _RESPONSE_EXPIRY_S = 60.0
-"""A response that was not fetched by then is worthless: its edge has repeated the request."""
+"""A response that is older is worthless: its edge has repeated the request."""
 
 
 class MqttRequestHandler:
@@ -169,12 +169,12 @@ class MqttServer:
         try:
             response = await self._handler.respond(request) if isinstance(request, ReceivedRequest) else request
         except Exception:
-            log.exception("question not answered", extra={"servo": servo})
+            log.exception("request not answered", extra={"servo": servo})
             response = None
         if not polls:
             acknowledge()
         if response is not None and connection.publish(response_topic(servo), response, _RESPONSE_EXPIRY_S) is None:
-            log.warning("answer not sent: too much waits for the broker", extra={"servo": servo})
+            log.warning("response not sent: too much waits for the broker", extra={"servo": servo})
 
     def _on_connected(self, _session_lost: bool) -> None:
         self.connected = True

@@ -201,19 +201,23 @@ class TwinService:
             with suppress(StoreUnavailable):
                 done = await self.executor.run(partial(delete_old_bodies, self.store, before))
                 if done.emptied:
-                    log.info("windows forgotten", extra=done._asdict())
+                    log.info("old window bodies deleted", extra=done._asdict())
             await asyncio.sleep(_RETENTION_S)
 
     def _add_gauges(self) -> None:
         add = self.metrics.add_gauge
-        waiting = "Messages and outcomes that wait for their commit."
+        waiting = "Messages and results that wait for their commit."
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
         mqtt = self._mqtt
         if mqtt is not None:
-            add("servotwin_broker_connected", "Whether the MQTT broker is there.", lambda: mqtt.connected)
-        add("servotwin_store_ok", "Whether the store could do what it was asked last.", lambda: self.health()["store"])
+            add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)
+        add(
+            "servotwin_store_ok",
+            "1 while the store is healthy: its last read and write succeeded.",
+            lambda: self.health()["store"],
+        )
 
     @asynccontextmanager
     async def _lifespan(self) -> AsyncIterator[None]:
@@ -225,7 +229,7 @@ class TwinService:
 
 
 def _log_failure(task: asyncio.Task[None]) -> None:
-    """Log what ended a background task at once: nobody awaits it before the end."""
+    """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
 

@@ -1,4 +1,4 @@
-"""A twin's file as a whole: [service] here, models and servos in `twin.fleet`."""
+"""A twin's file as a whole: [service] is read here, models and servos by `twin.model_registry`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def read_twin(path: Path) -> TwinFile:
 
 
 def service_of(path: Path) -> ServiceConfig:
-    """[service] alone, for what needs no models: quick."""
+    """Read [service] alone, without the models, which take much longer."""
     table = read_toml(path)
     try:
         return read_inner(table, "service", lambda inner: read_service(inner, path.parent))

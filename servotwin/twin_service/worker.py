@@ -104,12 +104,13 @@ def _load_work(start: bytes) -> Work:
     from servotwin.twin.model_registry import ModelRegistry
     from servotwin.twin.work import work
 
-    given = _decode_start(start)
-    registry = ModelRegistry.loads(given.text, given.source, Path(given.folder))
+    file = _decode_start(start)
+    registry = ModelRegistry.loads(file.text, file.source, Path(file.folder))
     return lambda lease, now: work(registry, lease, now)
 
 
 if __name__ == "__main__":
+    # One thread each: the workers share the cores already.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         main(int(sys.argv[1]))

@@ -85,7 +85,7 @@ class WorkerProcess:
 
     def _send(self, frame: bytes) -> None:
         if self._writer is None or self._writer.is_closing():
-            raise WorkerLost("the worker is gone")
+            raise WorkerLost("the socket to the worker is closed")
         self._writer.write(frame)
 
     async def _receive(self, timeout: float) -> bytes:

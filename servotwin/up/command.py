@@ -25,8 +25,11 @@ from servotwin.up.speed import CORES, FASTEST, SLOWEST, MachineTime, SpeedMeter,
 from servotwin.up.status import ServoReader, TwinPoller, TwinStatus
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_TICK_S, _TABLE_S, _LINE_S, _ADAPT_S, _NEWS_S = 0.1, 0.5, 5.0, 3.0, 30.0
-_SPEED_FILE, _CAUTION = "speed", 0.7
+_TICK_S, _TABLE_S, _LINE_S, _ADAPT_S, _EVENT_S = 0.1, 0.5, 5.0, 3.0, 30.0
+"""s between checks of signals and processes, tables, plain lines and speeds; s for which an event is shown."""
+_SPEED_FILE = "speed"
+_CAUTION = 0.7
+"""Share of the last speed at which a start begins."""
 
 
 def up(path: Path, speed: float | None = None, seconds: float | None = None, console: Console | None = None) -> None:
@@ -45,7 +48,8 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     Raises
     ------
     InvalidInput
-        The folder is another's or in use, a speed or time is not allowed, a process does not start or keeps ending.
+        The folder holds something else or is in use, a speed or time is not allowed, a process does not start or keeps
+        ending.
     """
     _check_positive("--speed", speed, FASTEST)
     _check_positive("--for", seconds, 1e9)
@@ -58,7 +62,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
             site.start()
             monitor.run(signals, seconds)
         except StartInterrupted:
-            console.print("ended before everything ran")
+            console.print("ended by a signal before everything ran")
         finally:
             try:
                 monitor.stop()
@@ -74,12 +78,12 @@ def _greet(folder: Folder, console: Console) -> None:
         state = folder.machine(servo)
         if state is not None:
             described = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
-            console.print(f"going on with {described}", soft_wrap=True, highlight=False)
+            console.print(f"continuing with {described}", soft_wrap=True, highlight=False)
     console.print("starting (the very first time, code is compiled for a minute or two) ...", highlight=False)
 
 
 def _initial_speed(folder: Folder) -> float:
-    """A little below the last speed, which another machine or another load may not hold."""
+    """Choose a speed a little below the last one, which this machine may not reach under its present load."""
     last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in SERVOS]
     return max(SLOWEST, _CAUTION * min(last))
 
@@ -116,7 +120,7 @@ class Monitor:
         self._readers = {servo.name: ServoReader(servo, folder.servo(servo)) for servo in SERVOS}
         self._poller: TwinPoller | None = None
         self._meter = SpeedMeter()
-        self._news, self._news_until = "", 0.0
+        self._event, self._event_until = "", 0.0
         self._begun = time.monotonic()
         self._ended = 0.0
         self._last_twin: TwinStatus | None = None
@@ -163,7 +167,7 @@ class Monitor:
         share = self._meter.mean_share
         use = "an unknown share of the processor" if share is None else f"{100 * share:.0f} % of {CORES} cores"
         mean = f"{self._meter.mean_speed:.1f} times real time, {use}, for {clock(snapshot.seconds)}"
-        self._print(f"in the mean {mean}; all has ended, and goes on from here")
+        self._print(f"mean: {mean}; all processes have ended, and the next start continues from here")
 
     def _print(self, line: str) -> None:
         self._console.print(line, soft_wrap=True, highlight=False, markup=False)
@@ -184,10 +188,10 @@ class Monitor:
             live.update(display.table(snapshot), refresh=True)
 
     def _restart_ended(self, now: float) -> None:
-        for news in self._site.restart_ended(now):
-            self._news, self._news_until = news, now + _NEWS_S
+        for event in self._site.restart_ended(now):
+            self._event, self._event_until = event, now + _EVENT_S
             if not self._console.is_terminal:
-                self._print(news)
+                self._print(event)
 
     def _adapt(self, now: float) -> None:
         states = {servo.name: self._readers[servo.name].machine() for servo in SERVOS}
@@ -221,7 +225,7 @@ class Monitor:
             share=self._meter.share,
             url=self._site.url,
             folder=str(self._folder.path),
-            news=self._news if now < self._news_until else "",
+            event=self._event if now < self._event_until else "",
         )
 
 

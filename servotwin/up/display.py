@@ -26,14 +26,14 @@ class Snapshot(NamedTuple):
     servos : tuple of ServoStatus
     twin : TwinStatus or None
     seconds : float
-        s since everything runs.
+        s since all processes run.
     speed, reached : float
         Machine time per time: the set speed, and that of the slowest machine.
     cores, share : float or None
         Cores in use, and their share of two; None: unknown.
     url, folder : str
-    news : str
-        Latest event worth a line.
+    event : str
+        Latest event, such as the restart of a process; empty: none.
     """
 
     servos: tuple[ServoStatus, ...]
@@ -45,7 +45,7 @@ class Snapshot(NamedTuple):
     share: float | None
     url: str
     folder: str
-    news: str = ""
+    event: str = ""
 
 
 Cell = Callable[[ServoStatus], str]
@@ -67,7 +67,7 @@ def _below(snapshot: Snapshot) -> list[str]:
     """Lines with speed, processor, twin, address and folder."""
     lines = [f"{_speed(snapshot)}   {_processor(snapshot)}   for {clock(snapshot.seconds)}", _twin(snapshot)]
     lines.append(f"[dim]{snapshot.url}   {escape(snapshot.folder)}/*.log   Ctrl-C ends it[/]")
-    return lines if not snapshot.news else [*lines, f"[yellow]{escape(snapshot.news)}[/]"]
+    return lines if not snapshot.event else [*lines, f"[yellow]{escape(snapshot.event)}[/]"]
 
 
 def line(snapshot: Snapshot) -> str:
@@ -94,7 +94,7 @@ def _speed(snapshot: Snapshot) -> str:
     if snapshot.cores is None and snapshot.reached == 0.0:
         return f"starting at {snapshot.speed:g} x real time"
     slow = snapshot.reached < 0.95 * SLOWEST <= 0.95 * snapshot.speed
-    note = f" [red](this machine does not hold {SLOWEST:g})[/]" if slow else ""
+    note = f" [red](this machine does not reach {SLOWEST:g})[/]" if slow else ""
     return f"[bold]{snapshot.reached:.1f}[/] x real time{note}"
 
 
@@ -120,8 +120,8 @@ def _waits(twin: TwinStatus | None) -> str:
 
 
 def _windows(servo: ServoStatus) -> dict[str, Any]:
-    found = servo.edge.get("windows", {})
-    return found if isinstance(found, dict) else {}
+    windows = servo.edge.get("windows", {})
+    return windows if isinstance(windows, dict) else {}
 
 
 def _number(servo: ServoStatus, key: str, scale: float, digits: int) -> str:
@@ -149,6 +149,7 @@ def _error(servo: ServoStatus) -> str:
         return _NONE
     colour = "green" if compared.inside else "red"
     age = "" if compared.age is None else f"{compared.age:.0f} s ago"
+    # Adding 0.0 turns -0.0 into 0.0, so that the sign does not flicker.
     return f"[{colour}]{round(compared.error, 4) + 0.0:+.4f}[/] [dim]{age}[/]"
 
 
@@ -187,7 +188,7 @@ def _link(servo: ServoStatus) -> str:
     if servo.outage:
         return f"[red]outage[/], {servo.outage:.0f} s left"
     trouble = servo.edge.get("up", {}).get("trouble") or servo.edge.get("down", {}).get("trouble")
-    return "[yellow]coming back[/]" if trouble else "[green]up[/]" if servo.edge else _NONE
+    return "[yellow]reconnecting[/]" if trouble else "[green]up[/]" if servo.edge else _NONE
 
 
 _GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 1, "kd_v_s_per_m": 2}

@@ -1,4 +1,4 @@
-"""A servo made known: its token, the twin's verifier of it, and a folder with all that its edge needs."""
+"""Enrolment of servos and operators: their tokens, the twin's verifiers, and the folder that an edge starts from."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from servotwin.twin_service.twin_file import TwinFile, read_twin
 
 TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
 LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
-"""What a twin with [twin.excitation] may ask an edge for: a calm loop turns the screw back late."""
+"""Limits of the windows that a twin with [twin.excitation] may request: a calm loop reverses the screw late."""
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
 
 
 @dataclass(frozen=True)
 class Enrolment:
-    """What is wanted of an edge.
+    """Request to enrol a servo.
 
     Attributes
     ----------
@@ -45,13 +45,13 @@ class Enrolment:
     drive : mapping
         The table [drive] of its file.
     url : str or None
-        Where the edge reaches the twin; None: where the twin's file says that it listens.
+        Address at which the edge reaches the twin; None: that of the twin's file.
     again : bool
-        A servo that has a token gets another one; the former counts no more.
+        Replace an existing token, which is revoked.
     noise : float
-        m rms on the measured position, which the edge's watch has to put up with.
+        m rms on the measured position, which the edge's watch has to tolerate.
     ca : Path or None
-        Certificates that the edge checks the twin's against. None: the twin's own where it has signed itself, else
+        Certificates that the edge checks the twin's against. None: the twin's own if it is self-signed, otherwise
         those of the edge's system.
     """
 
@@ -66,10 +66,11 @@ class Enrolment:
     ca: Path | None = None
 
 
-def enroll(path: Path, wanted: Enrolment) -> list[Path]:
-    """Make a servo known to the twin of that file; the files that were written.
+def enroll(path: Path, request: Enrolment) -> list[Path]:
+    """Enrol a servo with the twin of that file; returns the files that were written.
 
-    The edge's folder is written first: a token counts only once the edge has it. An edge.toml that is there stays.
+    The edge's folder is written first, so that a token becomes valid only once the edge has it. An existing edge.toml
+    stays as it is.
 
     Raises
     ------
@@ -78,22 +79,22 @@ def enroll(path: Path, wanted: Enrolment) -> list[Path]:
     """
     twin = read_twin(path)
     tokens = _tokens_file(twin)
-    _check(wanted, _known(tokens))
-    new = not (wanted.folder / CONFIG).exists()
-    text = edge_toml(edge_config(twin, wanted)) if new else ""
-    token, folder = secrets.token_urlsafe(32), make_directory(wanted.folder)
-    made = _configured(_trusted(twin, wanted), folder, text) if new else []
+    _check(request, _read_or_create(tokens))
+    new = not (request.folder / CONFIG).exists()
+    text = edge_toml(edge_config(twin, request)) if new else ""
+    token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
+    made = _write_configuration(_trusted_certificates(twin, request), folder, text) if new else []
     write_private(folder / TOKEN, token + "\n")
     made.append(folder / TOKEN)
-    _add(tokens, "servos", wanted.servo, token, wanted.again)
+    _add(tokens, "servos", request.servo, token, request.again)
     return [*made, tokens]
 
 
 def enroll_operator(path: Path, name: str, file: Path, again: bool = False) -> list[Path]:
-    """Make an operator known, whose token goes to `file`; as `enroll`."""
+    """Enrol an operator with the twin of that file and write the token to `file`; returns and raises as `enroll`."""
     twin = read_twin(path)
     tokens = _tokens_file(twin)
-    _check_name(name, _known(tokens).operators, again)
+    _check_name(name, _read_or_create(tokens).operators, again)
     if file.exists() and not again:
         raise InvalidInput(f"{file}: is there already; give another file, or --again to replace it by a new token")
     token = secrets.token_urlsafe(32)
@@ -103,7 +104,7 @@ def enroll_operator(path: Path, name: str, file: Path, again: bool = False) -> l
 
 
 def revoke(path: Path, name: str) -> Path:
-    """Take a servo's or an operator's token from the twin of that file: it counts no more, at once; the tokens' file.
+    """Revoke the token of a servo or an operator at the twin of that file; returns the file of tokens.
 
     Raises
     ------
@@ -113,9 +114,9 @@ def revoke(path: Path, name: str) -> Path:
     tokens = _tokens_file(read_twin(path))
     with tokens_locked(tokens):
         known = read_tokens(tokens)
-        everybody = [*known.servos, *known.operators]
-        if name not in everybody:
-            raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, everybody)}")
+        names = [*known.servos, *known.operators]
+        if name not in names:
+            raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, names)}")
         servos, operators = dict(known.servos), dict(known.operators)
         servos.pop(name, None)
         operators.pop(name, None)
@@ -124,67 +125,67 @@ def revoke(path: Path, name: str) -> Path:
 
 
 def drive_of(path: Path | None) -> Mapping[str, object]:
-    """The table [drive] that a TOML file holds; a simulated one without a file."""
+    """Read the table [drive] of a TOML file; without a file, return that of a simulated drive."""
     return SIMULATED if path is None else dict(read_toml(path).table("drive", required=True).values)
 
 
-def edge_config(twin: TwinFile, wanted: Enrolment) -> EdgeConfig:
-    """Configuration of a servo's edge: supervised as the twin's policy needs it.
+def edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
+    """Make the configuration of a servo's edge, with the supervision that the twin's policy requires.
 
     Raises
     ------
     InvalidInput
         The servo has no model, or nothing is verified for its stated range.
     """
-    model = twin.fleet.model_of(wanted.servo)
-    sampled = wanted.role == "control" or wanted.noise > 0.0
-    law = model.servo.controller.replace(sample_rate=wanted.sample_rate if sampled else None)
+    model = twin.fleet.model_of(request.servo)
+    sampled = request.role == "control" or request.noise > 0.0
+    law = model.servo.controller.replace(sample_rate=request.sample_rate if sampled else None)
     recording = Recording(
-        sample_rate=wanted.sample_rate, longest_window=LONGEST_WINDOW_S, longest_pre_trigger=LONGEST_PRE_TRIGGER_S
+        sample_rate=request.sample_rate, longest_window=LONGEST_WINDOW_S, longest_pre_trigger=LONGEST_PRE_TRIGGER_S
     )
     servo = model.servo.replace(controller=law)
-    commissioning = Commissioning(servo, law, model.settings, recording, noise=wanted.noise)
+    commissioning = Commissioning(servo, law, model.settings, recording, noise=request.noise)
     commissioning.check_window()
-    agent = commissioning.agent_settings(wanted.servo, UNBOOTED)
-    certificate = None if _trusted(twin, wanted) is None else CERTIFICATE
-    link = TwinLink(wanted.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
-    return EdgeConfig(agent, wanted.role, agent.controller or law, wanted.drive, link, folder=wanted.folder)
+    agent = commissioning.agent_settings(request.servo, UNBOOTED)
+    certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE
+    link = TwinLink(request.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
+    return EdgeConfig(agent, request.role, agent.controller or law, request.drive, link, folder=request.folder)
 
 
 def url_of(service: ServiceConfig) -> str:
-    """Where the service listens, as its file says.
+    """URL at which the service listens, from its settings.
 
     Raises
     ------
     InvalidInput
-        It does not: any port, every address, or only a proxy reaches it.
+        The settings do not determine it: any port, all addresses, or a proxy in front.
     """
     if service.behind_proxy:
-        raise InvalidInput("behind_proxy = true: say with --url where edges reach the proxy")
+        raise InvalidInput("behind_proxy = true: give the address of the proxy with --url")
     if service.port == 0 or service.bind in ("0.0.0.0", "::"):
-        raise InvalidInput(f"bind = {service.bind!r}, port = {service.port}: say with --url where edges reach the twin")
+        raise InvalidInput(f"bind = {service.bind!r}, port = {service.port}: give the address of the twin with --url")
     host = f"[{service.bind}]" if ":" in service.bind else service.bind
     return f"{'http' if service.tls_key is None else 'https'}://{host}:{service.port}"
 
 
-def _configured(certificates: Path | None, folder: Path, text: str) -> list[Path]:
+def _write_configuration(certificates: Path | None, folder: Path, text: str) -> list[Path]:
     made = [write_text(folder / CONFIG, text)]
     if certificates is not None:
         made.append(Path(shutil.copyfile(certificates, folder / CERTIFICATE)))
     return made
 
 
-def _trusted(twin: TwinFile, wanted: Enrolment) -> Path | None:
-    """What the edge checks the twin's certificate against; None: what its system knows."""
-    if wanted.ca is not None:
-        _signers(wanted.ca)
-        return wanted.ca
+def _trusted_certificates(twin: TwinFile, request: Enrolment) -> Path | None:
+    """Certificates that the edge checks the twin's against; None: those of its system."""
+    if request.ca is not None:
+        _authorities(request.ca)
+        return request.ca
     own = twin.service.tls_certificate
-    return own if own is not None and any(each["subject"] == each["issuer"] for each in _signers(own)) else None
+    return own if own is not None and any(each["subject"] == each["issuer"] for each in _authorities(own)) else None
 
 
-def _signers(certificates: Path) -> list[Any]:
-    """Those in a file that may sign others; raises InvalidInput where it holds no certificates."""
+def _authorities(certificates: Path) -> list[Any]:
+    """Certificates of a file that may sign others; raises InvalidInput where it holds none."""
     try:
         return ssl.create_default_context(cafile=str(certificates)).get_ca_certs()
     except OSError as error:
@@ -198,34 +199,34 @@ def _tokens_file(twin: TwinFile) -> Path:
 
 
 def _add(tokens: Path, role: str, name: str, token: str, again: bool) -> None:
-    """To the file as it is now: others may have been enrolled meanwhile."""
+    """Add a verifier to the file of tokens as it is now: others may have been enrolled meanwhile."""
     with tokens_locked(tokens):
-        known = _known(tokens)
-        there: Mapping[str, bytes] = getattr(known, role)
-        _check_name(name, there, again)
-        write_tokens(tokens, replace(known, **{role: {**there, name: verifier_of(token)}}))
+        known = _read_or_create(tokens)
+        verifiers: Mapping[str, bytes] = getattr(known, role)
+        _check_name(name, verifiers, again)
+        write_tokens(tokens, replace(known, **{role: {**verifiers, name: verifier_of(token)}}))
 
 
-def _known(tokens: Path) -> Verifiers:
+def _read_or_create(tokens: Path) -> Verifiers:
     if not tokens.exists():
         tokens.touch(PRIVATE)
     return read_tokens(tokens)
 
 
-def _check(wanted: Enrolment, known: Verifiers) -> None:
-    if wanted.role not in ROLES:
-        raise InvalidInput(f"role = {wanted.role!r} is not allowed; give one of {', '.join(ROLES)}")
-    _check_name(wanted.servo, known.servos, wanted.again)
-    _check_folder(wanted)
+def _check(request: Enrolment, known: Verifiers) -> None:
+    if request.role not in ROLES:
+        raise InvalidInput(f"role = {request.role!r} is not allowed; give one of {', '.join(ROLES)}")
+    _check_name(request.servo, known.servos, request.again)
+    _check_folder(request)
 
 
-def _check_folder(wanted: Enrolment) -> None:
-    """Another servo's edge is not given this one's token."""
-    file, token = wanted.folder / CONFIG, wanted.folder / TOKEN
-    whose = load(file).agent.servo if file.exists() else wanted.servo
-    if whose != wanted.servo:
-        raise InvalidInput(f"{file}: is that of servo {whose!r}; give {wanted.servo!r} another folder")
-    if token.exists() and not wanted.again:
+def _check_folder(request: Enrolment) -> None:
+    """Refuse a folder that belongs to another servo's edge, or that has a token already."""
+    file, token = request.folder / CONFIG, request.folder / TOKEN
+    owner = load(file).agent.servo if file.exists() else request.servo
+    if owner != request.servo:
+        raise InvalidInput(f"{file}: is that of servo {owner!r}; give {request.servo!r} another folder")
+    if token.exists() and not request.again:
         raise InvalidInput(f"{token}: there is a token already; give --again to replace it by a new one")
 
 

@@ -27,10 +27,11 @@ from servotwin.up.speed import FASTEST
 MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operator.token"
 EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
 LONGEST = 100
-"""Bytes of a socket's path that every system takes."""
+"""Bytes of a socket's path that every system accepts: Linux allows 107, macOS 103."""
 ENDING_S = 25.0
-"""s that what an earlier start left behind may take to end."""
+"""s that processes of an earlier start, which was killed, may take to end."""
 _PLACEHOLDER = "http://127.0.0.1:1"
+"""URL of the twin in the edges' files until its port is known."""
 _RETRY = Retry(0.5, 2.0, 2.0)
 
 
@@ -103,33 +104,33 @@ def opened(path: Path) -> Iterator[Folder]:
 def _check_length(path: Path) -> None:
     longest = max(len(os.fsencode(path / servo.name / DRIVE)) for servo in SERVOS)
     if longest > LONGEST:
-        told = f"its path is {longest - LONGEST} bytes too long for the sockets in it"
-        raise InvalidInput(f"folder {path}: {told}; choose a shorter one with --folder")
+        fault = f"its path is {longest - LONGEST} bytes too long for the sockets in it"
+        raise InvalidInput(f"folder {path}: {fault}; choose a shorter one with --folder")
 
 
 def _check(path: Path) -> None:
     try:
-        found = msgspec.json.decode((path / MARKER).read_bytes(), type=Marker).servos
+        servos = msgspec.json.decode((path / MARKER).read_bytes(), type=Marker).servos
     except (OSError, msgspec.MsgspecError):
         allowed = "choose another with --folder, or one that is empty or not there yet"
         raise InvalidInput(f"folder {path}: was not made by servotwin up; {allowed}") from None
-    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in found for file in (EDGE, MACHINE, enrolment.TOKEN))]
+    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in servos for file in (EDGE, MACHINE, enrolment.TOKEN))]
     missing = [name for name in needed if not (path / name).is_file()]
-    if found != [servo.name for servo in SERVOS] or missing:
-        what = f"{missing[0]} is missing" if missing else f"its servos are {', '.join(found)}"
-        raise InvalidInput(f"folder {path}: {what}; remove the folder to begin anew, or choose another with --folder")
+    if servos != [servo.name for servo in SERVOS] or missing:
+        fault = f"{missing[0]} is missing" if missing else f"its servos are {', '.join(servos)}"
+        raise InvalidInput(f"folder {path}: {fault}; remove the folder to begin anew, or choose another with --folder")
 
 
 def _make(path: Path) -> None:
-    """Make everything in a folder beside it, then rename that."""
+    """Make everything in a temporary folder beside it, then rename that one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     try:
-        _fill(beside)
+        _fill(temporary)
         with suppress(FileExistsError):  # another start was quicker
-            beside.replace(path)
+            temporary.replace(path)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _fill(path: Path) -> None:
@@ -138,10 +139,16 @@ def _fill(path: Path) -> None:
     enrolment.enroll_operator(path / TWIN, "up", path / OPERATOR)
     for servo in SERVOS:
         folder, drive = path / servo.name, {"kind": "simulated", "address": f"unix:{DRIVE}"}
-        wanted = enrolment.Enrolment(
-            servo.name, folder, servo.role, RATE, drive, _PLACEHOLDER, noise=servo.noise_mm * 1e-3
+        request = enrolment.Enrolment(
+            servo=servo.name,
+            folder=folder,
+            role=servo.role,
+            sample_rate=RATE,
+            drive=drive,
+            url=_PLACEHOLDER,
+            noise=servo.noise_mm * 1e-3,
         )
-        enrolment.enroll(path / TWIN, wanted)
+        enrolment.enroll(path / TWIN, request)
         config = load(folder / EDGE)
         agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
         write_text(folder / EDGE, edge_toml(replace(config, agent=agent)))
@@ -151,7 +158,7 @@ def _fill(path: Path) -> None:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
-    """The lock; what a killed start left behind keeps it until it has ended, which it does by itself."""
+    """Take the lock. Processes that a killed start left behind hold it until they end, which they do by themselves."""
     end = time.monotonic() + ENDING_S
     with ExitStack() as stack:
         while True:
@@ -160,9 +167,11 @@ def _locked(path: Path) -> Iterator[int]:
                 break
             except BlockingIOError:
                 holder = (path / LOCK).read_bytes()[:32].decode("ascii", "replace").strip()
+                # The holder's id is in the file; its children inherit the lock and may outlive it.
                 if _alive(holder) or time.monotonic() > end:
-                    told = f"is in use by another servotwin up (process {holder or 'unknown'})"
-                    raise InvalidInput(f"folder {path}: {told}") from None
+                    raise InvalidInput(
+                        f"folder {path}: is in use by another servotwin up (process {holder or 'unknown'})"
+                    ) from None
                 time.sleep(0.1)
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)

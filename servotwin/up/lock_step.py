@@ -68,37 +68,39 @@ class HttpTwin:
             raise InvalidInput(f"twin url = {url!r}: must be http://HOST:PORT or https://HOST:PORT")
         if token and in_clear(url):
             raise InvalidInput(f"twin url = {url!r}: would send the token in clear to another machine; give https://")
-        place: Any = {"host": parts.hostname, "port": parts.port, "timeout": _TIMEOUT_S}
-        self._line = HTTPConnection(**place) if parts.scheme == "http" else HTTPSConnection(**place, context=context)
+        address: Any = {"host": parts.hostname, "port": parts.port, "timeout": _TIMEOUT_S}
+        self._connection = (
+            HTTPConnection(**address) if parts.scheme == "http" else HTTPSConnection(**address, context=context)
+        )
         self._path = f"/v1/servos/{servo}/lockstep"
         self._headers = {"authorization": f"Bearer {token}"} if token else {}
         self._wake: float | None = None
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """Messages that it sends after a message that arrived at `now` (s)."""
+        """Send a message at `now` (s); returns the messages that the twin sends after it."""
         return self._request("receive", now, encode(message))
 
     def wake(self, now: float) -> list[Message]:
-        """Messages that it sends by itself at `now` (s)."""
+        """Wake the twin at `now` (s); returns the messages that it sends by itself."""
         return self._request("wake", now, b"")
 
     def next_wake(self) -> float | None:
-        """Time at which it is to be woken, s, as of its last response."""
+        """Time at which the twin is to be woken, s, as of its last response."""
         return self._wake
 
     def close(self) -> None:
         """Close the connection."""
-        self._line.close()
+        self._connection.close()
 
-    def _request(self, what: str, now: float, body: bytes) -> list[Message]:
-        self._line.request("POST", f"{self._path}/{what}?now={now!r}", body, self._headers)
-        response = self._line.getresponse()
+    def _request(self, action: str, now: float, body: bytes) -> list[Message]:
+        self._connection.request("POST", f"{self._path}/{action}?now={now!r}", body, self._headers)
+        response = self._connection.getresponse()
         data = response.read()
         if response.status != 200:
-            raise InvalidInput(f"twin {self._path}/{what} at {now:g} s: {response.status} {data[:500].decode()}")
-        found = _response.decode(data)
-        self._wake = found.wake
-        return [decode(each) for each in found.messages]
+            raise InvalidInput(f"twin {self._path}/{action} at {now:g} s: {response.status} {data[:500].decode()}")
+        decoded = _response.decode(data)
+        self._wake = decoded.wake
+        return [decode(each) for each in decoded.messages]
 
 
 class DrivenMachine:
@@ -135,21 +137,21 @@ class DrivenMachine:
         return self._signals[name][first:last]
 
     def set_tolerance(self, tolerance: float) -> None:
-        """A new dead zone (m) from the present sample on."""
+        """Set another dead zone (m) from the present sample on."""
         self._write(tolerance, None)
 
     def set_controller(self, controller: Controller, tolerance: float) -> None:
-        """Other gains and dead zone (m) from the present sample on."""
+        """Set other gains and another dead zone (m) from the present sample on."""
         self._write(tolerance, gains_of(controller))
 
     def set_reference(self, _reference: PiecewiseCubic) -> None:
-        """Lock-step has no excitation.
+        """Refuse: lock-step has no excitation.
 
         Raises
         ------
         InvalidInput
         """
-        raise InvalidInput("lock-step knows no probing moves: leave [twin.excitation] out of the scenario")
+        raise InvalidInput("lock-step has no probing moves: leave [twin.excitation] out of the scenario")
 
     def _write(self, tolerance: float, gains: Gains | None) -> None:
         self._version += 1

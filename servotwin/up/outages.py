@@ -98,17 +98,17 @@ class Forwarder:
 
     async def _forward(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self.left:
-            writer.transport.abort()
+            writer.transport.abort()  # a reset, as of a cut link; a close would look like an orderly end
             return
         try:
-            onward = await asyncio.open_connection("127.0.0.1", self._target)
+            target_reader, target_writer = await asyncio.open_connection("127.0.0.1", self._target)
         except OSError:
             writer.transport.abort()
             return
-        writers = {writer, onward[1]}
+        writers = {writer, target_writer}
         self._writers |= writers
         try:
-            await asyncio.gather(_pump(reader, onward[1]), _pump(onward[0], writer))
+            await asyncio.gather(_pump(reader, target_writer), _pump(target_reader, writer))
         finally:
             self._writers -= writers
             for each in writers:

@@ -76,7 +76,7 @@ def _model(name: str) -> str:
 
 _SERVICE = """\
 [service]
-port = 0                      # servotwin up takes any free one
+port = 0                      # any free port
 tokens = "tokens.toml"
 workers = 1
 speed = {speed:.1f}                 # machine time passes that much faster than the clock, at most
@@ -93,15 +93,15 @@ validity_s = 1800.0           # machine time: half a minute at sixty times real 
 [models.{name}.twin.trend]
 wear_deg = 10.0
 over_s = 3600.0
-[models.{name}.twin.triage]   # a window at which the gap has hardly moved is only glanced at
+[models.{name}.twin.triage]   # a window in which the gap has hardly moved is only screened
 every = 10
 """
 _MACHINE = """\
 role = "{role}"
 listen = "unix:drive.sock"
 speed = 5.0
-state_file = "state.json"     # how long it has run; without this file it is new again
-speed_file = "speed"          # goes before speed; servotwin up writes it
+state_file = "state.json"     # machine time so far; without this file the machine is new again
+speed_file = "speed"          # overrides speed; servotwin up writes it
 
 [scenario]
 servo = "paper"
@@ -128,6 +128,6 @@ sample_rate_hz = {rate}
 [scenario.controller]
 sample_rate_hz = {rate}
 
-[scenario.twin]               # of no account here: gains and dead zone come from the edge
+[scenario.twin]               # not used here: gains and dead zone come from the edge
 policy = "paper"
 """

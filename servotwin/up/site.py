@@ -12,7 +12,7 @@ from servotwin.up.plan import SERVOS
 
 _LISTENING = "servotwin twin: listening on "
 _READY_S, _STOP_S, _POLL_S = 600.0, 20.0, 0.05
-"""The very first start compiles, which takes minutes."""
+"""s to get ready (the very first start compiles, which takes minutes), to end, and between checks."""
 
 Signals = Callable[[], int]
 """Number of signals so far; after the second one processes are killed."""
@@ -66,14 +66,15 @@ class Site:
         first = [self.twin, *self.machines.values()]
         for child in first:
             child.start()
-        self._await(first)
+        self._wait_until_ready(first)
         port = self.url.rpartition(":")[2]
+        # A restarted twin has to listen on the same port: edges and forwarder have its address.
         self.twin.command = (*self.twin.command[:-1], port)
         self.forwarder = Forwarder(int(port), self._outages)
         self.forwarder.start()
         for servo in SERVOS:
-            through = f"http://127.0.0.1:{self.forwarder.port}" if servo.outages else self.url
-            self._folder.connect(servo, through)
+            url = f"http://127.0.0.1:{self.forwarder.port}" if servo.outages else self.url
+            self._folder.connect(servo, url)
         for child in self.edges.values():
             child.start()
 
@@ -89,7 +90,7 @@ class Site:
         for child in self.children:
             child.read_output()
             if child.code is not None:
-                ended.append(f"{child.name} ended by itself (code {child.code}) and was started again")
+                ended.append(f"{child.name} ended unexpectedly (code {child.code}) and was restarted")
                 child.restart(now)
         return ended
 
@@ -112,7 +113,7 @@ class Site:
     def _edge(self, servo: str) -> Child:
         return self._child(f"edge {servo}", ("servotwin.edge_process", str(self._folder.path / servo / EDGE)), "")
 
-    def _await(self, children: list[Child]) -> None:
+    def _wait_until_ready(self, children: list[Child]) -> None:
         end = time.monotonic() + _READY_S
         while any(child.address is None for child in children):
             for child in children:

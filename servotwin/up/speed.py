@@ -13,8 +13,9 @@ LIMIT, TARGET = 0.60, 0.52
 """Shares of two cores: the limit, and the set point below it."""
 CORES = 2
 _MAX_WAITING = 10
-"""Messages that wait for the twin; more are a queue that grows."""
+"""Messages that may wait for the twin; more mean that its queue grows."""
 _DEADBAND, _REACHED = 0.08, 0.93
+"""Relative change of speed that is not made; share of the set speed that a machine in time reaches."""
 _SMOOTHING = 0.5
 """Weight of the newest measurement of the processor's share, which comes in bursts."""
 _PROC = Path("/proc")
@@ -94,7 +95,7 @@ class SpeedMeter:
 
     @property
     def started(self) -> bool:
-        """Test whether the start is over, so that measurements count."""
+        """True once the start is over, so that measurements count."""
         return self._measurements > 1 and bool(self._last)
 
     @property
@@ -127,13 +128,12 @@ class SpeedMeter:
         """
         cores = self._usage.measure(used, now)
         if cores is not None:
-            self._measurements, self._total = (
-                self._measurements + 1,
-                self._total + (cores if self._measurements else 0.0),
-            )
+            # The first measurement contains the start, when processes import and compile.
+            self._total += cores if self._measurements else 0.0
+            self._measurements += 1
             self.cores = cores if self.cores is None else self.cores + _SMOOTHING * (cores - self.cores)
-        moved = {name: new for name, new in times.items() if name in self._last and new.wall > self._last[name].wall}
-        self.reached = min((_speed(self._last[name], new) for name, new in moved.items()), default=self.reached)
+        advanced = {name: new for name, new in times.items() if name in self._last and new.wall > self._last[name].wall}
+        self.reached = min((_speed(self._last[name], new) for name, new in advanced.items()), default=self.reached)
         self._last |= times
         self._first = {**times, **self._first}
 
@@ -147,7 +147,7 @@ class CoreUsage:
 
     def __init__(self) -> None:
         self._before: dict[int, float] = {}
-        self._then: float | None = None
+        self._last: float | None = None
 
     def measure(self, used: dict[int, float] | None, now: float) -> float | None:
         """Cores used since the last measurement; None: unknown.
@@ -159,11 +159,11 @@ class CoreUsage:
         now : float
             Monotonic clock, s.
         """
-        before, then = self._before, self._then
-        self._before, self._then = used or {}, now
-        if used is None or then is None or not now > then:
+        before, last = self._before, self._last
+        self._before, self._last = used or {}, now
+        if used is None or last is None or not now > last:
             return None
-        return sum(max(0.0, time - before.get(pid, 0.0)) for pid, time in used.items()) / (now - then)
+        return sum(max(0.0, time - before.get(pid, 0.0)) for pid, time in used.items()) / (now - last)
 
 
 def processor_times(groups: Collection[int], processes: Collection[int], root: Path = _PROC) -> dict[int, float] | None:

@@ -97,7 +97,7 @@ class TwinPoller:
 
     def __init__(self, url: str, token: str, servos: Sequence[str]) -> None:
         parts = urlsplit(url)
-        self._place, self._servos = (parts.hostname or "", parts.port), servos
+        self._host, self._port, self._servos = parts.hostname or "", parts.port, servos
         self._headers = {"authorization": f"Bearer {token}"}
         self.twin: TwinStatus | None = None
         self.estimates: dict[str, ServoEstimate] = {}
@@ -116,29 +116,29 @@ class TwinPoller:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            line = HTTPConnection(*self._place, timeout=_TIMEOUT_S)
+            connection = HTTPConnection(self._host, self._port, timeout=_TIMEOUT_S)
             with suppress(OSError, HTTPException, msgspec.MsgspecError, KeyError, TypeError, ValueError):
                 while not self._stop.is_set():
-                    self.twin = self._poll(line)
+                    self.twin = self._poll(connection)
                     self._stop.wait(_POLL_S)
-            line.close()
+            connection.close()
             self.twin = None
             self._stop.wait(0.2)
 
-    def _poll(self, line: HTTPConnection) -> TwinStatus:
-        waiting = msgspec.json.decode(self._get(line, "/healthz"))["waiting"]
-        counts = read_metrics(self._get(line, "/metrics").decode())
+    def _poll(self, connection: HTTPConnection) -> TwinStatus:
+        waiting = msgspec.json.decode(self._get(connection, "/healthz"))["waiting"]
+        counts = read_metrics(self._get(connection, "/metrics").decode())
         for servo in self._servos:
             limit = _WINDOWS if servo in self.estimates else _FIRST_WINDOWS
-            links = msgspec.json.decode(self._get(line, f"/v1/servos/{servo}/audit?limit={limit}"))
-            newest = newest_estimate(links)
+            traces = msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}"))
+            newest = newest_estimate(traces)
             if newest is not None:
                 self.estimates[servo] = newest
         return TwinStatus(waiting["messages"], waiting["age"], counts)
 
-    def _get(self, line: HTTPConnection, path: str) -> bytes:
-        line.request("GET", path, headers=self._headers)
-        response = line.getresponse()
+    def _get(self, connection: HTTPConnection, path: str) -> bytes:
+        connection.request("GET", path, headers=self._headers)
+        response = connection.getresponse()
         data = response.read()
         if response.status not in (200, 503):
             raise HTTPException(f"{path}: {response.status}")
@@ -157,20 +157,20 @@ def read_metrics(metrics: str) -> dict[str, int]:
     return counts
 
 
-def newest_estimate(links: list[dict[str, Any]]) -> ServoEstimate | None:
+def newest_estimate(traces: list[dict[str, Any]]) -> ServoEstimate | None:
     """Newest estimate with status OK in an evidence chain, newest window first; None: there is none."""
     status = ""
-    for link in links:
-        found = {each["kind"]: each for each in link["found"]}
-        if "estimate" not in found:
+    for trace in traces:
+        evidence = {each["kind"]: each for each in trace["found"]}
+        if "estimate" not in evidence:
             continue
-        status = status or found["estimate"]["status"]
-        if found["estimate"]["status"] == OK:
-            estimate = found["estimate"]["body"]["estimate"]
+        status = status or evidence["estimate"]["status"]
+        if evidence["estimate"]["status"] == OK:
+            estimate = evidence["estimate"]["body"]["estimate"]
             low, high = estimate["interval"]
-            rate, rate_half = _wear(found.get("trend"))
+            rate, rate_half = _wear(evidence.get("trend"))
             return ServoEstimate(
-                boot=link["window"]["boot"],
+                boot=trace["window"]["boot"],
                 time=estimate["time"],
                 gap=estimate["gap"],
                 interval=(low, high),
@@ -211,7 +211,7 @@ class EstimateError(NamedTuple):
 
     @property
     def inside(self) -> bool | None:
-        """Test whether the interval covers the truth."""
+        """True where the interval covers the truth; None: the truth is unknown."""
         low, high = map(degrees, self.estimate.interval)
         return None if self.truth is None else low <= self.truth <= high
 

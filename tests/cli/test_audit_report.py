@@ -149,7 +149,7 @@ def test_starts_of_the_edge_and_faults_of_the_twin_are_told() -> None:
     ]
     lines = chain(link(1, estimate()), link(2, estimate(), boot="b2"), events=events)
     assert [line[21:] for line in lines if line.startswith("1970") and "7.5" not in line] == [
-        "edge in touch: boot b2, version 3 in force",
+        "edge connected: boot b2, version 3 in force",
         "the edge answers a request: taken",
         "failed: the state is not understood; the twin begins anew",
     ]

@@ -114,7 +114,7 @@ def test_windows_that_retention_took_are_counted_and_the_rest_is_compared(folder
     assert gone.kept > 0
     code, said = replayed(folder)
     assert code == 0
-    assert f"{gone.emptied} not made again, as retention took the window" in said
+    assert f"{gone.emptied} not repeated: retention deleted the window's body" in said
     assert f"{gone.kept} the same, bit for bit" in said
 
 
@@ -138,7 +138,7 @@ def test_what_is_not_understood_is_told_for_each_window(folder: Path, statement:
     assert changed(folder, statement) > 0
     code, found = replayed(folder)
     assert code == 1
-    assert "NOT made again, as what is stored is not understood" in found
+    assert "NOT repeated: the stored data cannot be decoded" in found
     assert re.search(said, found), found
     assert "Traceback" not in found
 
@@ -148,7 +148,7 @@ def test_what_was_never_estimated_is_counted_as_that(folder: Path) -> None:
     code, said = replayed(folder)
     assert (code, said.splitlines()[1].strip()) == (
         0,
-        f"{windows(folder)} not estimated, as nothing could be made of the window",
+        f"{windows(folder)} not estimated: the window could not be processed",
     )
 
 

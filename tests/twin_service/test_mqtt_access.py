@@ -107,7 +107,7 @@ def test_without_paho_one_sentence_says_what_to_install(monkeypatch: pytest.Monk
 
 def test_a_broker_elsewhere_asks_for_tokens(tmp_path: Path) -> None:
     for text, what in (
-        ('[service.mqtt]\nurl = "mqtts://elsewhere"', "asks for tokens"),
+        ('[service.mqtt]\nurl = "mqtts://elsewhere"', "requires tokens"),
         ('[service]\nlockstep = true\n[service.mqtt]\nurl = "mqtt://localhost"', "exclude each other"),
         ('[service.mqtt]\nurl = "mqtt://localhost"\ngroup = "a/b"', "a name without"),
     ):

@@ -123,14 +123,14 @@ def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, de
     else:
         assert found == whole
         assert len(whole) <= limit
-    assert bodies.held == 0
+    assert bodies.buffered == 0
 
 
 def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
     bodies = BodyReader(100, 10.0, memory=150)
     with pytest.raises(Disconnected):
         asyncio.run(bodies.read(None, received(b"x", end=False)))
-    assert bodies.held == 0
+    assert bodies.buffered == 0
 
     async def two():
         gate = asyncio.Event()
@@ -151,7 +151,7 @@ def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
         return refused.value.refusal
 
     assert asyncio.run(two()) is Refusal.UNAVAILABLE
-    assert bodies.held == 0
+    assert bodies.buffered == 0
 
 
 def test_metrics_are_prometheus_text():
@@ -309,10 +309,10 @@ def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not
 
 def test_another_address_needs_tokens_and_tls_or_a_proxy(tmp_path):
     for values in ({}, {"tokens": "tokens.toml"}, {"behind_proxy": True}):
-        with pytest.raises(InvalidInput, match="only with tokens"):
+        with pytest.raises(InvalidInput, match="requires tokens"):
             config(tmp_path, {"bind": "0.0.0.0", **values})
     assert not config(tmp_path, {"bind": "::", "tokens": "tokens.toml", "behind_proxy": True}).local
-    with pytest.raises(InvalidInput, match="asks for tokens"):
+    with pytest.raises(InvalidInput, match="requires tokens"):
         config(tmp_path, {"bind": "127.0.0.1", "behind_proxy": True})
     for address in ("localhost", "127.0.0.2", "::1"):
         assert config(tmp_path, {"bind": address}).local

@@ -105,7 +105,7 @@ def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path
 
     with started(path, "--speed", "10") as second:
         lines = told(second, RUNNING)
-        assert sum(line.startswith("going on with") for line in lines) == len(SERVOS)
+        assert sum(line.startswith("continuing with") for line in lines) == len(SERVOS)
         refused = subprocess.run(
             [sys.executable, "-m", "servotwin", "up", "--folder", str(path)],
             capture_output=True,

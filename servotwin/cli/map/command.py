@@ -1,4 +1,4 @@
-"""`servotwin map`: computes what is missing, piece by piece, and writes numbers, table and picture."""
+"""`servotwin map`: compute the missing chunks of a map, and write its numbers, table and picture."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def stability_map(
     scheduler: str | None = None,
     console: Console | None = None,
 ) -> StabilityMap:
-    """Compute a map, or what is missing of it, into the directory `out`.
+    """Compute a map, or its missing chunks, into the directory `out`.
 
     Parameters
     ----------
     request : MapOptions
     out : Path
-        Made if missing. Gets settings.json and chunks/, from which an interrupted map goes on; map.npz, map.csv,
+        Made if missing. Gets settings.json and chunks/, from which an interrupted map continues; map.npz, map.csv,
         map.txt and map.png.
     workers : int, optional
         Processes on this machine; one per core by default.
@@ -46,7 +46,7 @@ def stability_map(
     InvalidInput
         A value out of its range, a directory that cannot be written or holds another map, a scheduler out of reach.
     KeyboardInterrupt
-        With a sentence on what is finished and how to go on.
+        Its message says how much is finished and how to continue.
     """
     console = console or Console()
     check_extra("matplotlib", "servotwin map")
@@ -55,12 +55,12 @@ def stability_map(
     settings = request.settings()
     store = MapStore(out, settings)
     compute(store, workers, scheduler, console)
-    found = StabilityMap(settings, collected(store))
-    write_numbers(found, out)
-    files.write_text(out / "map.txt", summary.text(found))
-    summary.tell(found, console)
+    result = StabilityMap(settings, collected(store))
+    write_numbers(result, out)
+    files.write_text(out / "map.txt", summary.text(result))
+    summary.print_summary(result, console)
     from servotwin.cli.map import figure
 
-    path = figure.save(found, out)
+    path = figure.save(result, out)
     console.print(f"picture: {path}", soft_wrap=True, highlight=False)
-    return found
+    return result

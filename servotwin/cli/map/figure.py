@@ -1,4 +1,4 @@
-"""A map as a picture: over two axes as panels of colour, over one as curves, over more as a sheet of small maps."""
+"""Picture of a map: curves over one axis, panels of colour over two, a sheet of small maps over more."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LABELS = {
 }
 _RATIO_LABELS = {"tolerance": ("tolerance / (p b)", 1.0), "amplitude": ("reference step / (p b)", 1.0)}
 _DOT: Any = {"color": style.PINK, "linestyle": "", "marker": ".", "markersize": 2.5}
-# The horizontal axis is what one can choose: the dead zone.
+# The horizontal axis is the one that a designer can choose: the dead zone.
 _ACROSS = ("tolerance", "k_dz", "estimate", "gap", "amplitude")
 
 
@@ -51,32 +51,32 @@ class PictureAxis:
         return bool(np.ptp(ratios) / np.abs(ratios).mean() < np.ptp(steps) / np.abs(steps).mean())
 
 
-def save(found: StabilityMap, directory: Path) -> Path:
+def save(result: StabilityMap, directory: Path) -> Path:
     """Write map.png; returns its path."""
     path = directory / "map.png"
     with style.look():
-        figure = draw(found)
+        figure = draw(result)
         with files.atomic_output(path) as temporary:
             figure.savefig(temporary, format="png", dpi=150)
     return path
 
 
-def draw(found: StabilityMap) -> Figure:
-    """The picture for the number of axes that vary."""
-    varying = lines(found)
+def draw(result: StabilityMap) -> Figure:
+    """Draw the picture for the number of axes that vary."""
+    varying = lines(result)
     if len(varying) == 1:
-        return _curves(found, varying[0])
+        return _curves(result, varying[0])
     if len(varying) == 2:
-        return _panels(found, *_order(varying))
-    return _sheet(found, varying)
+        return _panels(result, *_order(varying))
+    return _sheet(result, varying)
 
 
-def lines(found: StabilityMap) -> list[PictureAxis]:
+def lines(result: StabilityMap) -> list[PictureAxis]:
     """The axes that vary."""
-    labels = _RATIO_LABELS if isinstance(found.settings.axes, RatioAxes) else _LABELS
+    labels = _RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS
     return [
         PictureAxis(name, labels[name][0], np.array(values) * labels[name][1])
-        for name, values in found.axes
+        for name, values in result.axes
         if len(values) > 1
     ]
 
@@ -87,23 +87,23 @@ def _order(pair: Sequence[PictureAxis]) -> tuple[PictureAxis, PictureAxis]:
     return across, up
 
 
-def _unit(found: StabilityMap) -> tuple[float, str]:
+def _unit(result: StabilityMap) -> tuple[float, str]:
     """Unit of lengths and its name."""
-    axes = found.settings.axes
+    axes = result.settings.axes
     if isinstance(axes, RatioAxes):
-        return 0.5 * found.settings.servo.p * axes.gap, "p b"
+        return 0.5 * result.settings.servo.p * axes.gap, "p b"
     return 1e-3, "mm"
 
 
-def _panels(found: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure:
+def _panels(result: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure:
     figure = style.sheet(7.2, 7.8)
     axes = figure.subplots(3, 2, sharex=True)
-    unit, name = _unit(found)
-    turned = [line.name for line in lines(found)].index(across.name) == 0
+    unit, name = _unit(result)
+    turned = [line.name for line in lines(result)].index(across.name) == 0
 
     def grid(measure: str) -> Array:
         """(up, across)."""
-        values = found.grid(measure).squeeze()
+        values = result.grid(measure).squeeze()
         return values.T if turned else values
 
     _colour(axes[0, 0], across, up, grid("settled"), Normalize(0.0, 1.0))
@@ -112,7 +112,7 @@ def _panels(found: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure
     _shares(axes[0, 1], across, grid("settled"), bool(slow.any()))
     error, swing = grid("error") / unit, grid("swing") / unit
     _colour(axes[1, 0], across, up, error, _norm(error))
-    _colour(axes[1, 1], across, up, swing, _norm(swing, found.settings.still / unit))
+    _colour(axes[1, 1], across, up, swing, _norm(swing, result.settings.still / unit))
     _colour(axes[2, 0], across, up, grid("settling"), _norm(grid("settling"), 0.5))
     _colour(axes[2, 1], across, up, grid("effort"), _norm(grid("effort")))
     titles = (
@@ -121,7 +121,7 @@ def _panels(found: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure
         f"worst error at the end ({name})",
         f"worst swing at the end (± {name})",
         "worst 5 % settling time (s); white: never",
-        _effort(found),
+        _effort(result),
     )
     for one, letter, title in zip(axes.ravel(), "abcdef", titles, strict=True):
         one.set_title(f"({letter}) {title}", loc="left")
@@ -132,8 +132,8 @@ def _panels(found: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure
     return figure
 
 
-def _effort(found: StabilityMap) -> str:
-    axes = found.settings.axes
+def _effort(result: StabilityMap) -> str:
+    axes = result.settings.axes
     where = f" at a gap of {math.degrees(axes.gap):g} deg" if isinstance(axes, RatioAxes) else ""
     return f"voltage{where} (V rms)"
 
@@ -170,7 +170,7 @@ def _scales(axes: Axes, across: PictureAxis, up: PictureAxis | None = None) -> N
 
 
 def _rule(axes: Axes, across: PictureAxis) -> None:
-    """The paper's k_DZ along the top, for a gap that is known exactly."""
+    """Add the paper's k_DZ, for a gap that is known exactly, along the top."""
     if across.name != "tolerance" or across.logarithmic:
         return
     above = axes.secondary_xaxis("top", functions=(lambda x: np.multiply(0.5, x), lambda k: np.multiply(2.0, k)))
@@ -179,7 +179,7 @@ def _rule(axes: Axes, across: PictureAxis) -> None:
 
 
 def _mark(axes: Axes, across: PictureAxis, up: PictureAxis, where: NDArray[np.bool_]) -> None:
-    """Cells in which the conventional ten seconds would mislead."""
+    """Mark the cells in which a window of ten seconds would call more runs settled."""
     rows, columns = np.nonzero(where)
     axes.plot(across.values[columns], up.values[rows], **_DOT)
 
@@ -196,10 +196,10 @@ def _shares(axes: Axes, across: PictureAxis, settled: Array, marked: bool) -> No
     axes.grid(True)
 
 
-def _curves(found: StabilityMap, across: PictureAxis) -> Figure:
+def _curves(result: StabilityMap, across: PictureAxis) -> Figure:
     figure, axes = style.panels(4, 1, height=1.7)
-    unit, name = _unit(found)
-    flat = {measure: found.grid(measure).ravel() for measure in ("settled", "error", "swing", "settling", "effort")}
+    unit, name = _unit(result)
+    flat = {measure: result.grid(measure).ravel() for measure in ("settled", "error", "swing", "settling", "effort")}
     axes[0, 0].plot(across.values, 100.0 * flat["settled"], ".-", color=style.BLUE)
     axes[0, 0].set_ylabel("runs that\nsettle (%)")
     axes[1, 0].plot(across.values, flat["error"] / unit, ".-", color=style.BLUE, label="error")
@@ -216,14 +216,14 @@ def _curves(found: StabilityMap, across: PictureAxis) -> Figure:
     return figure
 
 
-def _sheet(found: StabilityMap, varying: Sequence[PictureAxis]) -> Figure:
+def _sheet(result: StabilityMap, varying: Sequence[PictureAxis]) -> Figure:
     """The share that settles, over the two longest axes, once for each value of the others."""
     longest = sorted(varying, key=lambda line: -line.values.size)[:2]
     across, up = _order(longest)
     others = [line for line in varying if line.name not in (across.name, up.name)]
-    names = [name for name, values in found.axes if len(values) > 1]
+    names = [name for name, values in result.axes if len(values) > 1]
     settled = np.moveaxis(
-        found.grid("settled").squeeze(), [names.index(line.name) for line in (*others, up, across)], range(len(names))
+        result.grid("settled").squeeze(), [names.index(line.name) for line in (*others, up, across)], range(len(names))
     )
     columns = others[-1].values.size
     rows = math.prod(line.values.size for line in others[:-1])

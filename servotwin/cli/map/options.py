@@ -39,7 +39,7 @@ class MapOptions:
     still_um: float = 1.0
 
     def settings(self) -> MapSettings:
-        """The map.
+        """Settings of the map.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class MapOptions:
 
 
 def parsed(name: str, text: str, unit: float = 1.0) -> Values:
-    """An axis: "LOW:HIGH:COUNT", evenly spaced, with ":log" in equal ratios, or "VALUE,VALUE,...".
+    """Parse an axis: "LOW:HIGH:COUNT", evenly spaced, with ":log" in equal ratios, or "VALUE,VALUE,...".
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def parsed(name: str, text: str, unit: float = 1.0) -> Values:
 def _ranged(name: str, text: str) -> list[float]:
     low, high, count, *kind = text.split(":") if text.count(":") in (2, 3) else ("", "", "")
     if kind not in ([], ["log"]) or not count.strip().isdecimal():
-        raise _refused(name, text)
+        raise _invalid_axis(name, text)
     first, last, size = _number(name, text, low), _number(name, text, high), int(count)
     if not (2 <= size <= MAX_VALUES and first < last and (first > 0.0 or not kind)):
         raise InvalidInput(
@@ -124,18 +124,18 @@ def _number(name: str, text: str, part: str) -> float:
     try:
         value = float(part)
     except ValueError:
-        raise _refused(name, text) from None
+        raise _invalid_axis(name, text) from None
     if not math.isfinite(value):
-        raise _refused(name, text)
+        raise _invalid_axis(name, text)
     return value
 
 
-def _refused(name: str, text: str) -> InvalidInput:
+def _invalid_axis(name: str, text: str) -> InvalidInput:
     return InvalidInput(f"{name} {text!r}: is no axis; give LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or VALUE,VALUE,...")
 
 
 def _check_drawable(shape: Sequence[int]) -> None:
-    """Refuse what no picture can show."""
+    """Refuse axes that no picture can show."""
     varying = sorted((size for size in shape if size > 1), reverse=True)
     if not varying:
         raise InvalidInput("map axes: every axis has one value; give a range to one of them at least")

@@ -25,73 +25,75 @@ _LABELS = {
 _RATIO_LABELS = {"tolerance": ("tolerance\n/(p b)", 1.0), "amplitude": ("step\n/(p b)", 1.0)}
 
 
-def label(found: StabilityMap, name: str) -> tuple[str, float]:
+def label(result: StabilityMap, name: str) -> tuple[str, float]:
     """An axis's name with its unit, and what its values are multiplied by to be in it."""
-    return (_RATIO_LABELS if isinstance(found.settings.axes, RatioAxes) else _LABELS)[name]
+    return (_RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS)[name]
 
 
-def table_axis(found: StabilityMap) -> int:
-    """The axis along which the map is told: the one whose effect is asked for, else the first that varies."""
-    varying = [i for i, (_, values) in enumerate(found.axes) if len(values) > 1]
-    asked = [i for i in varying if found.axes[i][0] in ("tolerance", "k_dz")]
-    return (asked or varying or [0])[0]
+def table_axis(result: StabilityMap) -> int:
+    """Index of the axis along which the table runs: the dead zone where it varies, else the first axis that varies."""
+    varying = [i for i, (_, values) in enumerate(result.axes) if len(values) > 1]
+    dead_zone = [i for i in varying if result.axes[i][0] in ("tolerance", "k_dz")]
+    return (dead_zone or varying or [0])[0]
 
 
-def rows(found: StabilityMap) -> list[tuple[float, Array]]:
-    """One row per value of that axis (at most `ROWS` of them): the value, and the numbers in the order of `HEADS`, the
-    worst of everything but of the shares and of the effort."""
-    axis = table_axis(found)
-    name, values = found.axes[axis]
-    scale = label(found, name)[1]
+def rows(result: StabilityMap) -> list[tuple[float, Array]]:
+    """One row per value of the table's axis, `ROWS` at most: the value, and the numbers in the order of `HEADS`.
+
+    Error, swing and settling time are the worst of the cells; shares and effort are means.
+    """
+    axis = table_axis(result)
+    name, values = result.axes[axis]
+    scale = label(result, name)[1]
     chosen = np.unique(np.linspace(0, len(values) - 1, min(ROWS, len(values))).round().astype(int))
-    return [(values[i] * scale, _numbers(found, axis, int(i))) for i in chosen]
+    return [(values[i] * scale, _numbers(result, axis, int(i))) for i in chosen]
 
 
-def _numbers(found: StabilityMap, axis: int, place: int) -> Array:
-    cells = {name: found.grid(name).take(place, axis) for name in ("settled", "error", "swing", "settling", "effort")}
+def _numbers(result: StabilityMap, axis: int, place: int) -> Array:
+    cells = {name: result.grid(name).take(place, axis) for name in ("settled", "error", "swing", "settling", "effort")}
     shares = 100.0 * np.mean(cells["settled"] == 1.0), 100.0 * np.mean(cells["settled"])
     worst = 1e3 * cells["error"].max(), 1e3 * cells["swing"].max(), cells["settling"].max()
     return np.array([*shares, *worst, np.sqrt(np.mean(cells["effort"] ** 2))])
 
 
-def sentences(found: StabilityMap) -> tuple[str, ...]:
+def sentences(result: StabilityMap) -> tuple[str, ...]:
     """Runs, definition of settled, and the shares over the whole map."""
-    s, settled = found.settings, found.grid("settled")
-    slow = int(found.slow.sum())
+    s, settled = result.settings, result.grid("settled")
+    slow = int(result.slow.sum())
     return (
         f"{s.count} cells with {s.members} initial states each, {s.duration:g} s a run;"
-        f" settled: half the peak-to-peak of the last {s.window:g} s below {s.still * 1e6:g} um{_scale(found)}.",
+        f" settled: half the peak-to-peak of the last {s.window:g} s below {s.still * 1e6:g} um{_scale(result)}.",
         f"Every run settles in {np.mean(settled == 1.0):.1%} of the cells, none in {np.mean(settled == 0.0):.1%};"
         f" {np.mean(settled):.1%} of all runs settle.",
-        f"In {slow} cells the last {SHORT_WINDOW:g} s alone would call more runs settled: they rest and move on.",
+        f"In {slow} cells the last {SHORT_WINDOW:g} s alone would call more runs settled: they rest, then move on.",
     )
 
 
-def _scale(found: StabilityMap) -> str:
-    axes, law = found.settings.axes, found.settings.law
+def _scale(result: StabilityMap) -> str:
+    axes, law = result.settings.axes, result.settings.law
     if not isinstance(axes, RatioAxes):
         return ""
     at = f" at a gap of {math.degrees(axes.gap):g} deg"
     if law.voltage_limit is not None or law.feedforward != 0.0:  # neither scales with the gap
         return f"{at}, for which alone this map is made"
-    return f"{at}, {found.settings.still / (0.5 * found.settings.servo.p * axes.gap):.3g} p b at any"
+    return f"{at}, {result.settings.still / (0.5 * result.settings.servo.p * axes.gap):.3g} p b at any"
 
 
-def text(found: StabilityMap) -> str:
+def text(result: StabilityMap) -> str:
     """Sentences and table as plain text."""
     console = Console(width=110, no_color=True, record=True, quiet=True, file=None)
     with console.capture() as captured:
         console.quiet = False
-        tell(found, console)
+        print_summary(result, console)
     return "\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n"
 
 
-def tell(found: StabilityMap, console: Console) -> None:
-    """Sentences and table."""
-    for sentence in sentences(found):
+def print_summary(result: StabilityMap, console: Console) -> None:
+    """Print sentences and table."""
+    for sentence in sentences(result):
         console.print(sentence, highlight=False)
-    table = Table(label(found, found.axes[table_axis(found)][0])[0], *HEADS, box=None, pad_edge=False)
-    for value, numbers in rows(found):
+    table = Table(label(result, result.axes[table_axis(result)][0])[0], *HEADS, box=None, pad_edge=False)
+    for value, numbers in rows(result):
         table.add_row(f"{value:.4g}", *_cells(numbers.tolist()))
     console.print(table, highlight=False)
 
