@@ -98,7 +98,7 @@ def test_a_prior_must_not_be_counted_twice():
         TwinSettings(estimator=whitened.WhitenedSettings(combine=True))
     with pytest.raises(InvalidInput, match=r"estimation\.paper|estimation\.settings"):
         TwinSettings(method="paper", estimator=whitened.WhitenedSettings())
-    with pytest.raises(InvalidInput, match="'best' does not exist"):
+    with pytest.raises(InvalidInput, match="'best': must be one of whitened, paper"):
         TwinSettings(method="best")
     with pytest.raises(InvalidInput, match="gap_limit"):
         TwinSettings(gap_limit=-1.0)

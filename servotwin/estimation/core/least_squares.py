@@ -19,7 +19,7 @@ from servotwin.plant.signals import Array
 Flags: TypeAlias = NDArray[np.bool_]
 
 _NOTHING_LEFT = 1e-7  # of a column's length: what the others leave of it below this is rounding
-_DEPENDENT = 1e-11  # of the largest eigenvalue of the columns scaled to one
+_DEPENDENT_EIGENVALUE = 1e-11  # of the largest eigenvalue of the columns scaled to one
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def least_squares(columns: Array, target: Array) -> LeastSquares:
     size[size == 0.0] = 1.0
     scaled = columns / size[:, None]
     values, vectors = np.linalg.eigh(scaled @ scaled.T)
-    good = values > _DEPENDENT * values[-1]
+    good = values > _DEPENDENT_EIGENVALUE * values[-1]
     root = (vectors[:, good] / np.sqrt(values[good])).T
     return LeastSquares((root.T @ (root @ (scaled @ target))) / size, root / size, np.zeros(size.size, dtype=bool))
 
