@@ -23,8 +23,8 @@ from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
 from servotwin.twin_service.twin_file import service_of
 
-TIMEOUT_S = 30.0
-BEFORE_S = 60.0
+_TIMEOUT_S = 30.0
+_BEFORE_S = 60.0
 """Events that belong to no window are shown from so many s before the first window on."""
 
 
@@ -48,7 +48,7 @@ class Source:
     ca: Path | None = None
 
 
-class ServoEvidence(NamedTuple):
+class _ServoEvidence(NamedTuple):
     """A servo, its windows and the events of no window, as the API returns them."""
 
     servo: JsonObject
@@ -121,34 +121,34 @@ def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
     return rows
 
 
-def _read_store(servo: str, config: Path, limit: int) -> ServoEvidence:
+def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
     store = open_existing_store(service_of(config))
     try:
         traces, summary = store.audit(servo, limit=limit), store.servo(servo)
         if summary is None or not traces:
-            return ServoEvidence({}, [], [])
+            return _ServoEvidence({}, [], [])
         events = store.events(servo, _since(traces[-1].window.received), MAX_ROWS)
-        return ServoEvidence(
+        return _ServoEvidence(
             summary._asdict(), [trace_as_json(trace) for trace in traces], [evidence_as_json(each) for each in events]
         )
     finally:
         store.close()
 
 
-def _read_service(servo: str, source: Source, limit: int) -> ServoEvidence:
+def _read_service(servo: str, source: Source, limit: int) -> _ServoEvidence:
     get_json, name = _json_client(source), quote(servo, safe="")
     traces = get_json(f"/v1/servos/{name}/audit?limit={limit}")
     if not traces:
-        return ServoEvidence({}, [], [])
+        return _ServoEvidence({}, [], [])
     since = _since(traces[-1]["window"]["received"])
-    return ServoEvidence(
+    return _ServoEvidence(
         get_json(f"/v1/servos/{name}"), traces, get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
     )
 
 
 def _since(oldest: float) -> float:
     """Time from which events are read: an edge starts before its first window."""
-    return max(0.0, oldest - BEFORE_S)
+    return max(0.0, oldest - _BEFORE_S)
 
 
 def _json_client(source: Source) -> Callable[[str], Any]:
@@ -166,7 +166,7 @@ def _json_client(source: Source) -> Callable[[str], Any]:
 
     def get_json(path: str) -> Any:
         try:
-            with opener.open(Request(url + path, headers=headers), timeout=TIMEOUT_S) as response:
+            with opener.open(Request(url + path, headers=headers), timeout=_TIMEOUT_S) as response:
                 return jsons.load(response)
         except HTTPError as error:
             raise InvalidInput(f"{url}: {_refusal(error)}") from None

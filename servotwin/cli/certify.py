@@ -24,7 +24,7 @@ from servotwin.twin.settings import TwinSettings
 
 
 @dataclass(frozen=True)
-class TableJob:
+class _TableJob:
     """A table to verify: name of its model, policy and file."""
 
     name: str
@@ -83,7 +83,7 @@ def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:
         raise InvalidInput(f"{option} {text!r}: give VALUE,VALUE,...") from None
 
 
-def _jobs(file: Path, model: str | None, out: Path | None) -> list[TableJob]:
+def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:
     """Tables that a file names."""
     table = read_toml(file)
     known = _models(table, file)
@@ -111,13 +111,13 @@ def _models(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 
-def _table_job(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> TableJob:
+def _table_job(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> _TableJob:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
-    return TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
+    return _TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
 
 
-def _verify(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
+def _verify(job: _TableJob, grid: Grid, console: Console) -> CertifiedTable:
     """Verify one table, under a progress bar."""
     done = total = 0
     try:
@@ -145,7 +145,7 @@ def _verify(job: TableJob, grid: Grid, console: Console) -> CertifiedTable:
     return table
 
 
-def _summary(job: TableJob, table: CertifiedTable) -> str:
+def _summary(job: _TableJob, table: CertifiedTable) -> str:
     shares = Counter(cell is not None for cell in table.cells.values())
     settings = {cell.setting for cell in table.cells.values() if cell is not None}
     low, high = (math.degrees(gap) for gap in table.stated)

@@ -148,7 +148,7 @@ HEADS = (
     "off by, um",
 )
 MORE = ("published: estimate, deg",)
-SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled", "worst error, um", "Ms")
+_SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled", "worst error, um", "Ms")
 
 
 def cells(row: DemoStep) -> tuple[str, ...]:
@@ -162,7 +162,7 @@ def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
     """An update as texts, in the order of `SENT`; gains in the servo's own."""
     new, verification, own = update.setting.gains, update.verification, servo.controller
     if new is None or verification is None:
-        return (f"{update.data_time:.0f}", *("-" for _ in SENT[1:]))
+        return (f"{update.data_time:.0f}", *("-" for _ in _SENT[1:]))
     gains = f"x {new.Kp / own.Kp:.2f}", f"x {new.Ki / own.Ki:.2f}", f"{new.feedforward * MM:+.2f}"
     worst = f"{verification.tail * UM:.1f}", f"{verification.Ms:.2f}"
     return (
@@ -242,7 +242,7 @@ def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes, pre
             page.table((*HEADS, *MORE), [(*cells(row), _estimate(row.published_estimate)) for row in rows]),
             f"<p>Off by: largest error that remains at the end of the step. {escape(published)}</p>",
             "<h2>What the certified twin sent</h2>",
-            page.table(SENT, [sent(update, comparison.servo) for update in comparison.twinned.updates]),
+            page.table(_SENT, [sent(update, comparison.servo) for update in comparison.twinned.updates]),
             "<p>Gains are relative to the servo's own. Each setting was verified on simulated machines within the "
             "uncertainty of model and estimate.</p>",
             "<p class='soft small'>Every figure and claim of the paper: <code>servotwin reproduce</code>.</p>",

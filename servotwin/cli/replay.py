@@ -20,17 +20,17 @@ from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import read_twin, service_of
 
 DEG = 180.0 / math.pi
-PAGE = 100
+_PAGE = 100
 SAME, OTHER = "the same, bit for bit", "NOT the same"
-UNREADABLE = "NOT repeated: the stored data cannot be decoded"
-EMPTIED = "not repeated: retention deleted the window's body"
-GLANCED = "not estimated: screening was enough"
+_UNREADABLE = "NOT repeated: the stored data cannot be decoded"
+_EMPTIED = "not repeated: retention deleted the window's body"
+_GLANCED = "not estimated: screening was enough"
 FAILED = "not estimated: the window could not be processed"
 WAITING = "not yet processed"
-BAD = (OTHER, UNREADABLE)
+BAD = (OTHER, _UNREADABLE)
 
 
-class ReplayedWindow(NamedTuple):
+class _ReplayedWindow(NamedTuple):
     """Result of estimating one window again.
 
     Attributes
@@ -88,10 +88,10 @@ def print_replay(servo: str, config: Path, window: str | None, present: bool) ->
 
 def _replay_windows(
     store: Store, servo: str, model: ServoModel | None, only: tuple[str, int] | None
-) -> Iterator[ReplayedWindow]:
+) -> Iterator[_ReplayedWindow]:
     """Replay the windows of a servo, newest first."""
     before = None
-    while traces := store.audit(servo, limit=PAGE, window=only, before=before):
+    while traces := store.audit(servo, limit=_PAGE, window=only, before=before):
         contexts = store.contexts({record.context for trace in traces for record in trace.found if record.context})
         for trace in traces:
             yield _replay_window(store, trace, contexts, model)
@@ -108,30 +108,30 @@ def _summary(servo: str, counts: Counter[str], differing: Counter[str]) -> str:
 
 def _replay_window(
     store: Store, trace: WindowTrace, contexts: dict[str, str], model: ServoModel | None
-) -> ReplayedWindow:
+) -> _ReplayedWindow:
     window = trace.window
     name = f"{window.boot}/{window.sequence}"
     estimate = next((one for one in reversed(trace.found) if one.kind == "estimate"), None)
     if estimate is None:
-        return ReplayedWindow(name, WAITING if window.done is None else GLANCED)
+        return _ReplayedWindow(name, WAITING if window.done is None else _GLANCED)
     if estimate.status.startswith("failed"):
-        return ReplayedWindow(name, FAILED)
+        return _ReplayedWindow(name, FAILED)
     message = store.window(window.servo, window.boot, window.sequence)
     if message is None or not message.body:
-        return ReplayedWindow(name, EMPTIED)
+        return _ReplayedWindow(name, _EMPTIED)
     try:
         data = decompress(message.body, message.encoding, MAX_BYTES)
         return _compare(name, estimate, replay(data, estimate.body, contexts.get(estimate.context, ""), model))
     except (InvalidInput, InvalidMessage) as error:
-        return ReplayedWindow(name, UNREADABLE, str(error))
+        return _ReplayedWindow(name, _UNREADABLE, str(error))
 
 
-def _compare(name: str, stored: StoredEvidence, again: ReplayResult) -> ReplayedWindow:
+def _compare(name: str, stored: StoredEvidence, again: ReplayResult) -> _ReplayedWindow:
     if again.same:
-        return ReplayedWindow(name, SAME, "", again.differs)
+        return _ReplayedWindow(name, SAME, "", again.differs)
     gaps = f"gap {_degrees(stored.gap)} deg then, {_degrees(again.estimate.gap)} deg now"
     why = "" if again.differs else "; no recorded version, model or setting explains it"
-    return ReplayedWindow(name, OTHER, f"{gaps}; changed: {', '.join(again.changed)}{why}", again.differs)
+    return _ReplayedWindow(name, OTHER, f"{gaps}; changed: {', '.join(again.changed)}{why}", again.differs)
 
 
 def _degrees(gap: float | None) -> str:

@@ -36,7 +36,7 @@ PATIENCE = 1.0
 """s that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
-MOST_SAMPLES = 1e8  # some 10 GB of signals
+_MOST_SAMPLES = 1e8  # some 10 GB of signals
 
 # Widens a box so that rounding does not exclude its own corner.
 _ROUNDING = 1.0 + 1e-9
@@ -129,7 +129,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     supervision = Supervision(FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon))
     sent = policy_of(servo, settings)
     return Guarding(
-        supervision, *(hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else certified_box(policy))
+        supervision, *(_hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else _certified_box(policy))
     )
 
 
@@ -138,7 +138,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
     return Parameters(setting=fallback.setting, fallback=True)
 
 
-def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
+def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
     own, demands = policy.servo.controller, policy.demands_within_band()
     scales = [setting.controller.Kp / own.Kp for setting in candidates_of(policy.servo, demands, 0.0, True, False)]
@@ -154,7 +154,7 @@ def certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     return limits, Gains(own.Kp * middle, own.Ki, own.Kd * middle, own.Tf, 0.0, max(leave, own.leave) / factor)
 
 
-def hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
+def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
     own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
     return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=PATIENCE), gains_of(own)
@@ -290,6 +290,6 @@ class Commissioning:
 
 def check_samples(name: str, seconds: float, rate: float) -> None:
     """Refuse a time whose samples do not fit into memory."""
-    if not seconds * rate <= MOST_SAMPLES:
-        count = f"has {seconds * rate:.3g} samples at {rate!r} Hz; at most {MOST_SAMPLES:g} are allowed"
+    if not seconds * rate <= _MOST_SAMPLES:
+        count = f"has {seconds * rate:.3g} samples at {rate!r} Hz; at most {_MOST_SAMPLES:g} are allowed"
         raise InvalidInput(f"{name} = {seconds!r} s: {count}")

@@ -1,4 +1,4 @@
-"""Reference of a file's keys as Markdown and JSON Schema, generated from the declarations of `config.keys`."""
+"""Reference of a file's keys as Markdown and JSON _Schema, generated from the declarations of `config.keys`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
 
-Schema = dict[str, Any]
+_Schema = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def markdown(title: str, spec: TableSpec) -> str:
     return "\n".join([f"## {title}", "", *_sections("", spec)])
 
 
-def schema(title: str, spec: TableSpec) -> Schema:
-    """The JSON Schema of one kind of file."""
+def schema(title: str, spec: TableSpec) -> _Schema:
+    """The JSON _Schema of one kind of file."""
     return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **_object(spec)}
 
 
@@ -154,7 +154,7 @@ def _allowed(item: Item) -> str:
     }.get(item.form, "")
 
 
-def _object(spec: TableSpec) -> Schema:
+def _object(spec: TableSpec) -> _Schema:
     """The schema of a table."""
     if spec.kinds:
         return {"anyOf": [_kind(name, inner) for name, inner in spec.kinds.items()]}
@@ -162,7 +162,7 @@ def _object(spec: TableSpec) -> Schema:
         return {"type": "object", "additionalProperties": _object(spec.tables[spec.repeated])}
     if spec.text:
         return {"type": "object", "additionalProperties": {"type": "string"}}
-    top: Schema = {"type": "object", "additionalProperties": False, "properties": {}}
+    top: _Schema = {"type": "object", "additionalProperties": False, "properties": {}}
     for table, item, prefix in _flat(spec.items()):
         here = _at(top, table)
         for name in item.names:
@@ -184,7 +184,7 @@ def _object(spec: TableSpec) -> Schema:
     return top
 
 
-def _kind(name: str, spec: TableSpec) -> Schema:
+def _kind(name: str, spec: TableSpec) -> _Schema:
     described = _object(spec)
     if "=" in name:
         described["properties"]["kind"] = {"const": name.partition('"')[2].rstrip('"')}
@@ -192,23 +192,23 @@ def _kind(name: str, spec: TableSpec) -> Schema:
     return described
 
 
-def _at(top: Schema, table: str) -> Schema:
+def _at(top: _Schema, table: str) -> _Schema:
     if not table:
         return top
-    empty: Schema = {"type": "object", "additionalProperties": False, "properties": {}}
-    inner: Schema = top["properties"].setdefault(table, empty)
+    empty: _Schema = {"type": "object", "additionalProperties": False, "properties": {}}
+    inner: _Schema = top["properties"].setdefault(table, empty)
     return inner
 
 
-def _require(here: Schema, item: Item, spec: TableSpec) -> None:
+def _require(here: _Schema, item: Item, spec: TableSpec) -> None:
     if item.required and not spec.partial and len(item.names) == 1:
         here.setdefault("required", []).append(item.names[0])
 
 
-def _value(item: Item, name: str) -> Schema:
+def _value(item: Item, name: str) -> _Schema:
     number = {"type": "number", **_limits(item, name)}
     whole = {"type": "integer", **_limits(item, name)}
-    shapes: dict[Form, Schema] = {
+    shapes: dict[Form, _Schema] = {
         Form.NUMBER: number,
         Form.INTEGER: whole if unit_of(name).exact else number,
         Form.PAIR: {"type": "array", "items": number, "minItems": 2, "maxItems": 2},
@@ -221,7 +221,7 @@ def _value(item: Item, name: str) -> Schema:
     return {"description": f"{item.key.help} Unit: {unit}." if unit else item.key.help, **shapes.get(item.form, {})}
 
 
-def _limits(item: Item, name: str) -> Schema:
+def _limits(item: Item, name: str) -> _Schema:
     limits = item.key.range.scaled(unit_of(name).from_si)
     ends = {
         "minimum": limits.minimum,

@@ -67,7 +67,7 @@ def decide(
         return RequestDecision(state, state.answer)
     outcome = _judge(request, state, settings, here, at_rest)
     answer = Answer(here.servo, here.boot, request.serial, here.sample, outcome, state.newest)
-    if outcome.passing or not _is_for(request, here) or outcome is RequestOutcome.DUPLICATE:
+    if outcome.temporary or not _is_for(request, here) or outcome is RequestOutcome.DUPLICATE:
         return RequestDecision(state, answer)
     state = replace(state, answer=Answer(here.servo, here.boot, request.serial, here.sample, outcome, request.serial))
     state = _grant(request, state, settings, here) if outcome is RequestOutcome.TAKEN else state

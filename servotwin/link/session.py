@@ -90,7 +90,7 @@ class Session:
     def refused(self, item: Item, now: float, reason: Refusal, detail: str, after_s: float) -> None:
         """Drop and count what is never taken; retry later what is too early; else pause for all."""
         self.counts[f"refused: {reason.value}"] += 1
-        if not reason.passing:
+        if not reason.temporary:
             if isinstance(item, bytes):
                 self.outbox.remove_letter(item)
             else:

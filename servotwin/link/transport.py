@@ -53,7 +53,7 @@ class Refused(Exception):
     Attributes
     ----------
     reason : Refusal
-        `reason.passing` tells whether the message is kept.
+        `reason.temporary` tells whether the message is kept.
     detail : str
         One sentence.
     after_s : float

@@ -29,7 +29,7 @@ class Refusal(StrEnum):
     UNAVAILABLE = "unavailable"
 
     @property
-    def passing(self) -> bool:
+    def temporary(self) -> bool:
         """True where the same message may be accepted later: the edge keeps it; any other it drops and counts."""
         return self in (
             Refusal.BAD_TOKEN,

@@ -7,7 +7,7 @@ from servotwin.messages.checks import InvalidMessage, Refusal, require
 IDENTITY, DEFLATE, ZSTD = "", "deflate", "zstd"
 ENCODINGS = (IDENTITY, DEFLATE, ZSTD)
 """Names as in HTTP's Content-Encoding; the empty one is identity."""
-ZSTD_WINDOW = 8 * 1024 * 1024
+_ZSTD_WINDOW = 8 * 1024 * 1024
 """Bytes of memory that a zstd frame may require of its reader: the limit that RFC 8878 recommends."""
 
 
@@ -58,7 +58,7 @@ def _unzstd(data: bytes, limit: int) -> bytes:
         size = zstandard.frame_content_size(data)
         require(size >= 0, "body is not zstd: its frame does not say how many bytes it holds")
         require(size <= limit, _too_large(limit), Refusal.TOO_LARGE)
-        reader = zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW)
+        reader = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
         return reader.decompress(data, max_output_size=max(1, size), read_across_frames=False, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise InvalidMessage(f"body is not zstd: {error}") from None

@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text, require
 
-MAX_SECONDS = 600.0
+_MAX_SECONDS = 600.0
 """Longest window or probe that a request may name, s; an edge's own limits are tighter."""
 
 
@@ -25,7 +25,7 @@ class LongerWindow(Struct, frozen=True, tag="window"):
     pre_trigger_s: float
 
     def __post_init__(self) -> None:
-        require(0.0 < self.window_s <= MAX_SECONDS, f"request window_s {self.window_s} s is not allowed")
+        require(0.0 < self.window_s <= _MAX_SECONDS, f"request window_s {self.window_s} s is not allowed")
         require(
             0.0 <= self.pre_trigger_s < self.window_s, f"request pre_trigger_s {self.pre_trigger_s} s is not allowed"
         )
@@ -51,7 +51,7 @@ class Probe(Struct, frozen=True, tag="probe"):
     def __post_init__(self) -> None:
         require(isfinite(self.size) and self.size != 0.0, f"request size {self.size} m is not allowed")
         require(isfinite(self.hold_s) and self.hold_s > 0.0, f"request hold_s {self.hold_s} s is not allowed")
-        require(self.duration <= MAX_SECONDS, f"request takes {self.duration} s: at most {MAX_SECONDS} s are allowed")
+        require(self.duration <= _MAX_SECONDS, f"request takes {self.duration} s: at most {_MAX_SECONDS} s are allowed")
 
     @property
     def duration(self) -> float:
@@ -103,7 +103,7 @@ class RequestOutcome(StrEnum):
     BUSY = "the reference does not rest, or a window is being recorded"
 
     @property
-    def passing(self) -> bool:
+    def temporary(self) -> bool:
         """True where the same request may be accepted later."""
         return self in (RequestOutcome.BUSY, RequestOutcome.TOO_SOON)
 

@@ -19,7 +19,7 @@ from servotwin.store.schema import REVISION, metadata
 PAGES = 2048
 """Pages copied between two progress reports."""
 PRIVATE = 0o600
-SERIAL_MARGIN = 1_000_000
+_SERIAL_MARGIN = 1_000_000
 """Upper bound of the messages to one edge that may have been posted since a backup."""
 
 Progress = Callable[[int, int], None]
@@ -85,7 +85,7 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
     with atomic_output(place, PRIVATE) as temporary:
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
-            store.execute("UPDATE twins SET posted = posted + ?", (SERIAL_MARGIN,))
+            store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN,))
         return counts
 
 

@@ -19,7 +19,7 @@ from servotwin.errors import InvalidInput
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
-BUSY_S = 10.0
+_BUSY_S = 10.0
 """s that a connection waits for another one's transaction."""
 _PAGE_BYTES = 8192
 _LOG_PAGES = 2000
@@ -151,8 +151,8 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
         poolclass=QueuePool,
         pool_size=connections,
         max_overflow=0,
-        pool_timeout=BUSY_S,
-        connect_args={"timeout": BUSY_S, "check_same_thread": False},
+        pool_timeout=_BUSY_S,
+        connect_args={"timeout": _BUSY_S, "check_same_thread": False},
     )
     # IMMEDIATE takes the write lock at once: a transaction that reads first could not be upgraded and would fail.
     begin = "BEGIN" if reading else "BEGIN IMMEDIATE"

@@ -124,7 +124,11 @@ class Requests:
     def answered(self, state: RequestState, answer: Answer, now: float) -> tuple[RequestState, Request | None]:
         """The state after an answer, and the request to send instead, where the twin had lost count of its serials."""
         pending = state.pending
-        if pending is None or (answer.boot, answer.serial) != (pending.boot, pending.serial) or answer.outcome.passing:
+        if (
+            pending is None
+            or (answer.boot, answer.serial) != (pending.boot, pending.serial)
+            or answer.outcome.temporary
+        ):
             return state, None
         if answer.outcome is not RequestOutcome.DUPLICATE:
             return state.closed(answer.outcome), None

@@ -206,7 +206,7 @@ def read_tokens(path: Path) -> Verifiers:
     """
     if not path.exists():
         raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
-    check_private(path)
+    _check_private(path)
     if not path.read_bytes().strip():
         return Verifiers()
     table = read_toml(path)
@@ -266,14 +266,14 @@ def read_secret(path: Path) -> str:
     InvalidInput
         It cannot be read, or others than its owner may read it.
     """
-    check_private(path)
+    _check_private(path)
     try:
         return path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput(f"{path}: cannot be read ({error})") from None
 
 
-def check_private(path: Path) -> None:
+def _check_private(path: Path) -> None:
     """Refuse a file that others than its owner may read or write; raises InvalidInput."""
     try:
         mode = stat.S_IMODE(path.stat().st_mode)

@@ -36,8 +36,8 @@ def run(path: Path, port: int | None = None) -> None:
     check_tls(twin.service)
     configure_logging(twin.service.log_level)
     with (
-        exclusive_store(twin.service.store),
-        closing(open_configured_store(twin.service)) as store,
+        _exclusive_store(twin.service.store),
+        closing(_open_configured_store(twin.service)) as store,
         listening_socket(twin.service, port) as listener,
     ):
         serve(twin, store, listener)
@@ -53,7 +53,7 @@ def serve(twin: TwinFile, store: Store, listener: socket.socket) -> None:
     asyncio.run(server.serve([listener]))
 
 
-def open_configured_store(config: ServiceConfig) -> Store:
+def _open_configured_store(config: ServiceConfig) -> Store:
     """Open the store, with its password."""
     address = config.store
     if config.store_password is not None:
@@ -72,11 +72,11 @@ def open_existing_store(config: ServiceConfig) -> Store:
     file = sqlite_file(parse_address(config.store))
     if file is not None and not file.is_file():
         raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
-    return open_configured_store(config)
+    return _open_configured_store(config)
 
 
 @contextmanager
-def exclusive_store(store: str) -> Iterator[None]:
+def _exclusive_store(store: str) -> Iterator[None]:
     """Lock an SQLite store for this process; PostgreSQL is shared and not locked.
 
     Two services on one SQLite store would release each other's leases and not notify each other's edges.

@@ -24,7 +24,7 @@ MQTT_PASSWORD = "SERVOTWIN_MQTT_PASSWORD"
 """Environment variable with the password of the service's user at the broker."""
 SQLITE = "sqlite:///"
 GROUP = "twins"
-LOG_LEVELS = ("debug", "info", "warning", "error")
+_LOG_LEVELS = ("debug", "info", "warning", "error")
 _MOST = 1_000_000
 
 
@@ -146,7 +146,7 @@ class ServiceConfig:
         float, key(minimum=0.0, help="Largest lead of a window's sample time over that ratio.")
     ] = 60.0
     job_timeout_s: Annotated[float, key(above=0.0, help="Time for one servo after which a worker is replaced.")] = 300.0
-    log_level: Annotated[str, key(choices=LOG_LEVELS, help="Level of the log.")] = "info"
+    log_level: Annotated[str, key(choices=_LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
 
     def __post_init__(self) -> None:
@@ -204,10 +204,10 @@ def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[
             f"environment variable {PASSWORD}"
         )
     password = environment.get(PASSWORD) if file is None else read_secret(folder / file)
-    return sqlite_in(url, folder), password
+    return _sqlite_in(url, folder), password
 
 
-def sqlite_in(url: str, folder: Path) -> str:
+def _sqlite_in(url: str, folder: Path) -> str:
     """Return the URL of a store, a relative path of SQLite resolved against `folder`."""
     path = url.removeprefix(SQLITE)
     return url if path == url or not path else f"{SQLITE}{(folder / path).absolute()}"

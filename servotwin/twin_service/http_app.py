@@ -26,10 +26,10 @@ log = logging.getLogger(__name__)
 
 Scope = MutableMapping[str, Any]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-Lifespan = Callable[[], AbstractAsyncContextManager[None]]
+_Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
-MAX_INTEGER = 2**53
+_MAX_INTEGER = 2**53
 """Largest integer in a request: the largest that JSON readers with float64 numbers represent exactly."""
 _TITLE, _VERSION = "servotwin twin", "1"
 _DESCRIPTION = (
@@ -94,8 +94,8 @@ class HttpRequest:
         if text is None and default is not None:
             return default
         digits = text is not None and text.isascii() and text.isdecimal() and len(text) <= 16
-        if text is None or not (digits and int(text) <= MAX_INTEGER):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a whole number from 0 to {MAX_INTEGER}")
+        if text is None or not (digits and int(text) <= _MAX_INTEGER):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a whole number from 0 to {_MAX_INTEGER}")
         return int(text)
 
     def seconds(self, key: str, default: float | None = None) -> float:
@@ -183,7 +183,7 @@ class HttpApp:
         Context manager that is entered before the first request and left after the last.
     """
 
-    def __init__(self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: Lifespan) -> None:
+    def __init__(self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan) -> None:
         self._metrics, self.lifespan = metrics, lifespan
         declared = list(routes)
         document = msgspec.json.encode(_openapi(declared))
@@ -265,7 +265,7 @@ def _pattern(path: str) -> re.Pattern[str]:
 
 _NAME = NAME_PATTERN.replace(r"\A", "^").replace(r"\Z", "$")
 _BYTES: Operation = {"type": "string", "format": "binary"}
-INTEGER: Operation = {"type": "integer", "minimum": 0, "maximum": MAX_INTEGER}
+INTEGER: Operation = {"type": "integer", "minimum": 0, "maximum": _MAX_INTEGER}
 SECONDS: Operation = {"type": "number", "minimum": 0}
 _CONTENT: dict[str, Operation] = {MSGPACK: _BYTES, JSON: {}, TEXT: {"type": "string"}}
 _ERROR: Operation = {

@@ -29,7 +29,7 @@ _IDLE_S = 75
 """s after which an idle connection is closed."""
 
 
-class LimitedHttpProtocol(HttpToolsProtocol):
+class _LimitedHttpProtocol(HttpToolsProtocol):
     """HTTP/1.1 connection with limits on the size and time of a request's head.
 
     A head that is endless, or never complete, would otherwise hold memory or a descriptor for ever. So would a single
@@ -110,7 +110,7 @@ class HttpServer(uvicorn.Server):
     """
 
     def __init__(self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None]) -> None:
-        super().__init__(server_config(config, app))
+        super().__init__(_server_config(config, app))
         self._close_polls = close_polls
 
     @contextmanager
@@ -133,11 +133,11 @@ class HttpServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def server_config(config: ServiceConfig, app: HttpApp) -> uvicorn.Config:
+def _server_config(config: ServiceConfig, app: HttpApp) -> uvicorn.Config:
     """Configure uvicorn."""
     return uvicorn.Config(
         app,
-        http=LimitedHttpProtocol,
+        http=_LimitedHttpProtocol,
         ws="none",
         lifespan="on",
         log_config=None,

@@ -20,7 +20,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 """Upper bounds of the histograms' buckets."""
 
-Labels = tuple[str, ...]
+_Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
 
@@ -39,7 +39,7 @@ class Counter:
 
     def __init__(self, name: str, help_: str, *labels: str) -> None:
         self.name, self.help, self.labels = name, help_, labels
-        self.values: collections.Counter[Labels] = collections.Counter({} if labels else {(): 0})
+        self.values: collections.Counter[_Labels] = collections.Counter({} if labels else {(): 0})
 
     def add(self, *values: str, by: int = 1) -> None:
         """Add to the counter of these label values."""
@@ -146,7 +146,7 @@ def _number(value: float) -> str:
     return f"{value:.12g}"
 
 
-class JsonLines(logging.Formatter):
+class _JsonLines(logging.Formatter):
     """Formats a record as one JSON object: time, level, where, message and the fields of `extra`.
 
     Callers never give it a token, a header or a body.
@@ -173,7 +173,7 @@ def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handl
     uvicorn logs only warnings: its access log would hold every request.
     """
     handler = logging.StreamHandler(stream or sys.stderr)
-    handler.setFormatter(JsonLines())
+    handler.setFormatter(_JsonLines())
     service = logging.getLogger("servotwin")
     service.setLevel(level.upper())
     server = logging.getLogger("uvicorn")

@@ -74,7 +74,7 @@ class TwinService:
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
         self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
-        knows = servo_test(twin.fleet)
+        knows = _servo_test(twin.fleet)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
             put=self._put,
@@ -234,7 +234,7 @@ def _log_failure(task: asyncio.Task[None]) -> None:
         log.error("a task of the service ended", exc_info=error)
 
 
-def servo_test(fleet: ModelRegistry) -> Callable[[str], bool]:
+def _servo_test(fleet: ModelRegistry) -> Callable[[str], bool]:
     """Test whether a fleet has a servo of a name; invalid names, however long, are not cached."""
 
     @lru_cache(maxsize=MAX_SERVOS)

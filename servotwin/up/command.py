@@ -57,7 +57,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     with opened(path) as folder, _counted_signals() as signals:
         _greet(folder, console)
         site = Site(folder, Outages(), signals)
-        monitor = Monitor(folder, site, speed, console)
+        monitor = _Monitor(folder, site, speed, console)
         try:
             site.start()
             monitor.run(signals, seconds)
@@ -88,7 +88,7 @@ def _initial_speed(folder: Folder) -> float:
     return max(SLOWEST, _CAUTION * min(last))
 
 
-class SignalCounter:
+class _SignalCounter:
     """Counts signals; called, it returns their number."""
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class SignalCounter:
         self._count += 1
 
 
-class Monitor:
+class _Monitor:
     """Watches what runs, adapts its speed and shows its status.
 
     Parameters
@@ -126,7 +126,7 @@ class Monitor:
         self._last_twin: TwinStatus | None = None
         self._write_speed()
 
-    def run(self, signals: SignalCounter, seconds: float | None) -> None:
+    def run(self, signals: _SignalCounter, seconds: float | None) -> None:
         """Run until a signal comes or `seconds` have passed."""
         self._begun = time.monotonic()
         names = [servo.name for servo in SERVOS]
@@ -230,9 +230,9 @@ class Monitor:
 
 
 @contextmanager
-def _counted_signals() -> Iterator[SignalCounter]:
+def _counted_signals() -> Iterator[_SignalCounter]:
     """Count signals instead of ending; Ctrl-C comes only here, as children are in sessions of their own."""
-    counter = SignalCounter()
+    counter = _SignalCounter()
     before = [signal.signal(number, counter.handle) for number in _SIGNALS]
     try:
         yield counter

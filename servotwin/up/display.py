@@ -48,7 +48,7 @@ class Snapshot(NamedTuple):
     event: str = ""
 
 
-Cell = Callable[[ServoStatus], str]
+_Cell = Callable[[ServoStatus], str]
 
 
 def table(snapshot: Snapshot) -> RenderableType:
@@ -192,7 +192,7 @@ def _link(servo: ServoStatus) -> str:
 
 
 _GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 1, "kd_v_s_per_m": 2}
-_ROWS: Sequence[tuple[str, Cell]] = (
+_ROWS: Sequence[tuple[str, _Cell]] = (
     ("", lambda servo: f"[dim]{servo.plan.trait}[/]"),
     ("edge's role", lambda servo: servo.plan.role),
     ("twin's policy", lambda servo: servo.plan.model),
@@ -211,7 +211,7 @@ _ROWS: Sequence[tuple[str, Cell]] = (
     ("dropped", _dropped),
     ("link", _link),
 )
-_RESTARTS: tuple[str, Cell] = ("restarts", lambda servo: f"[red]{servo.restarts}[/]" if servo.restarts else "0")
+_RESTARTS: tuple[str, _Cell] = ("restarts", lambda servo: f"[red]{servo.restarts}[/]" if servo.restarts else "0")
 
 
 def summary(snapshot: Snapshot) -> Iterable[str]:

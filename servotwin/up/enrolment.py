@@ -81,7 +81,7 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
     tokens = _tokens_file(twin)
     _check(request, _read_or_create(tokens))
     new = not (request.folder / CONFIG).exists()
-    text = edge_toml(edge_config(twin, request)) if new else ""
+    text = edge_toml(_edge_config(twin, request)) if new else ""
     token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
     made = _write_configuration(_trusted_certificates(twin, request), folder, text) if new else []
     write_private(folder / TOKEN, token + "\n")
@@ -129,7 +129,7 @@ def drive_of(path: Path | None) -> Mapping[str, object]:
     return SIMULATED if path is None else dict(read_toml(path).table("drive", required=True).values)
 
 
-def edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
+def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     """Make the configuration of a servo's edge, with the supervision that the twin's policy requires.
 
     Raises
@@ -148,11 +148,11 @@ def edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     commissioning.check_window()
     agent = commissioning.agent_settings(request.servo, UNBOOTED)
     certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE
-    link = TwinLink(request.url or url_of(twin.service), token_file=TOKEN, ca_file=certificate)
+    link = TwinLink(request.url or _url_of(twin.service), token_file=TOKEN, ca_file=certificate)
     return EdgeConfig(agent, request.role, agent.controller or law, request.drive, link, folder=request.folder)
 
 
-def url_of(service: ServiceConfig) -> str:
+def _url_of(service: ServiceConfig) -> str:
     """URL at which the service listens, from its settings.
 
     Raises

@@ -28,14 +28,14 @@ MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operat
 EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
 LONGEST = 100
 """Bytes of a socket's path that every system accepts: Linux allows 107, macOS 103."""
-ENDING_S = 25.0
+_ENDING_S = 25.0
 """s that processes of an earlier start, which was killed, may take to end."""
 _PLACEHOLDER = "http://127.0.0.1:1"
 """URL of the twin in the edges' files until its port is known."""
 _RETRY = Retry(0.5, 2.0, 2.0)
 
 
-class Marker(msgspec.Struct, frozen=True, tag="servotwin-up/1", tag_field="schema"):
+class _Marker(msgspec.Struct, frozen=True, tag="servotwin-up/1", tag_field="schema"):
     """Marks a folder as made by `servotwin up`; names of its servos."""
 
     servos: list[str]
@@ -110,7 +110,7 @@ def _check_length(path: Path) -> None:
 
 def _check(path: Path) -> None:
     try:
-        servos = msgspec.json.decode((path / MARKER).read_bytes(), type=Marker).servos
+        servos = msgspec.json.decode((path / MARKER).read_bytes(), type=_Marker).servos
     except (OSError, msgspec.MsgspecError):
         allowed = "choose another with --folder, or one that is empty or not there yet"
         raise InvalidInput(f"folder {path}: was not made by servotwin up; {allowed}") from None
@@ -153,13 +153,13 @@ def _fill(path: Path) -> None:
         agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
         write_text(folder / EDGE, edge_toml(replace(config, agent=agent)))
         write_text(folder / MACHINE, machine_toml(servo))
-    write_text(path / MARKER, msgspec.json.encode(Marker([servo.name for servo in SERVOS])).decode() + "\n")
+    write_text(path / MARKER, msgspec.json.encode(_Marker([servo.name for servo in SERVOS])).decode() + "\n")
 
 
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
     """Take the lock. Processes that a killed start left behind hold it until they end, which they do by themselves."""
-    end = time.monotonic() + ENDING_S
+    end = time.monotonic() + _ENDING_S
     with ExitStack() as stack:
         while True:
             try:

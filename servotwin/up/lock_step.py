@@ -31,7 +31,7 @@ _TIMEOUT_S = 300.0
 """s for one response, which may include a verification."""
 
 
-class LockstepResponse(msgspec.Struct, frozen=True):
+class _LockstepResponse(msgspec.Struct, frozen=True):
     """Response of the service in lock-step.
 
     Attributes
@@ -45,7 +45,7 @@ class LockstepResponse(msgspec.Struct, frozen=True):
     wake: float | None
 
 
-_response = msgspec.msgpack.Decoder(LockstepResponse)
+_response = msgspec.msgpack.Decoder(_LockstepResponse)
 
 
 class HttpTwin:
@@ -103,7 +103,7 @@ class HttpTwin:
         return [decode(each) for each in decoded.messages]
 
 
-class DrivenMachine:
+class _DrivenMachine:
     """A `cosim.Machine` behind the drive protocol: another process, in lock-step.
 
     Parameters
@@ -193,7 +193,7 @@ def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress
     progress : callable, optional
         Called with the completed share.
     """
-    run = Cosimulation(scenario, DrivenMachine(drive, scenario), twin=twin)
+    run = Cosimulation(scenario, _DrivenMachine(drive, scenario), twin=twin)
     while not run.done:
         run.advance()
         if progress is not None:

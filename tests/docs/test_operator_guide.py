@@ -104,7 +104,7 @@ def test_every_refusal_is_explained_with_what_becomes_of_the_message() -> None:
     assert list(table) != []
     assert set(table) == {each.value for each in Refusal}
     for refusal in Refusal:
-        assert table[refusal.value][2] == ("kept" if refusal.passing else "dropped"), refusal
+        assert table[refusal.value][2] == ("kept" if refusal.temporary else "dropped"), refusal
 
 
 @pytest.mark.parametrize(("title", "names"), [("Updates", Reason), ("Requests", RequestOutcome), ("Fallbacks", Cause)])

@@ -106,7 +106,7 @@ def test_out_of_reach_everything_waits_longer_and_longer(sender: Sender, outbox:
     assert not sender.step(now).reconnected
 
 
-@pytest.mark.parametrize("reason", [reason for reason in Refusal if not reason.passing])
+@pytest.mark.parametrize("reason", [reason for reason in Refusal if not reason.temporary])
 def test_what_will_never_be_taken_is_dropped_and_counted(
     sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
 ) -> None:
@@ -123,7 +123,7 @@ def test_what_will_never_be_taken_is_dropped_and_counted(
     assert sender.session.counts[f"refused: {reason.value}"] == 2
 
 
-@pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.passing and reason is not Refusal.FUTURE])
+@pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.temporary and reason is not Refusal.FUTURE])
 def test_what_may_be_taken_later_is_kept(sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal) -> None:
     outbox.put(window(0))
     script.faults = [Refused(reason, "not now", 5.0)]
@@ -182,7 +182,7 @@ def test_every_window_is_delivered_once_or_counted(
     delivered = [parcel.sequence for parcel in script.delivered]
     assert len(delivered) == len(set(delivered))
     assert len(delivered) + sum(outbox.dropped.values()) == 5
-    permanent = sum(isinstance(fault, Refused) and not fault.reason.passing for fault in faults[: len(faults)])
+    permanent = sum(isinstance(fault, Refused) and not fault.reason.temporary for fault in faults[: len(faults)])
     assert sum(outbox.dropped.values()) <= permanent
     outbox.close()
 

@@ -98,7 +98,7 @@ def test_a_wrong_token_is_a_refusal(twin: FakeTwin) -> None:
     link = HttpTransport(twin.url, "axis-1", "other", timeout_s=5.0)
     with pytest.raises(Refused, match="bad_token") as refused:
         link.deliver(parcel(0))
-    assert refused.value.reason.passing
+    assert refused.value.reason.temporary
     release(link)
 
 

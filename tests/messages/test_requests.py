@@ -93,4 +93,7 @@ def test_cut_and_random_bytes_are_refused(noise: bytes) -> None:
 
 
 def test_what_may_be_taken_later() -> None:
-    assert {outcome for outcome in RequestOutcome if outcome.passing} == {RequestOutcome.BUSY, RequestOutcome.TOO_SOON}
+    assert {outcome for outcome in RequestOutcome if outcome.temporary} == {
+        RequestOutcome.BUSY,
+        RequestOutcome.TOO_SOON,
+    }

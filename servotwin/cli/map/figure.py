@@ -35,7 +35,7 @@ _ACROSS = ("tolerance", "k_dz", "estimate", "gap", "amplitude")
 
 
 @dataclass(frozen=True, eq=False)
-class PictureAxis:
+class _PictureAxis:
     """An axis of the picture: its name, its label and its values in the label's unit."""
 
     name: str
@@ -71,17 +71,17 @@ def draw(result: StabilityMap) -> Figure:
     return _sheet(result, varying)
 
 
-def lines(result: StabilityMap) -> list[PictureAxis]:
+def lines(result: StabilityMap) -> list[_PictureAxis]:
     """The axes that vary."""
     labels = _RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS
     return [
-        PictureAxis(name, labels[name][0], np.array(values) * labels[name][1])
+        _PictureAxis(name, labels[name][0], np.array(values) * labels[name][1])
         for name, values in result.axes
         if len(values) > 1
     ]
 
 
-def _order(pair: Sequence[PictureAxis]) -> tuple[PictureAxis, PictureAxis]:
+def _order(pair: Sequence[_PictureAxis]) -> tuple[_PictureAxis, _PictureAxis]:
     """Across, up."""
     across, up = sorted(pair, key=lambda line: _ACROSS.index(line.name))
     return across, up
@@ -95,7 +95,7 @@ def _unit(result: StabilityMap) -> tuple[float, str]:
     return 1e-3, "mm"
 
 
-def _panels(result: StabilityMap, across: PictureAxis, up: PictureAxis) -> Figure:
+def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Figure:
     figure = style.sheet(7.2, 7.8)
     axes = figure.subplots(3, 2, sharex=True)
     unit, name = _unit(result)
@@ -146,7 +146,7 @@ def _norm(values: Array, least: float = 0.0) -> Normalize:
     return LogNorm(low, high, clip=True) if low < high else Normalize()
 
 
-def _colour(axes: Axes, across: PictureAxis, up: PictureAxis, values: Array, norm: Normalize) -> None:
+def _colour(axes: Axes, across: _PictureAxis, up: _PictureAxis, values: Array, norm: Normalize) -> None:
     image = axes.pcolormesh(
         across.values, up.values, np.where(np.isfinite(values), values, np.nan), norm=norm, rasterized=True,
         shading="nearest",
@@ -161,7 +161,7 @@ def _colour(axes: Axes, across: PictureAxis, up: PictureAxis, values: Array, nor
     _scales(axes, across, up)
 
 
-def _scales(axes: Axes, across: PictureAxis, up: PictureAxis | None = None) -> None:
+def _scales(axes: Axes, across: _PictureAxis, up: _PictureAxis | None = None) -> None:
     axes.grid(False)
     if across.logarithmic:
         axes.set_xscale("log")
@@ -169,7 +169,7 @@ def _scales(axes: Axes, across: PictureAxis, up: PictureAxis | None = None) -> N
         axes.set_yscale("log")
 
 
-def _rule(axes: Axes, across: PictureAxis) -> None:
+def _rule(axes: Axes, across: _PictureAxis) -> None:
     """Add the paper's k_DZ, for a gap that is known exactly, along the top."""
     if across.name != "tolerance" or across.logarithmic:
         return
@@ -178,13 +178,13 @@ def _rule(axes: Axes, across: PictureAxis) -> None:
     above.tick_params(labelsize=7.5)
 
 
-def _mark(axes: Axes, across: PictureAxis, up: PictureAxis, where: NDArray[np.bool_]) -> None:
+def _mark(axes: Axes, across: _PictureAxis, up: _PictureAxis, where: NDArray[np.bool_]) -> None:
     """Mark the cells in which a window of ten seconds would call more runs settled."""
     rows, columns = np.nonzero(where)
     axes.plot(across.values[columns], up.values[rows], **_DOT)
 
 
-def _shares(axes: Axes, across: PictureAxis, settled: Array, marked: bool) -> None:
+def _shares(axes: Axes, across: _PictureAxis, settled: Array, marked: bool) -> None:
     axes.plot(across.values, 100.0 * settled.mean(axis=0), color=style.BLUE, label="runs that settle")
     full = 100.0 * np.mean(settled == 1.0, axis=0)
     axes.plot(across.values, full, color=style.RED, label="cells in which all do")
@@ -196,7 +196,7 @@ def _shares(axes: Axes, across: PictureAxis, settled: Array, marked: bool) -> No
     axes.grid(True)
 
 
-def _curves(result: StabilityMap, across: PictureAxis) -> Figure:
+def _curves(result: StabilityMap, across: _PictureAxis) -> Figure:
     figure, axes = style.panels(4, 1, height=1.7)
     unit, name = _unit(result)
     flat = {measure: result.grid(measure).ravel() for measure in ("settled", "error", "swing", "settling", "effort")}
@@ -216,7 +216,7 @@ def _curves(result: StabilityMap, across: PictureAxis) -> Figure:
     return figure
 
 
-def _sheet(result: StabilityMap, varying: Sequence[PictureAxis]) -> Figure:
+def _sheet(result: StabilityMap, varying: Sequence[_PictureAxis]) -> Figure:
     """The share that settles, over the two longest axes, once for each value of the others."""
     longest = sorted(varying, key=lambda line: -line.values.size)[:2]
     across, up = _order(longest)

@@ -13,8 +13,8 @@ from servotwin.analysis.maps.settings import MapSettings
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 
-MAX_VALUES = 4096
-MAX_PANELS = 36
+_MAX_VALUES = 4096
+_MAX_PANELS = 36
 TOLERANCE, AMPLITUDE = "0:5:64", "0.5:500:64:log"
 
 
@@ -113,9 +113,9 @@ def _ranged(name: str, text: str) -> list[float]:
     if kind not in ([], ["log"]) or not count.strip().isdecimal():
         raise _invalid_axis(name, text)
     first, last, size = _number(name, text, low), _number(name, text, high), int(count)
-    if not (2 <= size <= MAX_VALUES and first < last and (first > 0.0 or not kind)):
+    if not (2 <= size <= _MAX_VALUES and first < last and (first > 0.0 or not kind)):
         raise InvalidInput(
-            f"{name} {text!r}: a range goes up, has 2 to {MAX_VALUES} values and, with :log, starts above 0"
+            f"{name} {text!r}: a range goes up, has 2 to {_MAX_VALUES} values and, with :log, starts above 0"
         )
     return (np.geomspace if kind else np.linspace)(first, last, size).tolist()
 
@@ -139,8 +139,8 @@ def _check_drawable(shape: Sequence[int]) -> None:
     varying = sorted((size for size in shape if size > 1), reverse=True)
     if not varying:
         raise InvalidInput("map axes: every axis has one value; give a range to one of them at least")
-    if math.prod(varying[2:]) > MAX_PANELS:
+    if math.prod(varying[2:]) > _MAX_PANELS:
         raise InvalidInput(
             f"map axes: {' x '.join(map(str, varying))} values are {math.prod(varying[2:])} panels beside the two"
-            f" longest axes; give at most {MAX_PANELS}"
+            f" longest axes; give at most {_MAX_PANELS}"
         )

@@ -30,7 +30,7 @@ def label(result: StabilityMap, name: str) -> tuple[str, float]:
     return (_RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS)[name]
 
 
-def table_axis(result: StabilityMap) -> int:
+def _table_axis(result: StabilityMap) -> int:
     """Index of the axis along which the table runs: the dead zone where it varies, else the first axis that varies."""
     varying = [i for i, (_, values) in enumerate(result.axes) if len(values) > 1]
     dead_zone = [i for i in varying if result.axes[i][0] in ("tolerance", "k_dz")]
@@ -42,7 +42,7 @@ def rows(result: StabilityMap) -> list[tuple[float, Array]]:
 
     Error, swing and settling time are the worst of the cells; shares and effort are means.
     """
-    axis = table_axis(result)
+    axis = _table_axis(result)
     name, values = result.axes[axis]
     scale = label(result, name)[1]
     chosen = np.unique(np.linspace(0, len(values) - 1, min(ROWS, len(values))).round().astype(int))
@@ -92,7 +92,7 @@ def print_summary(result: StabilityMap, console: Console) -> None:
     """Print sentences and table."""
     for sentence in sentences(result):
         console.print(sentence, highlight=False)
-    table = Table(label(result, result.axes[table_axis(result)][0])[0], *HEADS, box=None, pad_edge=False)
+    table = Table(label(result, result.axes[_table_axis(result)][0])[0], *HEADS, box=None, pad_edge=False)
     for value, numbers in rows(result):
         table.add_row(f"{value:.4g}", *_cells(numbers.tolist()))
     console.print(table, highlight=False)
