@@ -54,7 +54,7 @@ def chain(*links: dict[str, Any], **other: Any) -> list[str]:
     return lines[lines.index(HEAD) + 1 :]
 
 
-def test_the_head_says_how_it_stands() -> None:
+def test_the_head_summarises_the_servo() -> None:
     trend = found("trend", body={"mean": [0.1, math.radians(0.5) / 3600.0, 0.0], "covariance": [0.0] * 9})
     head = told(link(1, estimate(), trend, found("disturbance", body={"bias": 0.02, "noise": 2e-6})))[:3]
     assert head == [
@@ -105,7 +105,7 @@ def test_a_version_from_its_window_to_its_effect() -> None:
         (link(1, estimate(), found("withdrawn", "two fail", version=3)), "version 3 WITHDRAWN: two fail"),
     ],
 )  # fmt: skip
-def test_what_is_said_of_a_window(of: dict[str, Any], said: str) -> None:
+def test_the_remarks_on_a_window(of: dict[str, Any], said: str) -> None:
     _, line = chain(of)
     assert line[HEAD.index("what followed") :] == said
 
@@ -127,21 +127,21 @@ def test_a_refused_version_shows_why() -> None:
         (Cause.ERROR_ENERGY, 3e-4, 1e-5, "300 um where 10 um are allowed"),
     ],
 )
-def test_a_fallback_stands_where_it_happened(cause: Cause, measured: float, allowed: float, said: str) -> None:
+def test_a_fallback_is_listed_at_its_time(cause: Cause, measured: float, allowed: float, said: str) -> None:
     body = {"cause": cause.value, "measured": measured, "allowed": allowed}
     events = [found("fallback", cause.value, version=3, body=body, made=90.0)]
     lines = chain(link(1, estimate()), link(2, estimate()), events=events)
     assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {said}"
 
 
-def test_a_drive_that_refuses_is_no_question_of_size() -> None:
+def test_a_fallback_after_a_drive_s_refusal_shows_no_values() -> None:
     event = found(
         "fallback", Cause.DRIVE.value, version=3, body={"cause": Cause.DRIVE.value, "measured": 0.0, "allowed": 0.0}
     )
     assert chain(link(1), events=[event])[0].endswith(f"FALLBACK from version 3: {Cause.DRIVE.value}")
 
 
-def test_starts_of_the_edge_and_faults_of_the_twin_are_told() -> None:
+def test_starts_of_the_edge_and_faults_of_the_twin_are_listed() -> None:
     events = [
         found("hello", "b2", version=3, made=70.0),
         found("answer", "taken", made=80.0),
@@ -163,7 +163,7 @@ def test_changes_leaves_out_what_led_to_nothing() -> None:
     assert [line.split()[2] for line in lines if line.startswith("1970")] == ["2", "3", "4"]
 
 
-def test_rubbish_in_a_body_is_no_reason_to_fail() -> None:
+def test_an_invalid_body_does_not_fail_the_report() -> None:
     for body in (None, {}, {"mean": []}, {"mean": None, "bias": "x", "noise": None}):
         of = [
             found(kind, "odd", version=1, body=body) for kind in ("trend", "disturbance", "estimate", "update", "new")

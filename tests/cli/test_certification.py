@@ -55,7 +55,7 @@ def test_one_model_may_be_named_and_its_file(tmp_path: Path) -> None:
     assert (tmp_path / "x.table").exists()
 
 
-def test_a_scenario_will_do(tmp_path: Path) -> None:
+def test_a_scenario_is_accepted_in_place_of_a_twin_s_file(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_text(
         'servo = "paper"\nduration_s = 50.0\n[reference]\nkind = "square"\namplitude_mm = 1.0\nperiod_s = 40.0\n'
@@ -71,15 +71,15 @@ def test_a_scenario_will_do(tmp_path: Path) -> None:
     [
         ((("one", ""),), (None, None), 'no model has a key table = "NAME.table"'),
         ((("one", "a.table"),), ("ore", None), "no such model .did you mean 'one'"),
-        ((("one", ""), ("two", "")), (None, Path("x.table")), "has 2 models; say which with --model"),
+        ((("one", ""), ("two", "")), (None, Path("x.table")), "has 2 models; choose one with --model"),
     ],
 )
-def test_what_cannot_be_proved_is_said(tmp_path: Path, models, options, why: str) -> None:
+def test_a_job_without_anything_to_verify_is_refused(tmp_path: Path, models, options, why: str) -> None:
     with pytest.raises(InvalidInput, match=why):
         certify(twin_file(tmp_path, *models), *options, COARSE, quiet())
 
 
-def test_a_policy_that_proves_nothing_is_named(tmp_path: Path) -> None:
+def test_a_policy_that_verifies_nothing_is_named(tmp_path: Path) -> None:
     path = tmp_path / "twin.toml"
     path.write_text(
         '[models.one]\nservo = "paper"\n[models.one.twin]\npolicy = "paper"\n[servos]\n"a" = "one"\n', encoding="utf-8"

@@ -99,7 +99,7 @@ def test_a_log_of_another_maker_needs_a_servo(folder, tmp_path):
     assert [e.gap for e in ours.estimates] == [e.gap for e in named.estimates]
 
 
-def test_one_window_as_asked_for(folder):
+def test_one_window_may_be_chosen(folder):
     found = identify(IdentifyOptions(folder / "run.npz", start=5.0, duration=2.0))
     (window,) = found.windows
     assert (window.start, window.duration) == pytest.approx((5.0, 2.0))
@@ -258,7 +258,7 @@ def test_measured_position_goes_before_the_true_one(folder):
     assert np.array_equal(log.whole.position, columns["measured_position_m"])
 
 
-def test_without_reference_the_steps_cannot_be_told(folder):
+def test_a_log_without_reference_needs_start_and_duration(folder):
     log = logfile.read_log(folder / "run.npz")
     assert identification.cut(log, IdentifyOptions(folder / "run.npz", duration=1.0))
     assert log.metadata["window_s"] == 1.0

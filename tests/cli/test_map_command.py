@@ -68,7 +68,7 @@ def test_the_files_hold_the_map(finished):
     assert image.imread(finished / "map.png").shape == (1170, 1080, 4)
 
 
-def test_the_table_is_what_the_cells_say(finished):
+def test_the_table_agrees_with_the_cells(finished):
     settings = REQUEST.settings()
     whole = StabilityMap(settings, measured(settings, range(settings.count)))
     value, numbers = summary.rows(whole)[2]

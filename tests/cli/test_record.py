@@ -78,7 +78,7 @@ def test_csv_holds_twelve_digits(written, expected):
     assert found["theta_m_rad"] == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
 
 
-def test_metadata_tells_what_was_run(written):
+def test_metadata_describes_the_run(written):
     with np.load(written[".npz"]) as found:
         metadata = json.loads(str(found["metadata"]))
     assert metadata["seed"] == 7

@@ -69,7 +69,7 @@ def test_every_estimate_comes_out_again_bit_for_bit(folder: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_version_that_is_another_one_now_is_named(folder: Path) -> None:
+def test_a_changed_version_is_named(folder: Path) -> None:
     assert changed(folder, "update contexts set text = replace(text, ?, ?)", f'"{version("numpy")}"', '"1.2.3"') == 1
     code, said = replayed(folder)
     assert code == 0, "the numbers are the same all the same"
@@ -77,7 +77,7 @@ def test_a_version_that_is_another_one_now_is_named(folder: Path) -> None:
     assert f"otherwise since {windows(folder)} windows: numpy 1.2.3 then, {version('numpy')} now" in said
 
 
-def test_an_estimate_that_is_not_what_comes_out_is_told(folder: Path) -> None:
+def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     """One bit of one stored number: nothing explains that, and nothing else is blamed."""
     (row, body), *_ = asked(folder, "select id, body from evidence where kind = 'estimate' and status = 'ok'")
     assert isinstance(body, bytes)
@@ -93,7 +93,7 @@ def test_an_estimate_that_is_not_what_comes_out_is_told(folder: Path) -> None:
     assert f"{windows(folder) - 1} the same, bit for bit" in said
 
 
-def test_another_model_of_today_is_named_with_what_it_changes(folder: Path) -> None:
+def test_a_changed_model_is_named_with_its_changes(folder: Path) -> None:
     code, _ = replayed(folder, "--present")
     assert code == 0
     twin = folder / "twin.toml"
@@ -104,7 +104,7 @@ def test_another_model_of_today_is_named_with_what_it_changes(folder: Path) -> N
     assert replayed(folder)[0] == 0, "as they were then"
 
 
-def test_windows_that_retention_took_are_counted_and_the_rest_is_compared(folder: Path) -> None:
+def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(folder: Path) -> None:
     store = open_store(f"sqlite:///{folder / 'twin.db'}")
     try:
         gone = delete_old_bodies(store, inf)
@@ -134,7 +134,7 @@ def test_one_window_is_enough(folder: Path) -> None:
         ("update evidence set body = x'00' where kind = 'estimate'", "the stored estimate is not understood"),
     ],
 )
-def test_what_is_not_understood_is_told_for_each_window(folder: Path, statement: str, said: str) -> None:
+def test_data_that_cannot_be_decoded_is_reported_for_each_window(folder: Path, statement: str, said: str) -> None:
     assert changed(folder, statement) > 0
     code, found = replayed(folder)
     assert code == 1
@@ -143,7 +143,7 @@ def test_what_is_not_understood_is_told_for_each_window(folder: Path, statement:
     assert "Traceback" not in found
 
 
-def test_what_was_never_estimated_is_counted_as_that(folder: Path) -> None:
+def test_windows_that_were_never_estimated_are_counted_apart(folder: Path) -> None:
     assert changed(folder, "update evidence set status = 'failed: a reason' where kind = 'estimate'") == windows(folder)
     code, said = replayed(folder)
     assert (code, said.splitlines()[1].strip()) == (
@@ -159,7 +159,7 @@ def test_what_was_never_estimated_is_counted_as_that(folder: Path) -> None:
         (("--window", "never"), "error: window 'never': give BOOT/NUMBER, as `servotwin audit` shows it\n"),
     ],
 )
-def test_a_window_that_is_none_is_one_sentence(folder: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_an_invalid_window_is_one_sentence(folder: Path, arguments: tuple[str, ...], said: str) -> None:
     assert replayed(folder, *arguments) == (2, said)
 
 

@@ -75,14 +75,14 @@ def test_every_form_is_read_in_its_unit() -> None:
     )  # fmt: skip
 
 
-def test_what_is_left_out_keeps_its_default_or_that_of_a_base() -> None:
+def test_a_missing_key_keeps_its_default_or_that_of_a_base() -> None:
     assert machine("") == Machine()
     table = parse_toml("share_percent = 10", "m.toml")
     assert read(table, Machine, base=Machine(size=7.0)) == Machine(size=7.0, share=0.1)
     assert changes(table, Machine) == {"share": 0.1, "spare": Motor(1.0)}
 
 
-def test_the_exact_key_goes_before_the_other() -> None:
+def test_the_exact_key_overrides_the_other() -> None:
     assert machine("size_m = 0.5\nsize_mm = 2").size == 0.5
 
 
@@ -130,7 +130,7 @@ def test_the_constructor_checks_the_same_ranges(values: dict[str, object], said:
     st.floats(0.0, inf), st.floats(0.0, 0.9), st.tuples(st.floats(-9, 9), st.floats(-9, 9)), st.floats(1e-9, 1e9),
     st.text(max_size=9).filter(str.isprintable),
 )  # fmt: skip
-def test_what_is_written_is_read_back(
+def test_settings_written_are_read_back(
     size: float, share: float, ends: tuple[float, float], gain: float, log: str
 ) -> None:
     made = Machine(
@@ -142,7 +142,7 @@ def test_what_is_written_is_read_back(
     assert (again.share, *again.range, again.motor.speed) == pytest.approx((share, *ends, 2.0), rel=1e-15, abs=0.0)
 
 
-def test_the_end_of_a_key_says_its_unit() -> None:
+def test_the_suffix_of_a_key_gives_its_unit() -> None:
     assert [unit_of(name).name for name in ("gap_deg", "k_n_per_m", "n", "megabytes")] == ["deg", "N/m", "", "MB"]
     assert unit_of("rate_deg_per_s").to_si(180.0) == pi
     assert unit_of("share_percent").to_si(29.0) == 29.0 / 100.0

@@ -92,7 +92,7 @@ def text_store(folder: Path) -> str:
         ('store = "postgresql://u:secret@h/d"', "holds a password"),
     ],
 )
-def test_a_twin_says_what_is_wrong_and_does_not_begin(
+def test_a_twin_with_an_invalid_file_names_the_fault_and_does_not_start(
     tmp_path: Path, service: str | Callable[[Path], str], said: str
 ) -> None:
     sentence = twin(tmp_path, service if isinstance(service, str) else service(tmp_path))
@@ -112,7 +112,7 @@ def edge(folder: Path, more: str) -> str:
     return ended(folder, "servotwin.edge_process", "edge.toml")
 
 
-def test_an_edge_says_what_is_wrong_and_does_not_begin(tmp_path: Path) -> None:
+def test_an_edge_with_an_invalid_file_names_the_fault_and_does_not_start(tmp_path: Path) -> None:
     """As a process; the other reasons below, without one each."""
     assert "edge.toml: unknown key 'keeep' (did you mean 'keep'?)" in edge(tmp_path, "[keeep]\n")
     assert list(tmp_path.iterdir()) == [tmp_path / "edge.toml"]
@@ -146,7 +146,7 @@ TOKEN = 'token_file = "token"\n'
         ('[keep]\nstatus = "/no/status.json"', "[keep]: status = '/no/status.json': there is no folder /no"),
     ],
 )
-def test_what_an_edge_s_file_names_has_to_be_there(tmp_path: Path, more: str, said: str) -> None:
+def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, said: str) -> None:
     (tmp_path / "edge.toml").write_text(EDGE + more)
     for name, mode in (("token", 0o600), ("open", 0o644)):
         (tmp_path / name).write_text("secret-token\n")

@@ -77,7 +77,7 @@ def test_parameter_messages_are_json_too(message: Any) -> None:
     assert json.loads(text)["type"] == type(message).__struct_config__.tag
 
 
-def test_a_window_knows_who_it_is() -> None:
+def test_a_window_has_an_identity() -> None:
     w = window()
     assert w.identity == ("axis-1", "b0", 4)
     assert w.samples == 3

@@ -78,7 +78,7 @@ def test_the_two_kinds_are_told_apart() -> None:
         ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "strokes": 0}}, "strokes"),
     ],
 )
-def test_what_is_wrong_is_named(change: dict[str, Any], words: str) -> None:
+def test_an_invalid_field_is_named(change: dict[str, Any], words: str) -> None:
     raw = msgspec.to_builtins(REQUEST) | change
     with pytest.raises(InvalidMessage, match=words):
         decode(msgspec.msgpack.encode(raw))
@@ -92,7 +92,7 @@ def test_cut_and_random_bytes_are_refused(noise: bytes) -> None:
             decode(data)
 
 
-def test_what_may_be_taken_later() -> None:
+def test_which_outcomes_are_temporary() -> None:
     assert {outcome for outcome in RequestOutcome if outcome.temporary} == {
         RequestOutcome.BUSY,
         RequestOutcome.TOO_SOON,

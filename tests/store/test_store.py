@@ -44,7 +44,7 @@ def test_the_same_key_with_another_digest_is_a_conflict_and_the_first_stays(stor
     assert store.put([reencoded]) == [KNOWN]
 
 
-def test_a_claim_holds_windows_and_letters_in_order_and_is_lent_once(store: Store) -> None:
+def test_a_lease_contains_windows_and_letters_in_order_and_is_granted_once(store: Store) -> None:
     store.put([letter(body=b"first"), window("b")])
     store.put([window(sequence=2, body=b"second"), window(sequence=1, body=b"third")])
     found = {one.servo: one for one in claim(store)}
@@ -58,7 +58,7 @@ def test_a_claim_holds_windows_and_letters_in_order_and_is_lent_once(store: Stor
     assert claim(store, "you") == []
 
 
-def test_who_waited_longest_comes_first_and_limits_hold(store: Store) -> None:
+def test_the_servo_that_waited_longest_is_leased_first_within_the_limits(store: Store) -> None:
     store.put([window("late", received=120.0), window("early", received=90.0), window("middle", received=100.0)])
     store.put([window("early", sequence) for sequence in range(2, 6)])
     assert [one.servo for one in claim(store, limit=2)] == ["early", "middle"]
@@ -71,7 +71,7 @@ def test_who_waited_longest_comes_first_and_limits_hold(store: Store) -> None:
     assert len(rest.messages) == 2
 
 
-def test_a_lease_ends_with_time_with_release_and_with_an_outcome(store: Store) -> None:
+def test_a_lease_ends_with_time_with_release_and_with_a_result(store: Store) -> None:
     store.put([window(), window("b")])
     assert len(claim(store, lease_s=30.0, now=200.0)) == 2
     assert claim(store, "you", now=229.0) == []
@@ -87,7 +87,7 @@ def test_a_lease_ends_with_time_with_release_and_with_an_outcome(store: Store) -
     assert (fresh.servo, fresh.serial, fresh.attempts, fresh.state) == ("b", 1, 1, b"state")
 
 
-def test_a_servo_is_woken_when_it_is_time(store: Store) -> None:
+def test_a_servo_is_leased_when_its_wake_up_is_due(store: Store) -> None:
     store.put([window(), window("b")])
     first = {one.servo: one for one in claim(store)}
     store.commit([outcome(first["a"], wake=300.0), outcome(first["b"])], 201.0)
@@ -97,7 +97,7 @@ def test_a_servo_is_woken_when_it_is_time(store: Store) -> None:
     assert (woken.servo, woken.messages) == ("a", ())
 
 
-def test_those_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Store) -> None:
+def test_servos_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Store) -> None:
     for servo in ("w1", "w2", "w3"):
         store.put([window(servo)])
     store.commit([outcome(one, wake=150.0) for one in claim(store)], 201.0)
@@ -107,7 +107,7 @@ def test_those_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Stor
     assert len([servo for servo in servos if servo.startswith("m")]) == 2
 
 
-def test_large_messages_are_claimed_a_few_at_a_time(store: Store) -> None:
+def test_large_messages_are_leased_a_few_at_a_time(store: Store) -> None:
     large, small = b"x" * (MAX_LEASE_BYTES // 2), b"y"
     store.put([window("a", sequence, large) for sequence in range(3)])
     store.put([window("a", 3, small), window("b", 0, large + large + small), window("b", 1, small)])
@@ -120,7 +120,7 @@ def test_large_messages_are_claimed_a_few_at_a_time(store: Store) -> None:
     assert [message.body for message in other.messages] == [small]
 
 
-def test_messages_from_before_a_clock_was_set_back_are_claimed(store: Store) -> None:
+def test_messages_from_before_a_clock_was_set_back_are_leased(store: Store) -> None:
     store.put([window(received=9000.0)])
     assert len(claim(store, now=200.0)) == 1
     assert store.backlog(200.0) == Backlog(1, 0, 0.0)
@@ -134,7 +134,7 @@ def test_a_lease_from_before_a_clock_was_set_back_has_ended(store: Store) -> Non
     assert claim(store, now=201.0) == []
 
 
-def test_proofs_are_claimed_only_when_asked_for(store: Store) -> None:
+def test_verifications_are_leased_only_on_request(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)
     assert store.commit([outcome(lent, enqueue=(proof(), proof(body=b"another")))], 201.0) == [True]
@@ -149,14 +149,14 @@ def test_proofs_are_claimed_only_when_asked_for(store: Store) -> None:
     assert sorted(bodies_of(both)) == [b"another", b"samples"]
 
 
-def test_a_claim_of_one_kind_lends_nothing_in_vain(store: Store) -> None:
+def test_a_lease_of_one_kind_skips_servos_without_such_messages(store: Store) -> None:
     store.put([window(), letter("b")])
     (only,) = claim(store, kinds=(MessageKind.LETTER,))
     assert only.servo == "b"
     assert [one.servo for one in claim(store, "you")] == ["a"]
 
 
-def test_of_two_outcomes_of_one_claim_the_second_is_void(store: Store) -> None:
+def test_the_second_of_two_results_of_one_lease_is_void(store: Store) -> None:
     store.put([window(), window("b")])
     a, b = claim(store)
     late = outcome(a, EvidenceRecord("estimate", a.messages[0].id, b"2"), outgoing=(b"2",), state=b"2")
@@ -169,12 +169,12 @@ def test_of_two_outcomes_of_one_claim_the_second_is_void(store: Store) -> None:
     assert claim(store)[0].state == b"1"
 
 
-def test_an_outcome_for_an_unknown_servo_is_void(store: Store) -> None:
+def test_a_result_for_an_unknown_servo_is_void(store: Store) -> None:
     assert store.commit([outcome(Lease("nobody", b"", 0, ()))], 200.0) == [False]
 
 
 @pytest.mark.parametrize("fault", ["context", "message", "foreign message", "done message"])
-def test_a_faulty_outcome_leaves_nothing_behind(store: Store, fault: str) -> None:
+def test_an_invalid_result_leaves_nothing_behind(store: Store, fault: str) -> None:
     store.put([window(), window("b")])
     a, b = sorted(claim(store))
     faulty = outcome(
@@ -213,7 +213,7 @@ def test_many_threads_with_the_same_windows_keep_each_once(store: Store) -> None
     assert flat.count(KNOWN) == 120
 
 
-def test_claims_of_many_threads_do_not_overlap(store: Store) -> None:
+def test_leases_of_many_threads_do_not_overlap(store: Store) -> None:
     names = [f"s{n}" for n in range(40)]
     store.put([window(name) for name in names])
     lent: list[str] = []
@@ -232,7 +232,7 @@ def test_claims_of_many_threads_do_not_overlap(store: Store) -> None:
     assert sorted(lent) == sorted(names)
 
 
-def test_a_message_that_comes_while_its_servo_is_lent_is_not_forgotten(store: Store) -> None:
+def test_a_message_that_arrives_while_its_servo_is_leased_is_not_lost(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)
     store.put([window(sequence=2)])
@@ -241,7 +241,7 @@ def test_a_message_that_comes_while_its_servo_is_lent_is_not_forgotten(store: St
     assert (again.serial, len(again.messages)) == (1, 1)
 
 
-def test_no_message_is_forgotten_when_outcomes_and_messages_come_at_once(store: Store) -> None:
+def test_no_message_is_lost_when_results_and_messages_are_committed_at_once(store: Store) -> None:
     total, done = 150, threading.Event()
 
     def send() -> None:
@@ -263,7 +263,7 @@ def test_no_message_is_forgotten_when_outcomes_and_messages_come_at_once(store: 
 
 
 @pytest.mark.parametrize("url", ["mysql://u:secret@h/d", "postgresql://u:secret@h:port/d", "http://secret@h/d", ""])
-def test_an_address_that_is_none_is_refused_without_what_it_hides(url: str) -> None:
+def test_an_invalid_address_is_refused_without_showing_its_password(url: str) -> None:
     with pytest.raises(InvalidInput, match=r"the store's address") as refused:
         open_store(url)
     assert "secret" not in str(refused.value)
@@ -286,7 +286,7 @@ class Deadlock(Exception):
     sqlstate = "40P01"
 
 
-def test_a_transaction_that_met_another_one_is_tried_again(store: Store) -> None:
+def test_a_transaction_that_lost_a_race_is_retried(store: Store) -> None:
     failures = iter([Deadlock("deadlock detected")] * 2)
 
     def fail(*_: object) -> None:

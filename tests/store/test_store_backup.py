@@ -78,7 +78,7 @@ def test_a_backup_while_it_is_written_to_is_of_one_moment(url: str, tmp_path: Pa
     store.close()
 
 
-def test_what_cannot_be_backed_up(url: str, tmp_path: Path) -> None:
+def test_a_store_that_cannot_be_backed_up_is_refused(url: str, tmp_path: Path) -> None:
     to = tmp_path / "backup.db"
     with pytest.raises(InvalidInput, match="there is no such file"):
         backup(url, to)
@@ -151,7 +151,7 @@ def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, lat
 # Retention
 
 
-def test_retention_empties_old_windows_but_those_that_matter(new_address: NewAddress) -> None:
+def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_update(new_address: NewAddress) -> None:
     store = open_store(new_address())
     store.put([window(sequence=n, body=bytes(1000), received=100.0 + n) for n in range(10)])
     store.put([letter(received=100.0)])
@@ -174,7 +174,7 @@ def test_retention_empties_old_windows_but_those_that_matter(new_address: NewAdd
     store.close()
 
 
-def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
+def test_retention_returns_space_to_the_file_system(url: str, tmp_path: Path) -> None:
     store = open_store(url)
     store.put([window(sequence=n, body=os.urandom(20_000), received=100.0) for n in range(100)])
     while claims := store.lease("me", 1, 30.0, 200.0):
@@ -190,7 +190,7 @@ def test_retention_gives_the_disk_back(url: str, tmp_path: Path) -> None:
     store.close()
 
 
-def test_retention_ended_early_goes_on_next_time(url: str) -> None:
+def test_interrupted_retention_continues_at_the_next_call(url: str) -> None:
     store = open_store(url)
     store.put([window(sequence=n, received=100.0) for n in range(10)])
     store.commit([outcome(claim) for claim in store.lease("me", 1, 30.0, 200.0)], 201.0)

@@ -110,7 +110,7 @@ def no_process() -> Iterator[None]:
     yield None
 
 
-def test_a_worker_killed_in_the_middle_of_outcomes(new_address: NewAddress) -> None:
+def test_a_worker_killed_in_the_middle_of_results(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
     store.put([window(servo, n) for n in range(60) for servo in store_process.SERVOS])
@@ -122,7 +122,7 @@ def test_a_worker_killed_in_the_middle_of_outcomes(new_address: NewAddress) -> N
     store.close()
 
 
-def test_what_a_killed_process_had_borrowed_another_one_does(new_address: NewAddress) -> None:
+def test_the_leases_of_a_killed_process_go_to_another_one(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
     store.put([window(servo, n) for n in range(12) for servo in store_process.SERVOS])

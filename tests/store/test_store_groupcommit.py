@@ -65,7 +65,7 @@ def results(futures: Sequence[Future[PutResult]]) -> list[PutResult]:
     return [future.result(PATIENCE_S) for future in futures]
 
 
-def test_messages_and_outcomes_of_many_threads(store: Store, group: GroupCommit) -> None:
+def test_messages_and_results_of_many_threads(store: Store, group: GroupCommit) -> None:
     store.put([window("worked")])
     (claim,) = store.lease("me", 1, 30.0, 200.0)
     became: list[PutResult] = []
@@ -84,7 +84,7 @@ def test_messages_and_outcomes_of_many_threads(store: Store, group: GroupCommit)
     assert store.servo("worked").posted == 1
 
 
-def test_whatever_waits_is_taken_together(gate: Gate) -> None:
+def test_waiting_writes_are_committed_together(gate: Gate) -> None:
     group = GroupCommit(gate, CommitLimits(together=8))
     first = group.put(window(sequence=0))
     assert gate.entered.wait(PATIENCE_S)
@@ -108,7 +108,7 @@ def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
 
 
 @pytest.mark.parametrize("bounds", [CommitLimits(waiting=3), CommitLimits(waiting_bytes=3 * 7)])
-def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds: CommitLimits) -> None:
+def test_a_full_queue_refuses_messages_but_not_results(gate: Gate, bounds: CommitLimits) -> None:
     gate.store.put([window("worked")])
     (claim,) = gate.store.lease("me", 1, 30.0, 200.0)
     group = GroupCommit(gate, bounds)
@@ -126,7 +126,7 @@ def test_when_too_much_waits_more_is_refused_but_not_outcomes(gate: Gate, bounds
     group.close()
 
 
-def test_what_is_handed_over_cannot_be_cancelled(gate: Gate) -> None:
+def test_an_accepted_write_cannot_be_cancelled(gate: Gate) -> None:
     group = GroupCommit(gate)
     futures = [group.put(window(sequence=n)) for n in range(3)]
     assert not any(future.cancel() for future in futures)
@@ -135,7 +135,7 @@ def test_what_is_handed_over_cannot_be_cancelled(gate: Gate) -> None:
     group.close()
 
 
-def test_closing_commits_what_waits_and_takes_nothing_more(gate: Gate) -> None:
+def test_closing_commits_waiting_writes_and_refuses_new_ones(gate: Gate) -> None:
     group = GroupCommit(gate)
     futures = [group.put(window(sequence=n)) for n in range(20)]
     gate.opened.set()
@@ -146,7 +146,7 @@ def test_closing_commits_what_waits_and_takes_nothing_more(gate: Gate) -> None:
         group.put(window())
 
 
-def test_a_faulty_outcome_fails_alone(store: Store, gate: Gate) -> None:
+def test_an_invalid_result_fails_alone(store: Store, gate: Gate) -> None:
     store.put([window("a"), window("b")])
     a, b = sorted(store.lease("me", 2, 30.0, 200.0))
     group = GroupCommit(gate)
@@ -170,7 +170,7 @@ def limit_pages(store: Store, more: int | None) -> None:
         connection.exec_driver_sql(f"PRAGMA max_page_count = {2**31 if more is None else pages + more}")
 
 
-def test_a_full_disk_fails_what_it_must_and_is_survived(store: Store, group: GroupCommit) -> None:
+def test_a_full_disk_fails_the_writes_and_the_store_recovers(store: Store, group: GroupCommit) -> None:
     assert results([group.put(window(sequence=0))]) == [PutResult.NEW]
     limit_pages(store, 20)
     futures = [group.put(window(sequence=n, body=bytes(50_000))) for n in range(1, 30)]
@@ -185,7 +185,7 @@ def test_a_full_disk_fails_what_it_must_and_is_survived(store: Store, group: Gro
     assert again == [PutResult.KNOWN if n in safe else PutResult.NEW for n in range(1, 30)]
 
 
-def test_a_full_disk_loses_no_outcome_that_was_acknowledged(store: Store, group: GroupCommit) -> None:
+def test_a_full_disk_loses_no_result_that_was_acknowledged(store: Store, group: GroupCommit) -> None:
     store.put([window()])
     (claim,) = store.lease("me", 1, 30.0, 200.0)
     limit_pages(store, 2)

@@ -76,7 +76,7 @@ def plan(path: str, statement: str, parameters: Any) -> list[str]:
         return [row[3] for row in connection.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)]
 
 
-def test_no_statement_walks_over_a_table(asked: tuple[Store, dict[str, Any]]) -> None:
+def test_no_statement_scans_a_whole_table(asked: tuple[Store, dict[str, Any]]) -> None:
     store, statements = asked
     exercise(store)
     path = str(store.engines.writer.url.database)

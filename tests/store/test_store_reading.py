@@ -24,7 +24,7 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
     assert store.outgoing("a", 4) == store.outgoing("nobody", 0) == []
 
 
-def test_an_edge_that_has_heard_more_than_a_restored_store_knows_hears_what_comes_next(store: Store) -> None:
+def test_an_edge_that_received_more_than_a_restored_store_posted_gets_the_next_message(store: Store) -> None:
     for sequence, heard in ((1, 0), (2, 900), (3, 2**60)):
         store.put([window(sequence=sequence), window("b", sequence)])
         assert store.outgoing("a", heard) == []
@@ -34,7 +34,7 @@ def test_an_edge_that_has_heard_more_than_a_restored_store_knows_hears_what_come
     assert store.outgoing("nobody", 7) == []
 
 
-def test_what_waits_and_for_how_long(store: Store) -> None:
+def test_the_backlog_counts_messages_and_gives_the_age_of_the_oldest(store: Store) -> None:
     assert store.backlog(200.0) == Backlog(0, 0, 0.0)
     store.put([window(received=110.0), letter(received=120.0), window("b", received=150.0)])
     assert store.backlog(200.0) == Backlog(3, 0, 90.0)
@@ -50,7 +50,7 @@ def test_contexts_are_kept_once(store: Store) -> None:
     assert store.contexts(["k1", "k2"]) == {"k1": '{"numpy": "2"}'}
 
 
-def test_a_servo_at_a_glance(store: Store) -> None:
+def test_the_summary_of_a_servo(store: Store) -> None:
     store.put([window(), letter(received=150.0), window("b")])
     found = (
         EvidenceRecord("glance", 0, b"", gap=0.1, std=0.01, status="calm"),
@@ -126,7 +126,7 @@ def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> Non
     assert (link.window.sequence, link.window.done, link.found, link.steps) == (1, None, (), ())
 
 
-def test_an_update_after_a_proof_hangs_on_its_window(store: Store) -> None:
+def test_an_update_after_a_verification_belongs_to_its_window(store: Store) -> None:
     store.put([window()])
     (lent,) = claim(store)
     store.commit([outcome(lent, EvidenceRecord("estimate", lent.messages[0].id, b""), enqueue=(proof(),))], 201.0)
@@ -161,7 +161,7 @@ def test_opened_again_everything_is_there(new_address: NewAddress) -> None:
     store.close()
 
 
-def test_what_belongs_to_no_window(store: Store) -> None:
+def test_events_that_belong_to_no_window(store: Store) -> None:
     """Starts, fallbacks, answers, and what the twin itself could not do; newest first, of one servo."""
     store.put([letter(), window(), letter("b")])
     first, second = claim(store, servo="a")[0], claim(store, servo="b")[0]

@@ -95,19 +95,19 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
     return asyncio.run(body())
 
 
-def test_blamed_is_whom_the_worker_was_at_though_others_failed_before():
+def test_the_lease_that_a_lost_worker_was_processing_counts_as_failed():
     poison = claim("b", DIES)
     lender = through([[claim("a", FAILS)], [claim("a"), poison], [claim("a"), poison]])
     assert lender.seen == [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
 
 
-def test_a_proof_that_kills_its_workers_is_counted_though_windows_succeed():
+def test_a_verification_that_kills_its_workers_is_counted_although_windows_succeed():
     proof, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
     lender = through([[proof], [window], [proof], [window], [proof]])
     assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
 
 
-def test_a_void_outcome_gives_nothing_back_that_another_may_have_borrowed():
+def test_a_void_result_releases_no_lease():
     lender = through([[claim("a")], [claim("b", FAILS)], [claim("b")]], valid=False)
     assert [servos for servos in lender.released if "a" in servos] == []
     assert frozenset({"b"}) in lender.released

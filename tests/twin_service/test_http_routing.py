@@ -104,7 +104,7 @@ def test_every_route_is_described_and_every_described_route_exists(tmp_path):
     asyncio.run(body())
 
 
-def test_a_service_that_does_not_start_says_so_to_the_server(tmp_path):
+def test_a_service_that_does_not_start_reports_it_to_the_server(tmp_path):
     """The lifespan protocol of ASGI: startup fails, or succeeds and is followed by shutdown."""
 
     @contextlib.asynccontextmanager

@@ -94,7 +94,7 @@ def test_over_tls_the_brokers_certificate_is_checked(tmp_path: Path, store: Stor
 @pytest.mark.parametrize(
     "url", ["http://host", "mqtt://", "mqtt://host/path", "mqtt://me:secret@host", "mqtt://host:0", "mqtt://host:x"]
 )
-def test_an_address_that_is_none_is_named(url: str) -> None:
+def test_an_invalid_address_is_named(url: str) -> None:
     with pytest.raises(InvalidInput, match=r"give mqtt\(s\)://host"):
         Broker(url)
 
@@ -105,7 +105,7 @@ def test_without_paho_one_sentence_says_what_to_install(monkeypatch: pytest.Monk
         MqttTransport(Broker("mqtt://127.0.0.1"), "axis-1", "token")
 
 
-def test_a_broker_elsewhere_asks_for_tokens(tmp_path: Path) -> None:
+def test_a_broker_on_another_machine_requires_tokens(tmp_path: Path) -> None:
     for text, what in (
         ('[service.mqtt]\nurl = "mqtts://elsewhere"', "requires tokens"),
         ('[service]\nlockstep = true\n[service.mqtt]\nurl = "mqtt://localhost"', "exclude each other"),

@@ -109,7 +109,7 @@ def test_windows_may_come_in_any_order(serving):
     serving(body)
 
 
-def test_who_may_do_what(serving):
+def test_tokens_decide_who_may_read_and_write(serving):
     async def body(_system, client):
         path = place(window())
         assert code(await client.put(path, content=encode(window()))) == (401, "bad_token")
@@ -126,7 +126,7 @@ def test_who_may_do_what(serving):
     serving(body)
 
 
-def test_a_servo_that_nobody_looks_after_may_come_again(serving):
+def test_a_message_of_an_unknown_servo_may_be_sent_again(serving):
     async def body(_system, client):
         stranger = window(servo="stranger")
         assert code(await put(client, stranger, "any")) == (404, "unknown_servo")
@@ -148,7 +148,7 @@ def test_a_message_must_be_what_its_address_says(serving):
     serving(body)
 
 
-def test_what_is_no_message_is_told_apart(serving):
+def test_invalid_messages_are_refused_with_distinct_codes(serving):
     async def body(system, client):
         path, whole = place(window()), encode(window())
         middle = len(whole) // 3
@@ -169,7 +169,7 @@ def test_what_is_no_message_is_told_apart(serving):
     serving(body)
 
 
-def test_what_is_too_large_is_refused_however_it_comes(serving):
+def test_a_body_that_is_too_large_is_refused_however_it_is_sent(serving):
     async def pieces():
         for _ in range(100):
             yield bytes(1000)
@@ -189,7 +189,7 @@ def test_what_is_too_large_is_refused_however_it_comes(serving):
     serving(body, "max_body_bytes = 20000")
 
 
-def test_a_body_that_does_not_come_is_not_waited_for(serving):
+def test_a_body_that_does_not_arrive_in_time_is_refused(serving):
     async def slowly():
         yield b"x"
         await asyncio.sleep(30.0)
@@ -225,7 +225,7 @@ def test_a_servo_that_sends_too_much_waits(serving):
     serving(body, "rate_limit_per_s = 0.001\nrate_burst = 3.0")
 
 
-def test_a_full_queue_and_a_store_that_cannot_write_are_for_later(serving):
+def test_a_full_queue_and_a_store_that_cannot_write_are_temporary_refusals(serving):
     async def body(system, client):
         writing, held, write = threading.Event(), threading.Event(), system.store.write
 
@@ -286,7 +286,7 @@ def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
 @pytest.mark.parametrize(
     "query", ["after=x", "after=-1", "after=" + "9" * 5000, "wait=31", "wait=nan", "wait=-1", "wait=inf", "after=%00"]
 )
-def test_arguments_that_are_none_are_refused(serving, query):
+def test_invalid_query_arguments_are_refused(serving, query):
     async def body(_system, client):
         answer = await client.get("/v1/servos/ax-1/outgoing?" + query, headers=bearer())
         assert code(answer) == (400, "not_understood")
@@ -294,7 +294,7 @@ def test_arguments_that_are_none_are_refused(serving, query):
     serving(body)
 
 
-def test_only_so_many_polls_wait(serving):
+def test_the_number_of_waiting_polls_is_limited(serving):
     async def body(system, client):
         path = "/v1/servos/ax-1/outgoing?wait=20"
         first = asyncio.create_task(client.get(path, headers=bearer()))
@@ -307,7 +307,7 @@ def test_only_so_many_polls_wait(serving):
     serving(body, "long_polls = 1")
 
 
-def test_an_unknown_path_and_method_are_told_in_the_same_form(serving):
+def test_an_unknown_path_or_method_has_an_error_body_of_the_same_form(serving):
     async def body(_system, client):
         assert code(await client.get("/nowhere")) == (404, "not_understood")
         assert code(await client.delete("/v1/servos")) == (405, "not_understood")
@@ -317,7 +317,7 @@ def test_an_unknown_path_and_method_are_told_in_the_same_form(serving):
     serving(body)
 
 
-def test_a_token_counts_as_soon_as_its_file_says_so_and_no_longer(serving):
+def test_a_token_is_valid_exactly_while_it_is_in_the_file(serving):
     async def body(system, client):
         path = serving.folder / "tokens.toml"
         known = read_tokens(path)
@@ -334,7 +334,7 @@ def test_a_token_counts_as_soon_as_its_file_says_so_and_no_longer(serving):
     serving(body)
 
 
-def test_nothing_that_is_said_or_logged_holds_a_token(serving, caplog):
+def test_no_response_and_no_log_line_contains_a_token(serving, caplog):
     caplog.set_level("DEBUG")
     said = []
 
@@ -352,7 +352,7 @@ def test_nothing_that_is_said_or_logged_holds_a_token(serving, caplog):
         assert verifier_of(token).hex() not in everything
 
 
-def test_health_says_what_is_not_well(serving):
+def test_health_names_the_unhealthy_part(serving):
     async def body(system, client):
         answer = await client.get("/healthz")
         assert answer.status_code == 503
@@ -366,7 +366,7 @@ def test_health_says_what_is_not_well(serving):
     serving(body)
 
 
-def test_a_store_that_takes_no_writes_is_not_well_though_it_can_be_read(serving):
+def test_a_store_that_rejects_writes_is_unhealthy_although_it_can_be_read(serving):
     async def body(system, client):
         write, system.store.write = system.store.write, full
         assert code(await put(client, window(0))) == (503, "unavailable")

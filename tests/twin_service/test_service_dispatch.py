@@ -67,7 +67,7 @@ def statuses(system, servo="ax-1"):
 
 
 @pytest.mark.parametrize("fault", ["die", "hang", "raise"])
-def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_once(tmp_path, fault, caplog):
+def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_processed_once(tmp_path, fault, caplog):
     async def body():
         async with working(twin_file(tmp_path), timeout=5.0 if fault == "hang" else 30.0) as (system, client):
             for sequence in range(6):
@@ -93,7 +93,7 @@ def test_a_message_that_kills_its_workers_is_found_and_all_others_are_worked_on_
     asyncio.run(body())
 
 
-def test_what_was_not_committed_is_worked_on_again_when_the_store_is_back(tmp_path):
+def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path):
     async def body():
         async with working(twin_file(tmp_path)) as (system, client):
             write, failures = system.store.write, []
@@ -117,7 +117,7 @@ def test_what_was_not_committed_is_worked_on_again_when_the_store_is_back(tmp_pa
 
 
 @pytest.mark.parametrize("kind", SYSTEMS)
-def test_windows_are_worked_on_and_the_edge_is_told(tmp_path, kind):
+def test_windows_are_processed_and_the_edge_is_notified(tmp_path, kind):
     async def body(url):
         async with working(twin_file(tmp_path, f'store = "{shown(url)}"'), url) as (system, client):
             asked = client.get("/v1/servos/ax-1/outgoing?after=0&wait=30", headers=bearer())
@@ -138,7 +138,7 @@ def shown(url):
     return f"{head}://{who.split(':')[0]}{at}{where}"
 
 
-def test_processes_share_one_database_and_tell_each_other_s_edges(tmp_path):
+def test_processes_share_one_database_and_notify_each_other_s_edges(tmp_path):
     async def body(url):
         file = twin_file(tmp_path, f'store = "{shown(url)}"')
         async with working(file, url) as (one, here), working(file, url) as (two, there):
@@ -157,7 +157,7 @@ def test_processes_share_one_database_and_tell_each_other_s_edges(tmp_path):
         asyncio.run(body(new()))
 
 
-def test_proofs_are_saved_up_to_two_and_then_come_at_their_rate():
+def test_at_most_two_verifications_start_at_once_and_then_at_their_rate():
     allowance = VerificationQuota(6.0)
     begun = []
     for tick in range(1, 6001):

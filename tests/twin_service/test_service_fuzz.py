@@ -43,7 +43,7 @@ def raw(_context, value):
 
 @given(st.data())
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
-def test_what_the_description_allows(described, data):
+def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
     case = data.draw(st.one_of([found.ok().as_strategy() for found in described.get_all_operations()]))
     if "wait" in (case.query or {}):

@@ -112,7 +112,7 @@ def received(*parts, end=True):
 
 
 @given(st.lists(st.binary(max_size=40), max_size=10), st.integers(0, 150), st.none() | st.integers(0, 300))
-def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, declared):
+def test_a_body_is_read_whole_or_refused_and_nothing_stays_buffered(parts, limit, declared):
     bodies, whole = BodyReader(limit, 10.0), b"".join(parts)
     length = None if declared is None else str(declared)
     try:
@@ -126,7 +126,7 @@ def test_a_body_is_read_whole_or_refused_and_nothing_stays_held(parts, limit, de
     assert bodies.buffered == 0
 
 
-def test_a_body_that_breaks_off_is_none_and_too_many_at_once_wait():
+def test_an_incomplete_body_is_discarded_and_too_many_at_once_are_refused():
     bodies = BodyReader(100, 10.0, memory=150)
     with pytest.raises(Disconnected):
         asyncio.run(bodies.read(None, received(b"x", end=False)))
@@ -196,7 +196,7 @@ def test_a_log_line_is_one_json_object_whatever_it_holds():
     assert "ValueError: it" in second["exception"]
 
 
-def test_polls_ask_the_store_only_when_something_may_be_there():
+def test_polls_read_the_store_only_when_there_may_be_a_message():
     posted, asked = [], []
 
     async def read(servo, serial):
@@ -223,7 +223,7 @@ def test_polls_ask_the_store_only_when_something_may_be_there():
     asyncio.run(body())
 
 
-def test_a_message_posted_while_the_store_is_asked_is_not_missed():
+def test_a_message_posted_while_the_store_is_read_is_not_missed():
     posted = []
 
     async def body():
@@ -328,7 +328,7 @@ def test_a_whole_file_knows_its_service_and_its_fleet(tmp_path):
         read_twin(twin_file(tmp_path, servos="[servo]\nx = 1\n" + SERVO))
 
 
-def test_what_others_posted_ends_the_polls_that_it_is_for():
+def test_a_message_posted_by_another_process_ends_the_polls_of_its_servo():
     posted = []
 
     async def read(_servo, serial):

@@ -91,7 +91,7 @@ def children(pid: int) -> list[int]:
     return [int(each) for each in found.split()]
 
 
-def test_a_window_goes_all_the_way_and_a_signal_ends_it_well(tmp_path):
+def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_order(tmp_path):
     with process(twin_file(tmp_path)) as (running, url):
         with httpx.Client(base_url=url, timeout=PATIENCE) as client:
             assert send(client, 0).status_code == 201
@@ -305,7 +305,7 @@ def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_pat
             assert httpx.get(f"{again}/healthz").json()["ok"] is True
 
 
-def test_a_service_that_cannot_begin_does_not_end_well(tmp_path, monkeypatch):
+def test_a_service_that_cannot_start_exits_with_an_error(tmp_path, monkeypatch):
     twin = read_twin(twin_file(tmp_path))
     pool = WorkerPool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
     monkeypatch.setattr(service, "TwinService", lambda twin, store: TwinService(twin, store, pool=pool))

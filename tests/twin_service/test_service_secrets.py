@@ -13,13 +13,13 @@ from servotwin.twin_service.auth import TokenFile, Verifiers, read_tokens, write
 from servotwin.twin_service.config import MQTT_PASSWORD, PASSWORD
 
 
-def test_workers_do_not_see_what_the_service_keeps_to_itself(monkeypatch):
+def test_workers_do_not_get_the_passwords_of_the_service(monkeypatch):
     for name in (PASSWORD, MQTT_PASSWORD):
         monkeypatch.setenv(name, "hunter2")
     assert "hunter2" not in worker_pool._environment().values()
 
 
-def test_tokens_written_while_they_are_read_count_too(tmp_path, monkeypatch):
+def test_tokens_written_while_the_file_is_read_become_valid_too(tmp_path, monkeypatch):
     path = tmp_path / "tokens.toml"
     write_tokens(path, Verifiers({"ax-1": verifier_of("old")}))
 

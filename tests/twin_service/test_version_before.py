@@ -43,7 +43,7 @@ def command(folder: Path, *words: str) -> str:
     return result.stdout
 
 
-def test_its_evidence_is_shown_as_it_was(folder: Path) -> None:
+def test_evidence_of_the_version_before_is_shown_unchanged(folder: Path) -> None:
     before = json.loads((folder / "audit.json").read_text())
     now = json.loads(command(folder, "audit", "--json"))
     assert len(now) == len(before) == 9
@@ -56,7 +56,7 @@ def test_its_evidence_is_shown_as_it_was(folder: Path) -> None:
     assert "version 1 applied at sample 49750" in command(folder, "audit")
 
 
-def test_its_estimates_come_out_again(folder: Path) -> None:
+def test_estimates_of_the_version_before_are_reproduced(folder: Path) -> None:
     result = CliRunner().invoke(cli.app, ["replay", "quick", "--config", str(folder / "twin.toml")])
     text = " ".join(result.output.split())
     same, other = (
@@ -68,7 +68,7 @@ def test_its_estimates_come_out_again(folder: Path) -> None:
     assert "5 not estimated" in text
 
 
-def test_its_edge_starts_on_the_parameters_that_it_had(folder: Path) -> None:
+def test_an_edge_of_the_version_before_starts_on_its_parameters(folder: Path) -> None:
     config = load(folder / "edge" / "edge.toml")
     assert config.agent.servo == "quick"
     parameters = FileParameterStore(folder / "edge" / config.keeping.parameters).load()
@@ -81,7 +81,7 @@ def test_its_edge_starts_on_the_parameters_that_it_had(folder: Path) -> None:
     assert band.settling == 4.0
 
 
-def test_what_its_edge_still_had_to_send_goes_to_its_twin_which_goes_on(folder: Path) -> None:
+def test_unsent_messages_of_an_edge_of_the_version_before_reach_its_twin_which_continues(folder: Path) -> None:
     outbox = SqliteOutbox(folder / "edge" / "outbox.sqlite", "quick")
     parcels = [outbox.parcel(key) for key in outbox.pending()]
     letters = [outbox.letter(digest) for digest in outbox.letters()]

@@ -51,7 +51,7 @@ def test_a_servo_is_enrolled_and_its_edge_can_begin(tmp_path):
     assert token not in (edge / "edge.toml").read_text()
 
 
-def test_a_second_token_replaces_the_first_only_when_asked_for_and_leaves_the_edge_s_file(tmp_path):
+def test_a_second_token_replaces_the_first_only_on_request_and_leaves_the_edge_s_file(tmp_path):
     twin, edge = fresh(tmp_path), tmp_path / "edge"
     options = ("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "http://127.0.0.1:1")
     assert run(*options).exit_code == 0
@@ -91,7 +91,7 @@ def test_another_servo_s_folder_is_left_alone(tmp_path):
         (("ax 1", "--url", "https://h"), "name 'ax 1'"),
     ],
 )
-def test_what_cannot_be_enrolled_leaves_nothing_behind(tmp_path, monkeypatch, arguments, said):
+def test_a_refused_enrolment_leaves_nothing_behind(tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     twin = fresh(tmp_path)
     found = run("enroll", *arguments, "--twin", twin, "--edge", tmp_path / "edge")
@@ -154,7 +154,7 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
     assert "ax-9" in unknown.stderr
 
 
-def test_a_store_is_backed_up_and_put_back(tmp_path):
+def test_a_store_is_backed_up_and_restored(tmp_path):
     twin = twin_file(tmp_path)
     store = open_store(f"sqlite:///{tmp_path / 'twin.db'}")
     store.close()
@@ -166,7 +166,7 @@ def test_a_store_is_backed_up_and_put_back(tmp_path):
     assert run("restore", tmp_path / "nothing.db", "--config", twin).exit_code == 2
 
 
-def test_whoever_is_enrolled_at_the_same_time_is_not_forgotten(tmp_path):
+def test_servos_enrolled_at_the_same_time_all_get_their_tokens(tmp_path):
     twin = fresh(tmp_path)
     barrier, made = threading.Barrier(8), []
 
@@ -192,7 +192,7 @@ def test_an_operator_s_token_replaces_no_file_that_is_there(tmp_path):
     assert twin.read_text() == before
 
 
-def test_a_token_that_is_taken_back_counts_no_more(tmp_path):
+def test_a_revoked_token_is_refused(tmp_path):
     twin = twin_file(tmp_path)
     before = read_tokens(tmp_path / "tokens.toml")
     assert run("revoke", "ax-1", "--twin", twin).exit_code == 0
@@ -204,7 +204,7 @@ def test_a_token_that_is_taken_back_counts_no_more(tmp_path):
     assert "'ax-1' has no token" in again.stderr
 
 
-def test_an_edge_gets_what_it_needs_to_believe_the_twin(tmp_path):
+def test_an_edge_gets_the_certificates_to_verify_the_twin(tmp_path):
     """A certificate that has signed itself goes along; one of the system's does not; signers are named."""
     certificate, key = self_made(tmp_path)
     tls = f'tls_certificate = "{certificate}"\ntls_key = "{key}"\n'

@@ -143,7 +143,7 @@ def test_a_path_too_long_for_sockets_is_refused_before_anything_is_made(tmp_path
     assert not path.exists()
 
 
-def test_what_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInput, match="file"), folder.opened(tmp_path / "file" / "up"):
         pass
@@ -170,7 +170,7 @@ def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("options", [("--speed", "0"), ("--speed", "101"), ("--for", "-1")])
-def test_a_speed_or_time_that_is_none_is_refused(tmp_path: Path, options: tuple[str, str]) -> None:
+def test_an_invalid_speed_or_time_is_refused(tmp_path: Path, options: tuple[str, str]) -> None:
     command = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -46,7 +46,7 @@ def test_more_than_the_limit_is_slowed_down_but_not_below_the_slowest(
 
 
 @given(some.floats(SLOWEST, 90.0), some.floats(1e-3, 1.0))
-def test_a_share_in_proportion_to_speed_settles_below_the_limit(speed: float, share_of_one: float) -> None:
+def test_a_processor_share_in_proportion_to_speed_stays_below_the_limit(speed: float, share_of_one: float) -> None:
     for _ in range(60):
         speed = next_speed(speed, SpeedSample(share_of_one * speed, speed, 0))
     assert share_of_one * speed <= LIMIT or speed == SLOWEST
@@ -84,7 +84,7 @@ def test_processor_time_of_groups_whatever_the_programs_are_called(tmp_path: Pat
     assert processor_times({10}, set(), tmp_path / "nowhere") is None
 
 
-def test_cores_in_use_are_those_since_the_last_look() -> None:
+def test_cores_in_use_are_those_since_the_last_measurement() -> None:
     use = CoreUsage()
     assert use.measure({1: 5.0}, 100.0) is None
     assert use.measure({1: 6.0, 2: 0.5}, 102.0) == pytest.approx(0.75)
@@ -105,7 +105,7 @@ def test_speed_is_that_of_the_slowest_machine() -> None:
 
 
 @given(some.floats(0.0, 1e4))
-def test_outages_come_again_and_end(time: float) -> None:
+def test_outages_repeat_and_end(time: float) -> None:
     plan = Outages(6.0, 8.0, 40.0)
     left = plan.left(time)
     assert 0.0 <= left <= plan.lasting
@@ -114,7 +114,7 @@ def test_outages_come_again_and_end(time: float) -> None:
 
 
 @pytest.mark.parametrize(("outages", "answer"), [(Outages(1e9, 1.0, 1e9), b"pong"), (Outages(0.0, 1e9, 2e9), b"")])
-def test_a_link_passes_on_what_comes_but_in_outages(outages: Outages, answer: bytes) -> None:
+def test_the_forwarder_forwards_except_in_outages(outages: Outages, answer: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as target:
         forwarder = Forwarder(target.getsockname()[1], outages)
         forwarder.start()
@@ -146,7 +146,7 @@ def machine(tmp_path: Path) -> MachineSettings:
     return MachineSettings.load(path)
 
 
-def test_a_machine_goes_on_wearing_from_where_it_was(tmp_path: Path) -> None:
+def test_a_machine_resumes_at_its_stored_wear(tmp_path: Path) -> None:
     new = machine(tmp_path)
     later = 2345.678
     write_state(tmp_path / "state.json", MachineState(time_s=later, gap_deg=1.0, speed=5.0, begun_s=0.0, written=0.0))
@@ -169,14 +169,14 @@ def test_a_signal_from_a_time_on_is_the_same_later(begin: float, time: float) ->
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": "other"}', "\xff", '{"time_s": -1}'])
-def test_a_state_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+def test_an_invalid_state_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "state.json").write_text(text, encoding="latin-1")
     with pytest.raises(InvalidInput, match=r"state\.json: is no state of a machine"):
         read_state(tmp_path / "state.json")
 
 
 @pytest.mark.parametrize("text", ["", "fast", "0", "-3", "nan", "inf", "1e9", "5 6"])
-def test_a_speed_that_is_none_changes_nothing(tmp_path: Path, text: str) -> None:
+def test_an_invalid_speed_file_changes_nothing(tmp_path: Path, text: str) -> None:
     (tmp_path / "speed").write_text(text)
     assert read_speed(tmp_path / "speed") is None
 
@@ -201,7 +201,7 @@ def link(boot: str, status: str, gap: float) -> dict[str, Any]:
     return {"window": {"boot": boot}, "found": found}
 
 
-def test_the_newest_good_estimate_and_the_newest_verdict() -> None:
+def test_the_newest_good_estimate_and_the_newest_status() -> None:
     glanced = {"window": {"boot": "b2"}, "found": [{"kind": "glance", "status": "", "body": {}}]}
     none = {"kind": "estimate", "status": "failed: no", "body": {"failed": "no"}}
     failed = {"window": {"boot": "b2"}, "found": [none]}
@@ -264,7 +264,7 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
     assert "47 cut, 41 acknowledged, 3 waiting, 3 dropped" in next(iter(display.summary(shown)))
 
 
-def test_a_truth_outside_of_the_interval_is_told_apart() -> None:
+def test_a_truth_outside_of_the_interval_is_marked() -> None:
     told = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
     assert isnan(told.rate)
     assert EstimateError(told, 9.03, 1.0).inside
