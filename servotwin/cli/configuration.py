@@ -96,7 +96,7 @@ FILES = {
             (_servo, Scenario),
             tables={
                 "controller": _CHANGED,
-                "recording": TableSpec((Recording,), "What the edge records and sends."),
+                "recording": TableSpec((Recording,), "Windows that the edge records and sends."),
                 "edge": TableSpec(
                     (Supervision,),
                     "Supervision: with this table updates may set gains too, and the edge looks after itself.",

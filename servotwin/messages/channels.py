@@ -98,6 +98,7 @@ def unpack_channel(channel: Channel) -> "array[float]":
 
 
 def _code(steps: float) -> int:
+    # A scale near the smallest float is so coarse that the quotient can exceed the last step.
     return min(round(steps), _STEPS) + _LOWEST
 
 

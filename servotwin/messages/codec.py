@@ -73,6 +73,7 @@ def _guarded(
     except InvalidMessage:
         raise
     except _UNREADABLE as error:
+        # The slow path: only bytes that no present schema decodes can be a message of the version before.
         read = msgspec.json.decode if decoder is _json_decoder else msgspec.msgpack.decode
         try:
             tag = read(data, type=_Tagged).type

@@ -85,6 +85,7 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
     with atomic_output(place, PRIVATE) as temporary:
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
+            # Serials that edges received after the backup must not be used again.
             store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN,))
         return counts
 

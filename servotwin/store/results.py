@@ -40,6 +40,7 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
     valid: dict[int, int] = {}
     for i in sorted(range(len(results)), key=lambda i: results[i].servo):
         serial, posted = serials.get(results[i].servo, (None, 0))
+        # A later result of the same servo in this batch has to name the serial after this one.
         if results[i].serial == serial:
             valid[i] = posted + len(results[i].outgoing)
             serials[results[i].servo] = serial + 1, valid[i]

@@ -122,7 +122,7 @@ class Dispatcher:
     async def stop(self) -> None:
         """Start nothing new, finish what is running, release the leases."""
         self._stopping = True
-        self._work_pending.set()
+        self._work_pending.set()  # ends the rest of `run`
         while self._tasks:
             await asyncio.wait(self._tasks)
         try:
@@ -164,6 +164,7 @@ class Dispatcher:
     async def _next_leases(self) -> list[Lease]:
         """Wait for pending work; returns nothing when the dispatcher is to stop."""
         while not self._stopping:
+            # Cleared before the store is read: a message that comes meanwhile ends the rest that follows.
             self._work_pending.clear()
             try:
                 await self._release_failed()

@@ -186,6 +186,7 @@ class HttpApp:
     def __init__(self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan) -> None:
         self._metrics, self.lifespan = metrics, lifespan
         declared = list(routes)
+        # Encoded once: the routes do not change.
         document = msgspec.json.encode(_openapi(declared))
 
         async def openapi(_request: HttpRequest) -> HttpResponse:

@@ -130,6 +130,7 @@ class MqttServer:
         """Connect, and reconnect whenever the connection is lost."""
         loop = asyncio.get_running_loop()
 
+        # paho calls back in a thread of its own.
         def on_message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
             loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
 

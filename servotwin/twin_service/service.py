@@ -120,6 +120,7 @@ class TwinService:
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
         if not self._shared:
+            # The store is locked for this process, so that every lease is one of a process that has ended.
             await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
@@ -133,7 +134,8 @@ class TwinService:
             await self._mqtt.start()
 
     async def stop(self) -> None:
-        """Commit what was received, finish what is running, stop the workers."""
+        """Commit the received messages, finish the running work, stop the workers."""
+        # Sources of requests first and the writer last: it still commits the results of the work that is finished.
         self.polls.close()
         if self._mqtt is not None:
             await self._mqtt.stop()

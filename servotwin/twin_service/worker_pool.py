@@ -55,6 +55,7 @@ class WorkerProcess:
     async def start(self) -> None:
         """Start the process and wait until it is ready; raises WorkerLost."""
         ours, theirs = socket.socketpair()
+        # Closed here once the child has a copy: only then does the end of the child close the connection.
         with theirs:
             number = theirs.fileno()
             self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
@@ -65,6 +66,7 @@ class WorkerProcess:
     async def work(self, leases: Sequence[Lease], now: float) -> AsyncIterator[LeaseResult]:
         """Process leases; yields their results in order. Raises WorkerLost."""
         self._send(encode_frame(WorkerJob(tuple(leases), now)))
+        # One timeout per lease, not per job: a job may hold sixteen of them.
         for _ in leases:
             yield decode_result(await self._receive(self._timeout))
 

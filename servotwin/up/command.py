@@ -233,6 +233,7 @@ class _Monitor:
 def _counted_signals() -> Iterator[_SignalCounter]:
     """Count signals instead of ending; Ctrl-C comes only here, as children are in sessions of their own."""
     counter = _SignalCounter()
+    # SIGHUP as well: it comes when the terminal is closed.
     before = [signal.signal(number, counter.handle) for number in _SIGNALS]
     try:
         yield counter

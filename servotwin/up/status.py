@@ -123,7 +123,7 @@ class TwinPoller:
                     self._stop.wait(_POLL_S)
             connection.close()
             self.twin = None
-            self._stop.wait(0.2)
+            self._stop.wait(0.2)  # before the next attempt to connect
 
     def _poll(self, connection: HTTPConnection) -> TwinStatus:
         waiting = msgspec.json.decode(self._get(connection, "/healthz"))["waiting"]
@@ -283,6 +283,7 @@ class ServoReader:
             state = read_state(self._folder / "state.json")
         except InvalidInput:
             return None
+        # A file of an earlier start counts as absent.
         return state if state is not None and state.written >= self._begun else None
 
     def _edge(self) -> dict[str, Any]:

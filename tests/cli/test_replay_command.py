@@ -87,7 +87,7 @@ def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     code, said = replayed(folder)
     assert code == 1
     assert re.search(
-        r"^window .*/\d+: gap .* deg then, .* deg now; changed: gap; no version, .* explains it$", said, re.M
+        r"^window .*/\d+: gap .* deg then, .* deg now; changed: gap; no recorded version, .* explains it$", said, re.M
     )
     assert re.search(r"^ +1 NOT the same$", said, re.M)
     assert f"{windows(folder) - 1} the same, bit for bit" in said

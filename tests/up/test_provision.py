@@ -131,7 +131,7 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
         monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
         assert run("servos", "--url", url, "--token", token).stdout == everybody.stdout
         none = run("audit", "ax-1", "--url", "http://[::1", "--token", token)
-        assert (none.exit_code, none.stderr.count("give that of a twin")) == (2, 1)
+        assert (none.exit_code, none.stderr.count("give the URL of a twin")) == (2, 1)
     read = run("audit", "ax-1", "--config", twin, "--json")
     assert json.loads(read.stdout) == json.loads(asked.stdout)
     [link] = json.loads(read.stdout)
