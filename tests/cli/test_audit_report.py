@@ -87,7 +87,7 @@ def test_a_version_from_its_window_to_its_effect() -> None:
 
 
 @pytest.mark.parametrize(
-    ("of", "said"),
+    ("of", "expected"),
     [
         (link(1, done=None), "waits to be processed"),
         (link(1, found("estimate", "failed: ValueError: no")), "failed: ValueError: no"),
@@ -105,9 +105,9 @@ def test_a_version_from_its_window_to_its_effect() -> None:
         (link(1, estimate(), found("withdrawn", "two fail", version=3)), "version 3 WITHDRAWN: two fail"),
     ],
 )  # fmt: skip
-def test_the_remarks_on_a_window(of: dict[str, Any], said: str) -> None:
+def test_the_remarks_on_a_window(of: dict[str, Any], expected: str) -> None:
     _, line = chain(of)
-    assert line[HEAD.index("what followed") :] == said
+    assert line[HEAD.index("what followed") :] == expected
 
 
 def test_a_refused_version_shows_why() -> None:
@@ -118,7 +118,7 @@ def test_a_refused_version_shows_why() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cause", "measured", "allowed", "said"),
+    ("cause", "measured", "allowed", "expected"),
     [
         (Cause.SILENCE, 41.0, 40.0, "41 s where 40 s are allowed"),
         (Cause.EFFORT, 0.5, 0.2, "0.5 V where 0.2 V are allowed"),
@@ -127,11 +127,11 @@ def test_a_refused_version_shows_why() -> None:
         (Cause.ERROR_ENERGY, 3e-4, 1e-5, "300 um where 10 um are allowed"),
     ],
 )
-def test_a_fallback_is_listed_at_its_time(cause: Cause, measured: float, allowed: float, said: str) -> None:
+def test_a_fallback_is_listed_at_its_time(cause: Cause, measured: float, allowed: float, expected: str) -> None:
     body = {"cause": cause.value, "measured": measured, "allowed": allowed}
     events = [found("fallback", cause.value, version=3, body=body, made=90.0)]
     lines = chain(link(1, estimate()), link(2, estimate()), events=events)
-    assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {said}"
+    assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {expected}"
 
 
 def test_a_fallback_after_a_drive_s_refusal_shows_no_values() -> None:

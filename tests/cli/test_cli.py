@@ -48,8 +48,8 @@ def test_help_names_every_command():
 def test_help_loads_no_numbers_library():
     heavy = "{'numpy', 'scipy', 'numba', 'matplotlib'}"
     code = f"import sys, servotwin.cli.app; print(*sorted({heavy} & set(sys.modules)))"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert found.stdout.strip() == ""
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert completed.stdout.strip() == ""
 
 
 def test_version():
@@ -59,7 +59,7 @@ def test_version():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("simulate", "SCENARIO", "-o", "run.xyz"), "'.xyz'"),
         (("simulate", "SCENARIO", "-o", "nowhere/run.csv"), "no directory nowhere"),
@@ -71,18 +71,18 @@ def test_version():
         (("demo", "--out", "SCENARIO/out"), "cannot be made"),
     ],
 )
-def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arguments, said):
+def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arguments, message):
     monkeypatch.chdir(scenario.parent)
     result = run(*(argument.replace("SCENARIO", str(scenario)) for argument in arguments))
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("error: ")
     assert [path.name for path in scenario.parent.iterdir()] == [scenario.name]
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("duraton_s = 3.0\n" + SMALL, "duraton_s"),
         (SMALL.replace("5.0", "-5.0"), "total_deg"),
@@ -91,11 +91,11 @@ def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arg
         ("= what", "TOML"),
     ],
 )
-def test_a_bad_scenario_is_refused_before_anything_is_written(scenario, change, said):
+def test_a_bad_scenario_is_refused_before_anything_is_written(scenario, change, message):
     scenario.write_text(change)
     result = run("simulate", scenario, "-o", scenario.parent / "run.csv")
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert scenario.name in result.stderr
     assert [path.name for path in scenario.parent.iterdir()] == [scenario.name]
 

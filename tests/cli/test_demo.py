@@ -33,8 +33,8 @@ def test_the_report_stands_alone(shown):
 
 
 def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does():
-    found = demo.compare(*demo.scenarios("paper"), Console(file=io.StringIO()))
-    rows = demo.demo_steps(found)
+    result = demo.compare(*demo.scenarios("paper"), Console(file=io.StringIO()))
+    rows = demo.demo_steps(result)
     assert [row.twinned.settled for row in rows] == [True] * 10
     assert max(row.left for row in rows) < 5e-6
     # Wear from 2 deg on: alone every step oscillates, and more the larger the gap; the published dead zone hunts too.
@@ -42,11 +42,11 @@ def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_publish
         assert [getattr(row, name).settled for row in rows[2:]] == [False] * 8
     swings = [row.alone.amplitude for row in rows[2:]]
     assert swings == sorted(swings)
-    assert not found.alone.applied
-    assert len(found.published.applied) == 10
-    assert len(found.twinned.applied) == len(found.twinned.updates) >= 1
+    assert not result.alone.applied
+    assert len(result.published.applied) == 10
+    assert len(result.twinned.applied) == len(result.twinned.updates) >= 1
     # The estimates are at least ten times nearer to the truth than the published ones, which the report says as well.
-    worst = [max(abs(one.error) for one in each.estimates if one.ok) for each in (found.twinned, found.published)]
+    worst = [max(abs(one.error) for one in each.estimates if one.ok) for each in (result.twinned, result.published)]
     assert 10.0 * worst[0] < worst[1]
 
 

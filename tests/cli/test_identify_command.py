@@ -185,16 +185,16 @@ BAD = {
 
 @pytest.mark.parametrize("kind", BAD)
 def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
-    change, said = BAD[kind]
+    change, message = BAD[kind]
     result = run(damaged(folder, tmp_path, change), "--servo", "paper")
     assert result.exit_code == 2, result.output
-    assert said in result.stderr
+    assert message in result.stderr
     assert "bad.csv" in result.stderr
     assert result.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("missing.csv",), "is not there"),
         (("FOLDER",), "the suffix '' is not known"),
@@ -215,10 +215,10 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
         (("FOLDER/run.npz", "--gap-limit-deg", "nan"), "--gap-limit-deg nan"),
     ],
 )
-def test_a_user_error_is_one_sentence(folder, arguments, said):
+def test_a_user_error_is_one_sentence(folder, arguments, message):
     result = run(*(argument.replace("FOLDER", str(folder)) for argument in arguments))
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert result.stderr.count("\n") == 1
 
 

@@ -15,8 +15,8 @@ def run(*arguments):
 def test_the_table_holds_orbit_and_prediction():
     result = run()
     assert result.exit_code == 0
-    for said in ("1.480016437", "0.179574564", "0.5853, 0.5513, 0.5513", "1.4335", "22.26", "stable"):
-        assert said in result.output
+    for message in ("1.480016437", "0.179574564", "0.5853, 0.5513, 0.5513", "1.4335", "22.26", "stable"):
+        assert message in result.output
 
 
 def test_the_same_as_json():
@@ -42,7 +42,7 @@ def test_hysteresis_is_passed_on():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("papre",), "papre"),
         (("--gap-deg", -1), "--gap-deg -1 deg: must be finite and 0 or more"),
@@ -52,9 +52,9 @@ def test_hysteresis_is_passed_on():
         (("--tolerance-mm", 1, "--enter", 2), "leave = 1.0 tolerances"),
     ],
 )
-def test_a_user_error_is_one_sentence_and_exit_code_2(arguments, said):
+def test_a_user_error_is_one_sentence_and_exit_code_2(arguments, message):
     result = run(*arguments)
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("error: ")

@@ -121,14 +121,14 @@ def test_a_damaged_piece_is_computed_again(finished, tmp_path):
 
 def test_another_map_s_folder_is_refused(finished):
     before = {path: path.read_bytes() for path in finished.rglob("*.npz")}
-    for change, said in (
+    for change, message in (
         (("--seed", "1"), "seed = 0, not 1"),
         (("--duration", "41"), "duration_s = 40.0, not 41.0"),
         (("--enter", "0.5"), "another controller"),
     ):
         result = run("paper", *SMALL, *change, "--out", finished)
         assert result.exit_code == 2
-        assert said in result.stderr
+        assert message in result.stderr
         assert result.stderr.count("\n") == 1
     assert {path: path.read_bytes() for path in finished.rglob("*.npz")} == before
     (finished / "settings.json").rename(finished / "moved")
@@ -185,7 +185,7 @@ def test_ctrl_c_ends_the_pool_with_130_and_one_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--tolerance", "0:6"), "--tolerance '0:6'"),
         (("--tolerance", "a,b"), "--tolerance 'a,b'"),
@@ -206,12 +206,12 @@ def test_ctrl_c_ends_the_pool_with_130_and_one_line(tmp_path):
         (("--out", "file/map"), "cannot be made"),
     ],
 )
-def test_a_user_error_is_one_sentence_and_exit_code_2(tmp_path, monkeypatch, arguments, said):
+def test_a_user_error_is_one_sentence_and_exit_code_2(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     result = run("paper", *arguments)
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert message in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "servotwin-map" / "map.npz").exists()
 

@@ -55,32 +55,32 @@ def expected(written):
 
 
 def test_npz(written, expected):
-    with np.load(written[".npz"]) as found:
-        assert [name for name in found.files if name != "metadata"] == COLUMNS
-        assert np.array_equal(found["position_m"], expected.position)
-        assert np.array_equal(found["q3_m"], found["position_m"])
-        assert np.array_equal(found["time_s"], np.arange(10001) / 5000.0)
-        assert found["gap_rad"] == pytest.approx(np.radians(5.0))
+    with np.load(written[".npz"]) as result:
+        assert [name for name in result.files if name != "metadata"] == COLUMNS
+        assert np.array_equal(result["position_m"], expected.position)
+        assert np.array_equal(result["q3_m"], result["position_m"])
+        assert np.array_equal(result["time_s"], np.arange(10001) / 5000.0)
+        assert result["gap_rad"] == pytest.approx(np.radians(5.0))
 
 
 def test_parquet_holds_the_same(written):
     table = parquet.read_table(written[".parquet"])
     assert table.column_names == COLUMNS
-    with np.load(written[".npz"]) as found:
+    with np.load(written[".npz"]) as result:
         for name in COLUMNS:
-            assert np.array_equal(table[name].to_numpy(), found[name])
+            assert np.array_equal(table[name].to_numpy(), result[name])
 
 
 def test_csv_holds_twelve_digits(written, expected):
     columns = range(len(COLUMNS))
-    found = np.genfromtxt(written[".csv"], delimiter=",", names=True, usecols=columns)
-    assert list(found.dtype.names) == COLUMNS
-    assert found["theta_m_rad"] == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
+    result = np.genfromtxt(written[".csv"], delimiter=",", names=True, usecols=columns)
+    assert list(result.dtype.names) == COLUMNS
+    assert result["theta_m_rad"] == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
 
 
 def test_metadata_describes_the_run(written):
-    with np.load(written[".npz"]) as found:
-        metadata = json.loads(str(found["metadata"]))
+    with np.load(written[".npz"]) as result:
+        metadata = json.loads(str(result["metadata"]))
     assert metadata["seed"] == 7
     assert metadata["scenario"] == SCENARIO
     assert metadata["servotwin"] == st.__version__
@@ -112,11 +112,11 @@ def test_parquet_without_pyarrow_is_refused_at_once(tmp_path, monkeypatch):
 
 def test_pandas_reads_the_csv_as_it_is(written, expected):
     pandas = pytest.importorskip("pandas", reason="the extra pandas is not installed")
-    found = pandas.read_csv(written[".csv"])
-    assert list(found.columns) == [*COLUMNS, "metadata"]
-    assert found["time_s"].dtype == float
-    assert found["theta_m_rad"].to_numpy() == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
-    assert json.loads(found["metadata"][0])["seed"] == 7
+    result = pandas.read_csv(written[".csv"])
+    assert list(result.columns) == [*COLUMNS, "metadata"]
+    assert result["time_s"].dtype == float
+    assert result["theta_m_rad"].to_numpy() == pytest.approx(expected.theta_m, rel=1e-11, abs=1e-300)
+    assert json.loads(result["metadata"][0])["seed"] == 7
     table = expected.to_pandas()
     assert np.array_equal(table["theta_m_rad"], expected.theta_m)
 

@@ -39,8 +39,8 @@ def folder(recorded: Path, tmp_path: Path) -> Path:
 
 def replayed(folder: Path, *options: str) -> tuple[int, str]:
     """Exit code, and what is printed."""
-    found = CliRunner().invoke(cli.app, ["replay", "axis", "--config", str(folder / "twin.toml"), *options])
-    return found.exit_code, found.stdout + found.stderr
+    result = CliRunner().invoke(cli.app, ["replay", "axis", "--config", str(folder / "twin.toml"), *options])
+    return result.exit_code, result.stdout + result.stderr
 
 
 def changed(folder: Path, statement: str, *values: object) -> int:
@@ -62,19 +62,19 @@ def windows(folder: Path) -> int:
 
 
 def test_every_estimate_comes_out_again_bit_for_bit(folder: Path) -> None:
-    code, said = replayed(folder)
+    code, output = replayed(folder)
     assert code == 0
-    assert said.split("\n") == [
+    assert output.split("\n") == [
         f"servo axis: {windows(folder)} windows", f"  {windows(folder):6d} the same, bit for bit", ""
     ]  # fmt: skip
 
 
 def test_a_changed_version_is_named(folder: Path) -> None:
     assert changed(folder, "update contexts set text = replace(text, ?, ?)", f'"{version("numpy")}"', '"1.2.3"') == 1
-    code, said = replayed(folder)
+    code, output = replayed(folder)
     assert code == 0, "the numbers are the same all the same"
-    assert f"{windows(folder)} the same, bit for bit" in said
-    assert f"otherwise since {windows(folder)} windows: numpy 1.2.3 then, {version('numpy')} now" in said
+    assert f"{windows(folder)} the same, bit for bit" in output
+    assert f"changed since {windows(folder)} windows: numpy 1.2.3 then, {version('numpy')} now" in output
 
 
 def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
@@ -84,13 +84,13 @@ def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     stored = msgspec.msgpack.decode(body)
     stored["estimate"]["gap"] += 1e-12
     assert changed(folder, "update evidence set body = ? where id = ?", msgspec.msgpack.encode(stored), row) == 1
-    code, said = replayed(folder)
+    code, output = replayed(folder)
     assert code == 1
     assert re.search(
-        r"^window .*/\d+: gap .* deg then, .* deg now; changed: gap; no recorded version, .* explains it$", said, re.M
+        r"^window .*/\d+: gap .* deg then, .* deg now; changed: gap; no recorded version, .* explains it$", output, re.M
     )
-    assert re.search(r"^ +1 NOT the same$", said, re.M)
-    assert f"{windows(folder) - 1} the same, bit for bit" in said
+    assert re.search(r"^ +1 NOT the same$", output, re.M)
+    assert f"{windows(folder) - 1} the same, bit for bit" in output
 
 
 def test_a_changed_model_is_named_with_its_changes(folder: Path) -> None:
@@ -98,9 +98,9 @@ def test_a_changed_model_is_named_with_its_changes(folder: Path) -> None:
     assert code == 0
     twin = folder / "twin.toml"
     twin.write_text(twin.read_text().replace('policy = "paper"', 'policy = "paper"\nmethod = "paper"'))
-    code, said = replayed(folder, "--present")
+    code, output = replayed(folder, "--present")
     assert code == 1
-    assert f"otherwise since {windows(folder)} windows: settings.method 'whitened' then, 'paper' now" in said
+    assert f"changed since {windows(folder)} windows: settings.method 'whitened' then, 'paper' now" in output
     assert replayed(folder)[0] == 0, "as they were then"
 
 
@@ -112,21 +112,21 @@ def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(fol
         store.close()
     assert gone.emptied > 0
     assert gone.kept > 0
-    code, said = replayed(folder)
+    code, output = replayed(folder)
     assert code == 0
-    assert f"{gone.emptied} not repeated: retention deleted the window's body" in said
-    assert f"{gone.kept} the same, bit for bit" in said
+    assert f"{gone.emptied} not repeated: retention deleted the window's body" in output
+    assert f"{gone.kept} the same, bit for bit" in output
 
 
 def test_one_window_is_enough(folder: Path) -> None:
     name = asked(folder, "select key from messages where kind = 'window'")[2][0]
     assert isinstance(name, str)
-    code, said = replayed(folder, "--window", name)
-    assert (code, said.splitlines()[0]) == (0, "servo axis: 1 window")
+    code, output = replayed(folder, "--window", name)
+    assert (code, output.splitlines()[0]) == (0, "servo axis: 1 window")
 
 
 @pytest.mark.parametrize(
-    ("statement", "said"),
+    ("statement", "output"),
     [
         ("update contexts set text = '{}'", "settings are not understood"),
         ("update contexts set text = 'x'", "the context is not understood"),
@@ -134,39 +134,39 @@ def test_one_window_is_enough(folder: Path) -> None:
         ("update evidence set body = x'00' where kind = 'estimate'", "the stored estimate is not understood"),
     ],
 )
-def test_data_that_cannot_be_decoded_is_reported_for_each_window(folder: Path, statement: str, said: str) -> None:
+def test_data_that_cannot_be_decoded_is_reported_for_each_window(folder: Path, statement: str, output: str) -> None:
     assert changed(folder, statement) > 0
-    code, found = replayed(folder)
+    code, result = replayed(folder)
     assert code == 1
-    assert "NOT repeated: the stored data cannot be decoded" in found
-    assert re.search(said, found), found
-    assert "Traceback" not in found
+    assert "NOT repeated: the stored data cannot be decoded" in result
+    assert re.search(output, result), result
+    assert "Traceback" not in result
 
 
 def test_windows_that_were_never_estimated_are_counted_apart(folder: Path) -> None:
     assert changed(folder, "update evidence set status = 'failed: a reason' where kind = 'estimate'") == windows(folder)
-    code, said = replayed(folder)
-    assert (code, said.splitlines()[1].strip()) == (
+    code, output = replayed(folder)
+    assert (code, output.splitlines()[1].strip()) == (
         0,
         f"{windows(folder)} not estimated: the window could not be processed",
     )
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (("--window", "never/1"), "error: servo 'axis': no window never/1 of it was ever stored\n"),
         (("--window", "never"), "error: window 'never': give BOOT/NUMBER, as `servotwin audit` shows it\n"),
     ],
 )
-def test_an_invalid_window_is_one_sentence(folder: Path, arguments: tuple[str, ...], said: str) -> None:
-    assert replayed(folder, *arguments) == (2, said)
+def test_an_invalid_window_is_one_sentence(folder: Path, arguments: tuple[str, ...], output: str) -> None:
+    assert replayed(folder, *arguments) == (2, output)
 
 
 def test_reading_makes_no_store(folder: Path) -> None:
     for file in folder.glob("twin.db*"):
         file.unlink()
-    code, said = replayed(folder)
+    code, output = replayed(folder)
     assert code == 2
-    assert said.endswith("there is no such file; the twin makes it when it first runs\n")
+    assert output.endswith("there is no such file; the twin makes it when it first runs\n")
     assert not (folder / "twin.db").exists()

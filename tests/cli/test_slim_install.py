@@ -57,7 +57,7 @@ def test_every_optional_package_of_the_table_is_in_its_extra():
 
 def test_a_slim_install_simulates_estimates_and_redesigns(tmp_path):
     (tmp_path / "wear.toml").write_text(SCENARIO, encoding="utf-8")
-    found = slim(
+    result = slim(
         tmp_path,
         ["--help"],
         *([name, "--help"] for name in ("simulate", "identify", "tune", "certify", "map", "up", "twin", "servos")),
@@ -66,13 +66,13 @@ def test_a_slim_install_simulates_estimates_and_redesigns(tmp_path):
         ["tune", "10", "14", "--json"],
         ["limit-cycle", "--json"],
     )
-    for code, _, stderr, exception in found:
+    for code, _, stderr, exception in result:
         assert code == 0, (stderr, exception)
-    windows = json.loads(found[-3][1])["windows"]
+    windows = json.loads(result[-3][1])["windows"]
     assert windows[0]["status"] == "ok"
     assert abs(windows[0]["gap_deg"] - 10.0) < 0.5
-    assert json.loads(found[-2][1])["Kp"] > 0.0
-    assert json.loads(found[-1][1])["status"] == "limit cycle"
+    assert json.loads(result[-2][1])["Kp"] > 0.0
+    assert json.loads(result[-1][1])["status"] == "limit cycle"
 
 
 MISSING = {
@@ -86,8 +86,8 @@ MISSING = {
 
 
 def test_a_command_without_its_extra_is_one_sentence_and_exit_code_2(tmp_path):
-    found = slim(tmp_path, *([name] for name in MISSING))
-    for name, (code, stdout, stderr, _) in zip(MISSING, found, strict=True):
+    result = slim(tmp_path, *([name] for name in MISSING))
+    for name, (code, stdout, stderr, _) in zip(MISSING, result, strict=True):
         assert code == 2
         assert stdout == ""
         assert stderr == f"error: servotwin {name} needs {MISSING[name]}\n"
@@ -100,5 +100,5 @@ def test_a_function_without_its_extra_names_the_pip_command(monkeypatch, module)
     package, extra = EXTRAS[module.partition(".")[0]]
     with pytest.raises(InvalidInput) as refused:
         require(module, "this")
-    said = f"this needs {package}, which is not installed; give: pip install 'servotwin[{extra}]'"
-    assert str(refused.value) == said
+    expected = f"this needs {package}, which is not installed; give: pip install 'servotwin[{extra}]'"
+    assert str(refused.value) == expected

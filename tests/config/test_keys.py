@@ -87,7 +87,7 @@ def test_the_exact_key_overrides_the_other() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("size_mm = -1", "m.toml: size_mm = -1 is not allowed; give a number, at least 0, inf allowed"),
         ("share_percent = 100", "m.toml: share_percent = 100 is not allowed; give a number, at least 0, below 100"),
@@ -102,14 +102,14 @@ def test_the_exact_key_overrides_the_other() -> None:
         ("colour = 1", "m.toml: unknown key 'colour'"),
     ],
 )
-def test_a_refusal_names_file_key_value_and_what_is_allowed(text: str, said: str) -> None:
+def test_a_refusal_names_file_key_value_and_what_is_allowed(text: str, expected: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         machine(text)
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "expected"),
     [
         ({"size": -1.0}, "machine size = -1.0 m: must be a number, at least 0, inf allowed"),
         ({"share": 1.0}, "machine share = 1.0: must be a number, at least 0, below 1, finite"),
@@ -120,10 +120,10 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(text: str, said: str
         ({"share": "a"}, "machine share = 'a': must be a number"),
     ],
 )
-def test_the_constructor_checks_the_same_ranges(values: dict[str, object], said: str) -> None:
+def test_the_constructor_checks_the_same_ranges(values: dict[str, object], expected: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         Machine(**values)  # type: ignore[arg-type]
-    assert str(caught.value).startswith(said)
+    assert str(caught.value).startswith(expected)
 
 
 @given(

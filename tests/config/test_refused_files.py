@@ -79,7 +79,7 @@ def text_store(folder: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("service", "said"),
+    ("service", "expected"),
     [
         ("prot = 1", "unknown key 'service.prot' (did you mean 'port'?)"),
         ("retention_days = -3", "service.retention_days = -3 is not allowed; give a positive number"),
@@ -93,10 +93,10 @@ def text_store(folder: Path) -> str:
     ],
 )
 def test_a_twin_with_an_invalid_file_names_the_fault_and_does_not_start(
-    tmp_path: Path, service: str | Callable[[Path], str], said: str
+    tmp_path: Path, service: str | Callable[[Path], str], expected: str
 ) -> None:
     sentence = twin(tmp_path, service if isinstance(service, str) else service(tmp_path))
-    assert said in sentence
+    assert expected in sentence
     assert "secret" not in sentence
 
 
@@ -122,7 +122,7 @@ TOKEN = 'token_file = "token"\n'
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "expected"),
     [
         (f'[twin]\nurl = "https://h"\n{TOKEN}ca_file = "no.crt"', "no.crt: holds no certificates that can be read (No"),
         (
@@ -146,14 +146,14 @@ TOKEN = 'token_file = "token"\n'
         ('[keep]\nstatus = "/no/status.json"', "[keep]: status = '/no/status.json': there is no folder /no"),
     ],
 )
-def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, said: str) -> None:
+def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, expected: str) -> None:
     (tmp_path / "edge.toml").write_text(EDGE + more)
     for name, mode in (("token", 0o600), ("open", 0o644)):
         (tmp_path / name).write_text("secret-token\n")
         (tmp_path / name).chmod(mode)
     with pytest.raises(InvalidInput) as refused:
         check(load(tmp_path / "edge.toml"))
-    assert said in str(refused.value)
+    assert expected in str(refused.value)
     assert "secret-token" not in str(refused.value)
 
 

@@ -152,10 +152,10 @@ def test_damaged_messages_decode_or_are_refused(message: Message, damages: list[
         for damage in damages:
             data[int(damage.position * len(data))] = damage.value
         try:
-            found = decoder(bytes(data[: len(data) - damages[0].cut]))
+            result = decoder(bytes(data[: len(data) - damages[0].cut]))
         except InvalidMessage:
             continue
-        assert isinstance(found, Message)
+        assert isinstance(result, Message)
 
 
 @given(st.recursive(st.none() | st.integers(-9, 9) | st.text(max_size=4), lambda x: st.lists(x, max_size=3)))

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 import sqlalchemy as sa
-from store_cases import bodies_of, claim, letter, outcome, proof, window
+from store_cases import bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
@@ -47,14 +47,14 @@ def test_the_same_key_with_another_digest_is_a_conflict_and_the_first_stays(stor
 def test_a_lease_contains_windows_and_letters_in_order_and_is_granted_once(store: Store) -> None:
     store.put([letter(body=b"first"), window("b")])
     store.put([window(sequence=2, body=b"second"), window(sequence=1, body=b"third")])
-    found = {one.servo: one for one in claim(store)}
-    assert bodies_of(found["a"]) == [b"first", b"second", b"third"]
-    assert [message.kind for message in found["a"].messages] == [
+    result = {one.servo: one for one in claim(store)}
+    assert bodies_of(result["a"]) == [b"first", b"second", b"third"]
+    assert [message.kind for message in result["a"].messages] == [
         MessageKind.LETTER,
         MessageKind.WINDOW,
         MessageKind.WINDOW,
     ]
-    assert (found["a"].state, found["a"].serial, found["a"].attempts) == (b"", 0, 1)
+    assert (result["a"].state, result["a"].serial, result["a"].attempts) == (b"", 0, 1)
     assert claim(store, "you") == []
 
 
@@ -136,15 +136,15 @@ def test_a_lease_from_before_a_clock_was_set_back_has_ended(store: Store) -> Non
 
 def test_verifications_are_leased_only_on_request(store: Store) -> None:
     store.put([window()])
-    (lent,) = claim(store)
-    assert store.commit([outcome(lent, enqueue=(proof(), proof(body=b"another")))], 201.0) == [True]
+    (leased,) = claim(store)
+    assert store.commit([outcome(leased, enqueue=(verification(), verification(body=b"another")))], 201.0) == [True]
     assert claim(store) == []
     assert store.backlog(202.0) == Backlog(0, 2, 0.0)
-    (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,), per_servo=1)
-    assert bodies_of(asked) == [b"prove it"]
+    (verification_lease,) = claim(store, kinds=(MessageKind.VERIFICATION,), per_servo=1)
+    assert bodies_of(verification_lease) == [b"prove it"]
     store.put([window(sequence=2)])
     assert claim(store, "you") == []
-    assert store.commit([outcome(asked)], 202.0) == [True]
+    assert store.commit([outcome(verification_lease)], 202.0) == [True]
     (both,) = claim(store, kinds=tuple(MessageKind))
     assert sorted(bodies_of(both)) == [b"another", b"samples"]
 
@@ -216,11 +216,11 @@ def test_many_threads_with_the_same_windows_keep_each_once(store: Store) -> None
 def test_leases_of_many_threads_do_not_overlap(store: Store) -> None:
     names = [f"s{n}" for n in range(40)]
     store.put([window(name) for name in names])
-    lent: list[str] = []
+    leased: list[str] = []
 
     def borrow(owner: str) -> None:
-        while found := claim(store, owner, limit=3):
-            lent.extend(one.servo for one in found)
+        while result := claim(store, owner, limit=3):
+            leased.extend(one.servo for one in result)
 
     threads = [threading.Thread(target=borrow, args=(f"owner {n}",)) for n in range(4)]
     for thread in threads:
@@ -228,15 +228,15 @@ def test_leases_of_many_threads_do_not_overlap(store: Store) -> None:
     for thread in threads:
         thread.join()
     # A row that another thread holds is passed over: what is left then is for the next one who asks.
-    lent.extend(one.servo for one in claim(store, "last", limit=40))
-    assert sorted(lent) == sorted(names)
+    leased.extend(one.servo for one in claim(store, "last", limit=40))
+    assert sorted(leased) == sorted(names)
 
 
 def test_a_message_that_arrives_while_its_servo_is_leased_is_not_lost(store: Store) -> None:
     store.put([window()])
-    (lent,) = claim(store)
+    (leased,) = claim(store)
     store.put([window(sequence=2)])
-    store.commit([outcome(lent)], 201.0)
+    store.commit([outcome(leased)], 201.0)
     (again,) = claim(store)
     assert (again.serial, len(again.messages)) == (1, 1)
 
@@ -254,10 +254,10 @@ def test_no_message_is_lost_when_results_and_messages_are_committed_at_once(stor
     taken, idle = 0, 0
     while idle < 2:
         finished = done.is_set()
-        found = claim(store, per_servo=4)
-        assert store.commit([outcome(one) for one in found], 201.0) == [True] * len(found)
-        taken += sum(len(one.messages) for one in found)
-        idle = idle + 1 if finished and not found else 0
+        result = claim(store, per_servo=4)
+        assert store.commit([outcome(one) for one in result], 201.0) == [True] * len(result)
+        taken += sum(len(one.messages) for one in result)
+        idle = idle + 1 if finished and not result else 0
     sender.join()
     assert taken == total
 
@@ -272,10 +272,10 @@ def test_an_invalid_address_is_refused_without_showing_its_password(url: str) ->
 def test_when_all_is_done_nothing_is_marked_as_waiting(store: Store) -> None:
     """Or each claim would lend servos in vain for ever."""
     store.put([window()])
-    (lent,) = claim(store)
-    store.commit([outcome(lent, enqueue=(proof(),))], 201.0)
-    (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,))
-    store.commit([outcome(asked)], 202.0)
+    (leased,) = claim(store)
+    store.commit([outcome(leased, enqueue=(verification(),))], 201.0)
+    (verification_lease,) = claim(store, kinds=(MessageKind.VERIFICATION,))
+    store.commit([outcome(verification_lease)], 202.0)
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.select(twins.c.ready, twins.c.asked)).all() == [(None, None)]
 

@@ -47,9 +47,9 @@ def kill(started: subprocess.Popen[str]) -> None:
 
 def lines(started: subprocess.Popen[str], number: int) -> list[list[str]]:
     """So many lines of its output."""
-    found = [line.split() for _, line in zip(range(number), started.stdout, strict=False)]
-    assert len(found) == number, "the process ended by itself"
-    return found
+    result = [line.split() for _, line in zip(range(number), started.stdout, strict=False)]
+    assert len(result) == number, "the process ended by itself"
+    return result
 
 
 def rest(started: subprocess.Popen[str]) -> list[list[str]]:
@@ -59,8 +59,8 @@ def rest(started: subprocess.Popen[str]) -> list[list[str]]:
 
 def finish(store: Store) -> None:
     """Work through everything that is left."""
-    while found := store.lease("finisher", 16, 1.0, FAR):
-        assert all(store.commit([store_process.worked(one) for one in found], FAR))
+    while result := store.lease("finisher", 16, 1.0, FAR):
+        assert all(store.commit([store_process.worked(one) for one in result], FAR))
 
 
 def numbers(store: Store, column: sa.Column) -> Counter[int]:
@@ -88,12 +88,12 @@ def test_killed_in_the_middle_of_group_commits(new_address: NewAddress) -> None:
     open_store(url).close()
     for acknowledged in (1, 150, 37):
         with process("put", url) as writing, process("work", url) if "postgres" in url else no_process() as working:
-            told = lines(writing, len(safe) + acknowledged)
+            output = lines(writing, len(safe) + acknowledged)
             kill(writing)
-            told += rest(writing)
+            output += rest(writing)
             if working is not None:
                 lines(working, 1)
-        safe |= {(servo, int(sequence)) for _, servo, sequence in told}
+        safe |= {(servo, int(sequence)) for _, servo, sequence in output}
         store = open_store(url)
         assert set(store.put([window(servo, n, store_process.BODY) for servo, n in sorted(safe)])) == {PutResult.KNOWN}
         store.close()

@@ -36,9 +36,9 @@ def test_the_migrations_make_the_tables_that_the_code_knows(new_address: NewAddr
     with transaction(store.engines.reader) as connection:
         options = {"version_table": migrations.VERSIONS}
         assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
-        found = sa.inspect(connection)
+        result = sa.inspect(connection)
         for table in metadata.tables.values():
-            known = {index["name"] for index in found.get_indexes(table.name)}
+            known = {index["name"] for index in result.get_indexes(table.name)}
             assert {index.name for index in table.indexes} <= known
     store.close()
 
@@ -117,10 +117,10 @@ def test_a_new_file_is_its_owners_alone(tmp_path: Path) -> None:
     mask = os.umask(0)
     try:
         store = filled(str(tmp_path / "store.db"))
-        found = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+        result = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
     finally:
         os.umask(mask)
-    assert found == {"store.db": 0o600, "store.db-wal": 0o600, "store.db-shm": 0o600}
+    assert result == {"store.db": 0o600, "store.db-wal": 0o600, "store.db-shm": 0o600}
     with transaction(store.engines.writer) as connection:
         values = {n: connection.exec_driver_sql(f"PRAGMA {n}").scalar() for n in ("journal_mode", "synchronous")}
         assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
@@ -159,8 +159,13 @@ def test_a_file_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
 def test_a_password_is_never_shown(url: str) -> None:
     with pytest.raises(InvalidInput, match="not available now") as refused:
         open_store(url)
-    seen = [str(refused.value), repr(refused.value), public_address(parse_address(url)), repr(refused.value.__cause__)]
-    assert SECRET not in " ".join(seen)
+    observed = [
+        str(refused.value),
+        repr(refused.value),
+        public_address(parse_address(url)),
+        repr(refused.value.__cause__),
+    ]
+    assert SECRET not in " ".join(observed)
 
 
 def test_a_password_of_its_own_replaces_that_of_the_address() -> None:
@@ -179,11 +184,11 @@ try:
 except InvalidInput as error:
     print(error)
 """
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
     ).stdout
-    assert said.strip().endswith("PostgreSQL needs the package psycopg; install servotwin[postgres]")
-    assert SECRET not in said
+    assert output.strip().endswith("PostgreSQL needs the package psycopg; install servotwin[postgres]")
+    assert SECRET not in output
 
 
 def test_a_server_that_cuts_its_connections_is_survived() -> None:

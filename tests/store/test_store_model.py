@@ -84,13 +84,13 @@ class Against(RuleBasedStateMachine):
     @rule(target=claims, limit=st.integers(1, 3), per_servo=st.integers(1, 4), kinds=st.sampled_from(sorted(QUEUES)))
     def claim(self, limit: int, per_servo: int, kinds: tuple[MessageKind, ...]) -> object:
         due = {servo for servo in self.servos if self.due(servo, kinds)}
-        found = self.store.lease("me", limit, LEASE_S, self.now, kinds, per_servo)
-        assert {one.servo for one in found} <= due
-        assert len(found) == min(limit, len(due))
-        for one in found:
+        result = self.store.lease("me", limit, LEASE_S, self.now, kinds, per_servo)
+        assert {one.servo for one in result} <= due
+        assert len(result) == min(limit, len(due))
+        for one in result:
             self.check(one, kinds, per_servo)
             self.servos[one.servo].lent_until = self.now + LEASE_S
-        return multiple(*found)
+        return multiple(*result)
 
     def check(self, claim: Lease, kinds: tuple[MessageKind, ...], per_servo: int) -> None:
         model = self.servos[claim.servo]
@@ -110,27 +110,29 @@ class Against(RuleBasedStateMachine):
         return body + key.encode()
 
     @rule(
-        lent=st.lists(consumes(claims), min_size=1, max_size=3),
+        leased=st.lists(consumes(claims), min_size=1, max_size=3),
         letters=st.lists(texts, max_size=2),
         wake=st.none() | st.floats(0.0, 30.0),
         ask=st.none() | keys,
         again=st.booleans(),
     )
-    def commit(self, lent: list[Lease], letters: list[bytes], wake: float | None, ask: str | None, again: bool) -> None:
-        made = [self.outcome(claim, letters, wake, ask) for claim in lent]
+    def commit(
+        self, leased: list[Lease], letters: list[bytes], wake: float | None, ask: str | None, again: bool
+    ) -> None:
+        made = [self.outcome(claim, letters, wake, ask) for claim in leased]
         made += made[:1] if again else []
         assert self.store.commit(made, self.now) == [self.expect_commit(one) for one in made]
 
     def outcome(self, claim: Lease, letters: list[bytes], wake: float | None, ask: str | None) -> WorkResult:
         done = tuple(message.id for message in claim.messages)
-        found = tuple(EvidenceRecord("estimate", message, b"") for message in done)
-        asked = (
+        result = tuple(EvidenceRecord("estimate", message, b"") for message in done)
+        enqueued = (
             ()
             if ask is None
             else (incoming(claim.servo, f"{MessageKind.VERIFICATION} {ask}", b"x", MessageKind.VERIFICATION, self.now),)
         )
         at = None if wake is None else self.now + wake
-        return WorkResult(claim.servo, claim.serial, b"%d" % claim.serial, at, done, found, tuple(letters), asked)
+        return WorkResult(claim.servo, claim.serial, b"%d" % claim.serial, at, done, result, tuple(letters), enqueued)
 
     def expect_commit(self, made: WorkResult) -> bool:
         model = self.servos[made.servo]
@@ -168,9 +170,9 @@ class Against(RuleBasedStateMachine):
     @invariant()
     def it_tells_the_same(self) -> None:
         for name, model in self.servos.items():
-            found = self.store.servo(name)
-            assert (found.serial, found.wake) == (model.serial, model.wake)
-            assert found.waiting == len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER)))
+            result = self.store.servo(name)
+            assert (result.serial, result.wake) == (model.serial, model.wake)
+            assert result.waiting == len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER)))
             assert self.store.outgoing(name, 0) == [OutgoingMessage(n, body) for n, body in enumerate(model.letters, 1)]
         waiting = self.store.backlog(self.now)
         assert waiting.messages == sum(

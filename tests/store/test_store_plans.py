@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
-from store_cases import letter, outcome, proof, window
+from store_cases import letter, outcome, verification, window
 
 from servotwin.store.records import EvidenceRecord, MessageKind
 from servotwin.store.retention import delete_old_bodies
@@ -38,19 +38,19 @@ def asked(tmp_path: Path) -> tuple[Store, dict[str, Any]]:
 
 def exercise(store: Store) -> None:
     """Everything that a service, its operators and its keeping do."""
-    sent = [window("a", 1), window("a", 2), window("b", 1), letter("b"), proof("a")]
+    sent = [window("a", 1), window("a", 2), window("b", 1), letter("b"), verification("a")]
     store.put(sent)
     store.put([*sent, window("a", 1, b"other")])
     for kinds in ((MessageKind.WINDOW, MessageKind.LETTER), (MessageKind.VERIFICATION,), (MessageKind.LETTER,)):
         for servo in (None, "a"):
             for claim in store.lease("me", 16, 60.0, 100.0, kinds, servo=servo):
                 first = claim.messages[0].id
-                found = (
+                result = (
                     EvidenceRecord("estimate", first, b"1", version=1, gap=0.1, std=0.01, status="ok", context="c"),
                     EvidenceRecord("update", first, b"2", version=2),
                     EvidenceRecord("receipt", 0, b"3", version=2, status="applied", window="boot/1"),
                 )
-                made = outcome(claim, *found, outgoing=(b"update",), contexts=(("c", "{}"),), wake=150.0)
+                made = outcome(claim, *result, outgoing=(b"update",), contexts=(("c", "{}"),), wake=150.0)
                 store.write([window("c", first)], [made], 100.0)
     store.lease("me", 16, 60.0, 300.0)
     store.release("me", ["a"])

@@ -1,7 +1,7 @@
 """What the store tells: letters to the edges, summaries, windows, and the evidence chain in one query."""
 
 import sqlalchemy as sa
-from store_cases import NewAddress, bodies_of, claim, letter, outcome, proof, window
+from store_cases import NewAddress, bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.store.records import Backlog, EvidenceRecord, MessageKind, OutgoingMessage
 from servotwin.store.store import Store, open_store
@@ -52,13 +52,13 @@ def test_contexts_are_kept_once(store: Store) -> None:
 
 def test_the_summary_of_a_servo(store: Store) -> None:
     store.put([window(), letter(received=150.0), window("b")])
-    found = (
+    result = (
         EvidenceRecord("glance", 0, b"", gap=0.1, std=0.01, status="calm"),
         EvidenceRecord("estimate", 0, b"", gap=0.2, std=0.02, status="ok"),
         EvidenceRecord("update", 0, b"", version=3, gap=0.2),
         EvidenceRecord("receipt", 0, b"", version=3, status="applied"),
     )
-    store.commit([outcome(claim(store, servo="a")[0], *found, outgoing=(b"u",), wake=400.0)], 201.0)
+    store.commit([outcome(claim(store, servo="a")[0], *result, outgoing=(b"u",), wake=400.0)], 201.0)
     store.put([window(sequence=2, received=160.0)])
     assert [one.servo for one in store.servos()] == ["a", "b"]
     assert [one.servo for one in store.servos(after="a")] == ["b"]
@@ -70,19 +70,24 @@ def test_the_summary_of_a_servo(store: Store) -> None:
 
 def test_a_window_with_its_body(store: Store) -> None:
     store.put([window(body=b"packed")._replace(encoding="zstd")])
-    found = store.window("a", "boot", 1)
-    assert (found.kind, found.body, found.encoding, found.received) == (MessageKind.WINDOW, b"packed", "zstd", 100.0)
+    result = store.window("a", "boot", 1)
+    assert (result.kind, result.body, result.encoding, result.received) == (
+        MessageKind.WINDOW,
+        b"packed",
+        "zstd",
+        100.0,
+    )
     assert store.window("a", "boot", 2) is store.window("b", "boot", 1) is None
     store.put([window(sequence=2), window(sequence=3)])
     assert [held.sequence for held in store.windows("a", limit=2)] == [3, 2]
     assert [held.sequence for held in store.windows("a", before=store.windows("a")[1].id)] == [1]
 
 
-def process(store: Store, *found: EvidenceRecord, servo: str = "a") -> None:
+def process(store: Store, *result: EvidenceRecord, servo: str = "a") -> None:
     """Claim and commit, with this evidence of the claim's first message."""
-    (lent,) = claim(store, servo=servo)
-    mine = [one._replace(message=one.message or lent.messages[0].id) for one in found]
-    assert store.commit([outcome(lent, *mine)], 201.0) == [True]
+    (lease,) = claim(store, servo=servo)
+    mine = [one._replace(message=one.message or lease.messages[0].id) for one in result]
+    assert store.commit([outcome(lease, *mine)], 201.0) == [True]
 
 
 def test_the_evidence_chain(store: Store) -> None:
@@ -93,8 +98,10 @@ def test_the_evidence_chain(store: Store) -> None:
         EvidenceRecord("trend", 0, b""),
     )
     store.put([window(sequence=2)])
-    seen = EvidenceRecord("estimate", 0, b"e2", version=0, gap=0.2, std=0.01, status="ok", tail=8e-4)
-    process(store, EvidenceRecord("glance", 0, b"g2", version=0), seen, EvidenceRecord("update", 0, b"u", version=1))
+    estimate = EvidenceRecord("estimate", 0, b"e2", version=0, gap=0.2, std=0.01, status="ok", tail=8e-4)
+    process(
+        store, EvidenceRecord("glance", 0, b"g2", version=0), estimate, EvidenceRecord("update", 0, b"u", version=1)
+    )
     store.put([letter(body=b"receipt")])
     process(store, EvidenceRecord("receipt", 0, b"r", version=1, status="applied"))
     store.put([window("b", 1)])
@@ -128,8 +135,10 @@ def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> Non
 
 def test_an_update_after_a_verification_belongs_to_its_window(store: Store) -> None:
     store.put([window()])
-    (lent,) = claim(store)
-    store.commit([outcome(lent, EvidenceRecord("estimate", lent.messages[0].id, b""), enqueue=(proof(),))], 201.0)
+    (lease,) = claim(store)
+    store.commit(
+        [outcome(lease, EvidenceRecord("estimate", lease.messages[0].id, b""), enqueue=(verification(),))], 201.0
+    )
     (asked,) = claim(store, kinds=(MessageKind.VERIFICATION,))
     late = EvidenceRecord("update", asked.messages[0].id, b"", version=1, window="boot/1")
     store.commit([outcome(asked, late)], 202.0)
@@ -166,7 +175,7 @@ def test_events_that_belong_to_no_window(store: Store) -> None:
     store.put([letter(), window(), letter("b")])
     first, second = claim(store, servo="a")[0], claim(store, servo="b")[0]
     word, cut = first.messages[0].id, first.messages[1].id
-    found = (
+    result = (
         EvidenceRecord("hello", word, b"h", version=0, status="boot"),
         EvidenceRecord("receipt", word, b"r", version=1, status="applied"),
         EvidenceRecord("estimate", cut, b"e", status="ok"),
@@ -174,7 +183,7 @@ def test_events_that_belong_to_no_window(store: Store) -> None:
         EvidenceRecord("estimate", 0, b"s", status="failed: no state"),
     )
     assert (
-        store.commit([outcome(first, *found), outcome(second, EvidenceRecord("hello", 0, b"other"))], 201.0)
+        store.commit([outcome(first, *result), outcome(second, EvidenceRecord("hello", 0, b"other"))], 201.0)
         == [True] * 2
     )
     assert [(one.kind, one.status, one.made) for one in store.events("a")] == [

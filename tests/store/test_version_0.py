@@ -40,9 +40,9 @@ def newest_window(store: Store) -> WindowMessage:
     last = store.windows(SERVO, 1)[0]
     stored = store.window(SERVO, last.boot, last.sequence)
     assert stored is not None
-    found = decode(incoming(store, stored.body, stored.encoding)[1])
-    assert isinstance(found, WindowMessage)
-    return found
+    message = decode(incoming(store, stored.body, stored.encoding)[1])
+    assert isinstance(message, WindowMessage)
+    return message
 
 
 def incoming(_store: Store, body: bytes, encoding: str) -> tuple[object, bytes]:
@@ -55,9 +55,9 @@ def incoming(_store: Store, body: bytes, encoding: str) -> tuple[object, bytes]:
 def test_a_store_of_version_0_is_at_the_newest_revision_and_tells_the_same(store: Store) -> None:
     with transaction(store.engines.reader) as connection:
         assert connection.exec_driver_sql(f"SELECT version_num FROM {VERSIONS}").scalar() == REVISION
-    told = json.loads(gzip.decompress((DATA / "audit.json.gz").read_bytes()))
+    expected = json.loads(gzip.decompress((DATA / "audit.json.gz").read_bytes()))
     traces = [trace_as_json(trace) for trace in store.audit(SERVO)]
-    assert json.loads(msgspec.json.encode(traces)) == told
+    assert json.loads(msgspec.json.encode(traces)) == expected
     assert sum(len(trace["steps"]) for trace in traces) == 1
 
 

@@ -213,11 +213,11 @@ class Fleet:
 
     def connections(self) -> dict[str, list[dict[str, Any]]]:
         """Of each controlled machine, in order; once the machines have stopped."""
-        found: dict[str, list[dict[str, Any]]] = {}
+        result: dict[str, list[dict[str, Any]]] = {}
         for line in (self.folder / "machines.log").read_text().splitlines():
             entry = json.loads(line)
-            found.setdefault(entry["servo"], []).append(entry)
-        return found
+            result.setdefault(entry["servo"], []).append(entry)
+        return result
 
     def _start_machines(self) -> list[str]:
         known = {"rate": RATE, "window": WINDOW_S, "period": 2 * EVERY / RATE}

@@ -21,9 +21,9 @@ def boot_number(boot: str) -> int:
     return int(boot.split("-")[0][1:])
 
 
-def by_boot(found: set[tuple[str, str, int]]) -> dict[tuple[str, str], list[int]]:
+def by_boot(result: set[tuple[str, str, int]]) -> dict[tuple[str, str], list[int]]:
     boots: dict[tuple[str, str], list[int]] = {}
-    for servo, boot, sequence in sorted(found):
+    for servo, boot, sequence in sorted(result):
         boots.setdefault((servo, boot), []).append(sequence)
     return boots
 
@@ -122,11 +122,11 @@ def check_kills_cost_little(fleet: Fleet) -> None:
     boots = by_boot(witnessed(fleet))
     assert all(numbers == list(range(len(numbers))) for numbers in boots.values())
     for servo, entries in fleet.connections().items():
-        found = {boot_number(boot): len(numbers) for (name, boot), numbers in boots.items() if name == servo}
-        assert len(entries) >= max(found)
+        result = {boot_number(boot): len(numbers) for (name, boot), numbers in boots.items() if name == servo}
+        assert len(entries) >= max(result)
         for number, entry in enumerate(entries, 1):
             possible = complete_windows(entry["first"], entry["last"])
-            assert possible - 1 <= found.get(number, 0) <= possible, (servo, number, entry, found)
+            assert possible - 1 <= result.get(number, 0) <= possible, (servo, number, entry, result)
 
 
 def check_controllers_ticked(fleet: Fleet) -> None:
@@ -139,8 +139,8 @@ def check_controllers_ticked(fleet: Fleet) -> None:
 def check_updates(fleet: Fleet) -> int:
     """Each version was applied once, and none after a newer one; how many there were."""
     applied = 0
-    for servo, found in receipts(fleet).items():
-        ordered = sorted(found, key=lambda receipt: (boot_number(receipt.boot), receipt.sample))
+    for servo, result in receipts(fleet).items():
+        ordered = sorted(result, key=lambda receipt: (boot_number(receipt.boot), receipt.sample))
         versions = [receipt.version for receipt in ordered if receipt.applied]
         assert versions == sorted(set(versions)), (servo, versions)
         for before, after in itertools.pairwise(ordered):

@@ -66,11 +66,11 @@ class Twin:
         asyncio.run(self._main())
 
     async def _main(self) -> None:
-        self._loop, self._stop, landing = asyncio.get_running_loop(), asyncio.Event(), FutureBridge()
+        self._loop, self._stop, futures = asyncio.get_running_loop(), asyncio.Event(), FutureBridge()
         self.polls = LongPolls(self._posted, 100, shared=True)
         known = SERVOS.__contains__
         limits = SampleTimeLimiter(1.0, 1e9)
-        ingest = Ingest(lambda incoming: landing.wrap(self.commits.put(incoming)), known, limits, self.metrics)
+        ingest = Ingest(lambda incoming: futures.wrap(self.commits.put(incoming)), known, limits, self.metrics)
         gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
         handler = MqttRequestHandler(gate, ingest, self.polls, lambda: None, self.metrics)
         server = MqttServer(self._broker, handler, "twins")

@@ -61,12 +61,17 @@ def running() -> Iterator[Server]:
         # Without its own name in the environment, libpq would read a home that is not the server's.
         started = {"user": user, "group": user, "extra_groups": []} if user else {}
         server = Server(folder, "postgres")
-        said = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
+        silent = {
+            "stdin": subprocess.DEVNULL,
+            "stdout": subprocess.DEVNULL,
+            "stderr": subprocess.DEVNULL,
+            "cwd": folder,
+        }
         make = [initdb, "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8", "--locale=C"]
-        subprocess.run([*make, folder / "data"], check=True, timeout=PATIENCE_S, **said, **started)
+        subprocess.run([*make, folder / "data"], check=True, timeout=PATIENCE_S, **silent, **started)
         settings = [word for name, value in OPTIONS.items() for word in ("-c", f"{name}={value}")]
         command = [initdb.with_name("postgres"), "-D", folder / "data", "-k", folder, *settings]
-        process = subprocess.Popen(command, start_new_session=True, **said, **started)
+        process = subprocess.Popen(command, start_new_session=True, **silent, **started)
         _wait(server, process)
         yield server
     finally:

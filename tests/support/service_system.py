@@ -31,8 +31,8 @@ def twin_file(folder: Path, service: str = "", tokens: bool = True, servos: str 
     """A twin's file in a folder, and its tokens."""
     path = folder / "twin.toml"
     if tokens:
-        found = Verifiers({"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}, {"me": verifier_of(OPERATOR)})
-        write_tokens(folder / "tokens.toml", found)
+        result = Verifiers({"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}, {"me": verifier_of(OPERATOR)})
+        write_tokens(folder / "tokens.toml", result)
         service += '\ntokens = "tokens.toml"'
     path.write_text(f"[service]\nport = 0\nworkers = 1\n{service}\n{servos}")
     return path
@@ -60,9 +60,9 @@ def bearer(token: str = TOKEN) -> dict[str, str]:
     return {"authorization": f"Bearer {token}"}
 
 
-def place(found: WindowMessage) -> str:
+def place(result: WindowMessage) -> str:
     """Where a window is put."""
-    return f"/v1/servos/{found.servo}/windows/{found.boot}/{found.sequence}"
+    return f"/v1/servos/{result.servo}/windows/{result.boot}/{result.sequence}"
 
 
 @contextlib.asynccontextmanager

@@ -53,7 +53,7 @@ def letter(servo: str = "a", body: bytes = b"hello", received: float = 100.0) ->
     return incoming(servo, hashlib.sha256(body).hexdigest(), body, MessageKind.LETTER, received)
 
 
-def proof(servo: str = "a", body: bytes = b"prove it", received: float = 100.0) -> Incoming:
+def verification(servo: str = "a", body: bytes = b"prove it", received: float = 100.0) -> Incoming:
     return incoming(servo, f"proof {body!r}", body, MessageKind.VERIFICATION, received)
 
 

@@ -16,8 +16,8 @@ from servotwin.store.store import Store, open_store
 
 @pytest.fixture(scope="module", params=SYSTEMS)
 def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NewAddress]:
-    with addresses(request.param, tmp_path_factory.mktemp("stores")) as found:
-        yield found
+    with addresses(request.param, tmp_path_factory.mktemp("stores")) as result:
+        yield result
 
 
 @pytest.fixture(scope="module")

@@ -102,8 +102,8 @@ def test_the_lease_that_a_lost_worker_was_processing_counts_as_failed():
 
 
 def test_a_verification_that_kills_its_workers_is_counted_although_windows_succeed():
-    proof, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
-    lender = through([[proof], [window], [proof], [window], [proof]])
+    verification, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
+    lender = through([[verification], [window], [verification], [window], [verification]])
     assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
 
 

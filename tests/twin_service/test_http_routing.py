@@ -53,36 +53,36 @@ def requests(draw: st.DrawFn) -> tuple[dict[str, Any], list[bytes]]:
 
 
 async def answered(app: Any, scope: dict[str, Any], parts: list[bytes]) -> tuple[int, list[Any], bytes]:
-    left, said = list(parts), []
+    left, sent = list(parts), []
 
     async def receive() -> dict[str, Any]:
         return {"type": "http.request", "body": left.pop(0), "more_body": bool(left)}
 
     async def send(event: dict[str, Any]) -> None:
-        said.append(event)
+        sent.append(event)
 
     await app(dict(scope), receive, send)
-    return said[0]["status"], sorted(said[0]["headers"]), b"".join(event.get("body", b"") for event in said[1:])
+    return sent[0]["status"], sorted(sent[0]["headers"]), b"".join(event.get("body", b"") for event in sent[1:])
 
 
 @given(st.lists(requests(), min_size=1, max_size=40))
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
-def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory, asked):
+def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory, requested):
     async def body() -> None:
         async with served(twin_file(tmp_path_factory.mktemp("twin"))) as (service, _):
             app = service.http_app()
-            for scope, parts in asked:
+            for scope, parts in requested:
                 status, headers, content = await answered(app, scope, parts)
                 assert status in {200, 201, 400, 401, 403, 404, 405, 409, 413, 422}
-                said = dict(headers)
-                assert int(said[b"content-length"]) == len(content)
+                by_name = dict(headers)
+                assert int(by_name[b"content-length"]) == len(content)
                 if status < 400:
-                    assert said[b"content-type"] == b"application/msgpack"
+                    assert by_name[b"content-type"] == b"application/msgpack"
                     continue
-                assert said[b"content-type"] == b"application/json"
+                assert by_name[b"content-type"] == b"application/json"
                 assert set(msgspec.json.decode(content)) == {"code", "detail"}
-                assert (b"allow" in said) == (status == 405)
-                assert (b"www-authenticate" in said) == (status == 401)
+                assert (b"allow" in by_name) == (status == 405)
+                assert (b"www-authenticate" in by_name) == (status == 401)
 
     asyncio.run(body())
 

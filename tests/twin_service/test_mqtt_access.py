@@ -46,9 +46,9 @@ def test_the_files_that_the_guide_shows_are_read(tmp_path: Path) -> None:
     assert (config.twin.over_mqtt, password_of(config.twin, tmp_path)) == (True, "secret")
     (tmp_path / "tokens").touch(0o600)
     twin_file = '[service]\ntokens = "tokens"\n' + shown("[service.mqtt]")
-    found = read_service(parse_toml(twin_file, "twin.toml").table("service"), tmp_path, {})
-    assert found.mqtt is not None
-    assert (found.mqtt.broker.password, found.mqtt.group, found.mqtt.local) == ("secret", "twins", False)
+    result = read_service(parse_toml(twin_file, "twin.toml").table("service"), tmp_path, {})
+    assert result.mqtt is not None
+    assert (result.mqtt.broker.password, result.mqtt.group, result.mqtt.local) == ("secret", "twins", False)
 
 
 def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path: Path, store: Store) -> None:

@@ -56,10 +56,10 @@ async def put(client: httpx.AsyncClient, sent, token=TOKEN, to=None, **headers) 
 
 
 def code(answer: httpx.Response) -> tuple[int, str]:
-    said = answer.json()
-    assert set(said) == {"code", "detail"}
-    assert said["detail"].strip()
-    return answer.status_code, said["code"]
+    content = answer.json()
+    assert set(content) == {"code", "detail"}
+    assert content["detail"].strip()
+    return answer.status_code, content["code"]
 
 
 def test_a_window_is_committed_then_acknowledged_and_known_the_second_time(serving):
@@ -264,8 +264,8 @@ def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
 
     async def body(system, client):
         await client.post("/v1/servos/ax-1/letters", content=hello(), headers=bearer())
-        asked = client.get("/v1/servos/ax-1/outgoing?after=0&wait=20", headers=bearer())
-        waiting = asyncio.create_task(asked)
+        request = client.get("/v1/servos/ax-1/outgoing?after=0&wait=20", headers=bearer())
+        waiting = asyncio.create_task(request)
         await asyncio.sleep(0.1)
         assert not waiting.done()
         [claim] = system.store.lease("me", 1, 10.0, system.clocks.wall())
@@ -275,8 +275,8 @@ def test_messages_for_an_edge_are_sealed_and_read_again_without_harm(serving):
         again = await client.get("/v1/servos/ax-1/outgoing", headers=bearer())
         for answer in (await waiting, again):
             [sealed] = unpacked(answer.content)
-            found = opened(key_of(verifier_of(TOKEN)), TO_EDGE, "ax-1", sealed, 10_000)
-            assert (found.serial, decode(found.body)) == (1, update)
+            message = opened(key_of(verifier_of(TOKEN)), TO_EDGE, "ax-1", sealed, 10_000)
+            assert (message.serial, decode(message.body)) == (1, update)
         nothing = await client.get("/v1/servos/ax-1/outgoing?after=1&wait=0.05", headers=bearer())
         assert unpacked(nothing.content) == []
 
@@ -336,17 +336,17 @@ def test_a_token_is_valid_exactly_while_it_is_in_the_file(serving):
 
 def test_no_response_and_no_log_line_contains_a_token(serving, caplog):
     caplog.set_level("DEBUG")
-    said = []
+    output = []
 
     async def body(system, client):
         for token in (TOKEN, OTHER, OPERATOR, "guess-of-a-token"):
             answers = await put(client, window(), token), await client.get("/v1/servos", headers=bearer(token))
-            said.extend(answer.text + str(dict(answer.headers)) for answer in answers)
-        said.append((await client.get("/metrics")).text)
-        said.append(repr(system.config) + repr(read_tokens(system.config.tokens)))
+            output.extend(answer.text + str(dict(answer.headers)) for answer in answers)
+        output.append((await client.get("/metrics")).text)
+        output.append(repr(system.config) + repr(read_tokens(system.config.tokens)))
 
     serving(body)
-    everything = " ".join(said) + "".join(str(vars(record)) for record in caplog.records)
+    everything = " ".join(output) + "".join(str(vars(record)) for record in caplog.records)
     for token in (TOKEN, OTHER, OPERATOR, "guess-of-a-token"):
         assert token not in everything
         assert verifier_of(token).hex() not in everything
@@ -356,10 +356,10 @@ def test_health_names_the_unhealthy_part(serving):
     async def body(system, client):
         answer = await client.get("/healthz")
         assert answer.status_code == 503
-        said = answer.json()
-        assert said["store"] is True
-        assert said["workers"] == 0
-        assert said["waiting"]["messages"] == 0
+        content = answer.json()
+        assert content["store"] is True
+        assert content["workers"] == 0
+        assert content["waiting"]["messages"] == 0
         system.executor.fault = "gone"
         assert (await client.get("/healthz")).status_code == 503
 

@@ -56,14 +56,14 @@ async def until(condition):
 
 
 def done(system, servo="ax-1"):
-    found = system.store.servo(servo)
-    return found is not None and found.waiting == 0
+    result = system.store.servo(servo)
+    return result is not None and result.waiting == 0
 
 
 def statuses(system, servo="ax-1"):
     """Of each window by its sequence: what was found of it."""
     links = system.store.audit(servo, limit=1000)
-    return {link.window.sequence: [found.status[:8] for found in link.found] for link in links}
+    return {link.window.sequence: [result.status[:8] for result in link.found] for link in links}
 
 
 @pytest.mark.parametrize("fault", ["die", "hang", "raise"])
@@ -74,10 +74,10 @@ def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_process
                 await put(client, sequence, fault if sequence == 3 else "work")
                 await put(client, sequence, servo="ax-2", token="token-of-ax-2")
             await until(lambda: done(system) and done(system, "ax-2"))
-            found = statuses(system)
-            assert found.pop(3) == ["failed: "]
-            assert all(len(each) == 1 and each[0].startswith("at ") for each in found.values())
-            assert len(found) == 5
+            result = statuses(system)
+            assert result.pop(3) == ["failed: "]
+            assert all(len(each) == 1 and each[0].startswith("at ") for each in result.values())
+            assert len(result) == 5
             assert [len(each) for each in statuses(system, "ax-2").values()] == [1] * 6
             # The state holds one letter for each message: nothing counted twice.
             [posted] = {summary.posted for summary in system.store.servos()}
@@ -120,8 +120,8 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
 def test_windows_are_processed_and_the_edge_is_notified(tmp_path, kind):
     async def body(url):
         async with working(twin_file(tmp_path, f'store = "{shown(url)}"'), url) as (system, client):
-            asked = client.get("/v1/servos/ax-1/outgoing?after=0&wait=30", headers=bearer())
-            poll = asyncio.create_task(asked)
+            request = client.get("/v1/servos/ax-1/outgoing?after=0&wait=30", headers=bearer())
+            poll = asyncio.create_task(request)
             await asyncio.sleep(0.05)
             await put(client, 0)
             assert len(unpacked((await poll).content)) == 1

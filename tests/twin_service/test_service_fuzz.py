@@ -45,7 +45,7 @@ def raw(_context, value):
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
 def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
-    case = data.draw(st.one_of([found.ok().as_strategy() for found in described.get_all_operations()]))
+    case = data.draw(st.one_of([result.ok().as_strategy() for result in described.get_all_operations()]))
     if "wait" in (case.query or {}):
         case.query["wait"] = "0.01"
     answer = case.call(timeout=20.0)
@@ -73,15 +73,15 @@ def bodies(draw):
 @given(
     body=bodies(),
     sent=st.sampled_from(["", "deflate", "zstd"]),
-    said=st.sampled_from(["", "identity", "deflate", "zstd", "gzip", "x" * 300]),
+    declared=st.sampled_from(["", "identity", "deflate", "zstd", "gzip", "x" * 300]),
     path=st.sampled_from(
         [place(window(0)), "/v1/servos/ax-1/letters", "/v1/servos/%00/letters", "/v1/servos/a%2Fb/letters"]
     ),
 )
-@example(body=zlib.compress(bytes(40_000_000)), sent="", said="deflate", path=place(window(0)))
+@example(body=zlib.compress(bytes(40_000_000)), sent="", declared="deflate", path=place(window(0)))
 @settings(max_examples=200, deadline=None)
-def test_bodies_and_encodings(url, body, sent, said, path):
-    headers = {"content-encoding": said} if said else {}
+def test_bodies_and_encodings(url, body, sent, declared, path):
+    headers = {"content-encoding": declared} if declared else {}
     method = "PUT" if "windows" in path else "POST"
     answer = httpx.request(method, url + path, content=compress(body, sent), headers=headers, timeout=20.0)
     if answer.status_code >= 300:
@@ -93,17 +93,17 @@ def test_bodies_and_encodings(url, body, sent, said, path):
 def test_decompression_gives_no_more_than_is_allowed(data, encoding, whole):
     packed = compress(data * 40, encoding) if whole else data
     try:
-        found = decompress(packed, encoding, LIMIT)
+        result = decompress(packed, encoding, LIMIT)
     except InvalidMessage as error:
         refusal = error.refusal
-        found = b""
+        result = b""
     else:
         refusal = None
     assert refusal in (None, Refusal.TOO_LARGE, Refusal.NOT_UNDERSTOOD)
-    assert len(found) <= LIMIT
+    assert len(result) <= LIMIT
     if whole:
         assert refusal is (Refusal.TOO_LARGE if len(data) * 40 > LIMIT else None)
-        assert refusal is not None or found == data * 40
+        assert refusal is not None or result == data * 40
 
 
 @given(st.text(max_size=100), st.text(max_size=40))

@@ -116,12 +116,12 @@ def test_a_body_is_read_whole_or_refused_and_nothing_stays_buffered(parts, limit
     bodies, whole = BodyReader(limit, 10.0), b"".join(parts)
     length = None if declared is None else str(declared)
     try:
-        found = asyncio.run(bodies.read(length, received(*parts)))
+        result = asyncio.run(bodies.read(length, received(*parts)))
     except RequestRejected as refused:
         assert refused.refusal is Refusal.TOO_LARGE  # noqa: PT017
         assert max(len(whole), declared or 0) > limit
     else:
-        assert found == whole
+        assert result == whole
         assert len(whole) <= limit
     assert bodies.buffered == 0
 
@@ -155,7 +155,7 @@ def test_an_incomplete_body_is_discarded_and_too_many_at_once_are_refused():
 
 
 def test_metrics_are_prometheus_text():
-    count, told = Counter("a_total", "How many.", "kind", "put"), Metrics()
+    count, metrics = Counter("a_total", "How many.", "kind", "put"), Metrics()
     count.add('w"\n\\', "new", by=2)
     assert list(count.lines()) == ['a_total{kind="w\\"\\n\\\\",put="new"} 2']
     assert list(Gauge("g", "Now.", lambda: {"x": 1.5}, "of").lines()) == ['g{of="x"} 1.5']
@@ -164,8 +164,8 @@ def test_metrics_are_prometheus_text():
         histogram.observe(value)
     lines = ['h_bucket{le="0.1"} 2', 'h_bucket{le="1"} 3', 'h_bucket{le="+Inf"} 4', "h_sum 7.65", "h_count 4"]
     assert list(histogram.lines()) == lines
-    told.add_gauge("w", "Watched.", lambda: True)
-    text = told.text()
+    metrics.add_gauge("w", "Watched.", lambda: True)
+    text = metrics.text()
     assert text.endswith("# HELP w Watched.\n# TYPE w gauge\nw 1\n")
     assert len({line for line in text.splitlines() if line.startswith("# TYPE")}) == text.count("# TYPE")
 
@@ -197,17 +197,17 @@ def test_a_log_line_is_one_json_object_whatever_it_holds():
 
 
 def test_polls_read_the_store_only_when_there_may_be_a_message():
-    posted, asked = [], []
+    posted, read_serials = [], []
 
     async def read(servo, serial):
-        asked.append(serial)
+        read_serials.append(serial)
         return [each for each in posted if each.serial > serial]
 
     async def body():
         outgoing = LongPolls(read, 10)
         for _ in range(5):
             assert list(await outgoing.messages("a", 0, 0.0)) == []
-        assert len(asked) == 1
+        assert len(read_serials) == 1
         waiting = [asyncio.create_task(outgoing.messages("a", 0, 60.0)) for _ in range(3)]
         await asyncio.sleep(0.01)
         posted.append(OutgoingMessage(1, b"x"))
@@ -230,10 +230,10 @@ def test_a_message_posted_while_the_store_is_read_is_not_missed():
         begun, go_on = asyncio.Event(), asyncio.Event()
 
         async def read(_servo, serial):
-            found = [each for each in posted if each.serial > serial]
+            result = [each for each in posted if each.serial > serial]
             begun.set()
             await go_on.wait()
-            return found
+            return result
 
         outgoing = LongPolls(read, 10)
         poll = asyncio.create_task(outgoing.messages("a", 0, 60.0))
@@ -263,7 +263,7 @@ def test_a_file_of_tokens_reads_as_it_was_written(tmp_path_factory, servos, oper
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ('[servos]\n"ax-1" = "secret"', "no verifier"),
         ('[servos]\n"a b" = "00"', "a name has"),
@@ -272,12 +272,12 @@ def test_a_file_of_tokens_reads_as_it_was_written(tmp_path_factory, servos, oper
         ('[operators]\n"x" = 3', "no verifier"),
     ],
 )
-def test_a_file_of_tokens_that_is_wrong_is_one_sentence_without_what_it_holds(tmp_path, text, said):
+def test_a_file_of_tokens_that_is_wrong_is_one_sentence_without_what_it_holds(tmp_path, text, expected):
     path = tmp_path / "tokens.toml"
     write_private(path, text)
     with pytest.raises(InvalidInput) as error:
         read_tokens(path)
-    assert said in str(error.value)
+    assert expected in str(error.value)
     assert "secret" not in str(error.value)
     path.chmod(0o640)
     with pytest.raises(InvalidInput, match="chmod 600"):
@@ -291,12 +291,12 @@ def config(folder, values, environment=None):
 def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not_shown(tmp_path):
     url = "postgresql://me@host/twin"
     write_private(tmp_path / "password", "hunter2\n")
-    for found in (
+    for result in (
         config(tmp_path, {"store": url, "store_password_file": "password"}),
         config(tmp_path, {"store": url}, {PASSWORD: "hunter2"}),
     ):
-        assert found.store_password == "hunter2"
-        assert "hunter2" not in repr(found)
+        assert result.store_password == "hunter2"
+        assert "hunter2" not in repr(result)
     assert config(tmp_path, {}).store == f"sqlite:///{tmp_path / 'twin.db'}"
     for holding in ("postgresql://me:hunter2@host/twin", "postgresql://me@host/twin?password=hunter2"):
         with pytest.raises(InvalidInput, match="holds a password") as error:
@@ -320,10 +320,10 @@ def test_another_address_needs_tokens_and_tls_or_a_proxy(tmp_path):
 
 
 def test_a_whole_file_knows_its_service_and_its_fleet(tmp_path):
-    found = read_twin(twin_file(tmp_path, "speed = 5.0"))
-    assert found.service.speed == 5.0
-    assert found.fleet.model_of("ax-9").name == "axis"
-    assert verifier_of("token-of-ax-1") in read_tokens(found.service.tokens).servos.values()
+    result = read_twin(twin_file(tmp_path, "speed = 5.0"))
+    assert result.service.speed == 5.0
+    assert result.fleet.model_of("ax-9").name == "axis"
+    assert verifier_of("token-of-ax-1") in read_tokens(result.service.tokens).servos.values()
     with pytest.raises(InvalidInput, match="unknown key 'servo'"):
         read_twin(twin_file(tmp_path, servos="[servo]\nx = 1\n" + SERVO))
 

@@ -49,8 +49,8 @@ def until(condition, seconds=PATIENCE):
     """What a condition gives once it gives something."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        if found := condition():
-            return found
+        if result := condition():
+            return result
         time.sleep(0.05)
     raise AssertionError("it did not happen in time")
 
@@ -87,8 +87,8 @@ def alive(pid: int) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    found = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(each) for each in found.split()]
+    result = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(each) for each in result.split()]
 
 
 def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_order(tmp_path):
@@ -102,7 +102,7 @@ def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_orde
                     if link["window"]["done"] is not None
                 ]
             )
-            assert {found["kind"] for found in links[0]["found"]} >= {"estimate"}
+            assert {result["kind"] for result in links[0]["found"]} >= {"estimate"}
             summary = client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()
             assert (summary["windows"], summary["waiting"], summary["serial"]) == (1, 0, 1)
             assert client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json() == []
@@ -122,8 +122,8 @@ def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_orde
         assert running.wait(PATIENCE) == 0
         until(lambda: not any(map(alive, workers)))
     log = (tmp_path / "log").read_text()
-    told = [json.loads(line) for line in log.splitlines()]
-    [estimate] = [line for line in told if line["message"] == "estimate"]
+    lines = [json.loads(line) for line in log.splitlines()]
+    [estimate] = [line for line in lines if line["message"] == "estimate"]
     assert (estimate["servo"], estimate["window"], estimate["version"]) == ("ax-1", "b/0", 0)
     assert estimate["message_id"] == links[0]["window"]["id"]
     assert "Traceback" not in log
@@ -214,7 +214,7 @@ def test_tls_with_a_self_made_certificate(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("service", "tokens", "said"),
+    ("service", "tokens", "expected"),
     [
         ('bind = "0.0.0.0"', False, "only with tokens"),
         ('bind = "0.0.0.0"', True, "behind_proxy"),
@@ -225,15 +225,15 @@ def test_tls_with_a_self_made_certificate(tmp_path):
         ("queue = 0", True, "at least 1"),
     ],
 )
-def test_a_file_that_is_not_allowed_is_one_sentence_and_2(tmp_path, service, tokens, said):
+def test_a_file_that_is_not_allowed_is_one_sentence_and_2(tmp_path, service, tokens, expected):
     path = twin_file(tmp_path, service, tokens)
     command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert found.returncode == 2
-    assert found.stdout == ""
-    assert said in found.stderr
-    assert "secret" not in found.stderr
-    assert found.stderr.count("\n") == 1
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert expected in result.stderr
+    assert "secret" not in result.stderr
+    assert result.stderr.count("\n") == 1
     assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
@@ -241,9 +241,9 @@ def test_tokens_that_others_may_read_are_refused(tmp_path):
     path = twin_file(tmp_path)
     (tmp_path / "tokens.toml").chmod(0o644)
     command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert found.returncode == 2
-    assert "chmod 600" in found.stderr
+    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert result.returncode == 2
+    assert "chmod 600" in result.stderr
 
 
 def test_bytes_that_are_no_request_do_no_harm(tmp_path):
@@ -295,9 +295,9 @@ def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_pat
     path = twin_file(tmp_path)
     with process(path) as (running, url):
         second = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-        found = subprocess.run(second, capture_output=True, text=True, timeout=PATIENCE, check=False)
-        assert found.returncode == 2
-        assert "another twin works on it" in found.stderr
+        result = subprocess.run(second, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        assert result.returncode == 2
+        assert "another twin works on it" in result.stderr
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
         running.kill()
         running.wait(timeout=PATIENCE)

@@ -24,9 +24,9 @@ def test_tokens_written_while_the_file_is_read_become_valid_too(tmp_path, monkey
     write_tokens(path, Verifiers({"ax-1": verifier_of("old")}))
 
     def reading(path):
-        found = read_tokens(path)
+        result = read_tokens(path)
         write_tokens(path, Verifiers({"ax-1": verifier_of("new")}))
-        return found
+        return result
 
     monkeypatch.setattr(auth, "read_tokens", reading)
     file = TokenFile(path)
@@ -38,7 +38,7 @@ def test_tokens_written_while_the_file_is_read_become_valid_too(tmp_path, monkey
 def test_an_operator_s_token_follows_no_redirection(tmp_path):
     class Elsewhere(BaseHTTPRequestHandler):
         def do_GET(self):
-            asked.append((self.path, self.headers["authorization"]))
+            requests.append((self.path, self.headers["authorization"]))
             self.send_response(307)
             self.send_header("location", "/elsewhere")
             self.end_headers()
@@ -46,7 +46,7 @@ def test_an_operator_s_token_follows_no_redirection(tmp_path):
         def log_message(self, *_):
             pass
 
-    asked = []
+    requests = []
     write_private(tmp_path / "token", "hunter2")
     with HTTPServer(("127.0.0.1", 0), Elsewhere) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -56,4 +56,4 @@ def test_an_operator_s_token_follows_no_redirection(tmp_path):
             audit("ax-1", source, 1, changes=False, json=True)
         server.shutdown()
         thread.join()
-    assert asked == [("/v1/servos/ax-1/audit?limit=1", "Bearer hunter2")]
+    assert requests == [("/v1/servos/ax-1/audit?limit=1", "Bearer hunter2")]

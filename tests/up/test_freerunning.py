@@ -78,17 +78,17 @@ def test_free_running_is_simulated(tmp_path: Path) -> None:
     simulated = {
         change_before(window.start): estimate.ok for window, estimate in zip(loop.windows, loop.estimates, strict=True)
     }
-    free = {change_before(start): found for start, found in free_running(tmp_path).items()}
+    free = {change_before(start): result for start, result in free_running(tmp_path).items()}
     missed = joined_at(tmp_path)
-    accepted = {change for change, found in free.items() if found["status"] == "ok"}
+    accepted = {change for change, result in free.items() if result["status"] == "ok"}
     common = set(free) & set(simulated)
     assert len(common) >= len(simulated) - 1
     assert accepted & common == {change for change, ok in simulated.items() if ok} & common
     assert len(accepted) >= 15
     gap_at = as_pieces(scenario.gap, DURATION)
-    found = [(free[change], float(gap_at.value(free[change]["time"] + missed))) for change in accepted]
-    assert sum(low <= gap <= high for each, gap in found for low, high in [each["interval"]]) >= len(found) - 2
-    assert max(abs(math.degrees(each["gap"] - gap)) for each, gap in found) < 0.02
+    result = [(free[change], float(gap_at.value(free[change]["time"] + missed))) for change in accepted]
+    assert sum(low <= gap <= high for each, gap in result for low, high in [each["interval"]]) >= len(result) - 2
+    assert max(abs(math.degrees(each["gap"] - gap)) for each, gap in result) < 0.02
 
 
 def free_running(folder: Path) -> dict[float, dict]:

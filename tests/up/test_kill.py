@@ -36,8 +36,8 @@ def check(fleet: Fleet, sufficient: int, killer: Killer, counts: dict[str, int])
     check_kills_cost_little(fleet)
     check_controllers_ticked(fleet)
     applied = check_updates(fleet)
-    seen = {kind: number for kind, number in counts.items() if "/" not in kind}
-    print({"windows": len(witnessed(fleet)), "applied": applied, **killer.kills, **seen})
+    observed = {kind: number for kind, number in counts.items() if "/" not in kind}
+    print({"windows": len(witnessed(fleet)), "applied": applied, **killer.kills, **observed})
     assert applied > 0
 
 

@@ -117,12 +117,12 @@ def test_deployed_is_simulated(
     text = SCENARIO.format(twin=twin, duration=duration, period=period, fine=fine)
     (tmp_path / "scenario.toml").write_text(text)
     scenario = Scenario.load(tmp_path / "scenario.toml")
-    loop, found = cosimulate(scenario), deployed(tmp_path, scenario, twin)
+    loop, result = cosimulate(scenario), deployed(tmp_path, scenario, twin)
     sent = {encode(message.message) for message in loop.messages if message.direction == "up"}
-    assert {encode(window) for window in found.windows} <= sent
-    assert [encode(each) for each in found.receipts] == [encode(each) for each in loop.receipts]
+    assert {encode(window) for window in result.windows} <= sent
+    assert [encode(each) for each in result.receipts] == [encode(each) for each in loop.receipts]
     assert len(loop.updates) >= updates
-    assert dict.fromkeys(encode(each) for each in found.sent if isinstance(each, Update)) == dict.fromkeys(
+    assert dict.fromkeys(encode(each) for each in result.sent if isinstance(each, Update)) == dict.fromkeys(
         encode(decode(encode(update))) for update in loop.updates
     )
     estimates = {key: msgspec.msgpack.decode(body)["estimate"] for key, body in stored(tmp_path, "estimate").items()}

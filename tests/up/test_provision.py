@@ -74,14 +74,14 @@ def test_another_servo_s_folder_is_left_alone(tmp_path):
     assert run("enroll", "ax-7", *options).exit_code == 0
     token = (edge / "token").read_text()
     for more in ((), ("--again",)):
-        found = run("enroll", "ax-8", *options, *more)
-        assert found.exit_code == 2
-        assert "'ax-7'" in found.stderr
+        result = run("enroll", "ax-8", *options, *more)
+        assert result.exit_code == 2
+        assert "'ax-7'" in result.stderr
     assert (edge / "token").read_text() == token
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("stranger", "--url", "https://h"), "has no model"),
         (("ax-1",), "--url"),
@@ -91,13 +91,13 @@ def test_another_servo_s_folder_is_left_alone(tmp_path):
         (("ax 1", "--url", "https://h"), "name 'ax 1'"),
     ],
 )
-def test_a_refused_enrolment_leaves_nothing_behind(tmp_path, monkeypatch, arguments, said):
+def test_a_refused_enrolment_leaves_nothing_behind(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     twin = fresh(tmp_path)
-    found = run("enroll", *arguments, "--twin", twin, "--edge", tmp_path / "edge")
-    assert found.exit_code == 2
-    assert said in found.stderr
-    assert found.stderr.count("\n") == 1
+    result = run("enroll", *arguments, "--twin", twin, "--edge", tmp_path / "edge")
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
     tokens = tmp_path / "tokens.toml"
     assert not tokens.exists() or read_tokens(tokens).servos == {}
     assert not (tmp_path / "edge" / "edge.toml").exists()
@@ -105,9 +105,9 @@ def test_a_refused_enrolment_leaves_nothing_behind(tmp_path, monkeypatch, argume
 
 
 def test_without_a_file_of_tokens_nobody_is_enrolled(tmp_path):
-    found = run("enroll", "ax-1", "--twin", twin_file(tmp_path, tokens=False), "--edge", tmp_path / "edge")
-    assert found.exit_code == 2
-    assert "tokens" in found.stderr
+    result = run("enroll", "ax-1", "--twin", twin_file(tmp_path, tokens=False), "--edge", tmp_path / "edge")
+    assert result.exit_code == 2
+    assert "tokens" in result.stderr
 
 
 def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeypatch):
@@ -119,9 +119,9 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
             assert client.put(place(sent), content=encode(sent), headers=bearer()).status_code == 201
             while client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"]:
                 pass
-        asked = run("audit", "ax-1", "--url", url, "--token", token, "--json")
-        assert asked.exit_code == 0, asked.output
-        told = run("audit", "ax-1", "--url", url, "--token", token)
+        fetched = run("audit", "ax-1", "--url", url, "--token", token, "--json")
+        assert fetched.exit_code == 0, fetched.output
+        printed = run("audit", "ax-1", "--url", url, "--token", token)
         everybody = run("servos", "--url", url, "--token", token)
         refused = run("audit", "ax-1", "--url", url)
         assert refused.exit_code == 2
@@ -133,11 +133,11 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
         none = run("audit", "ax-1", "--url", "http://[::1", "--token", token)
         assert (none.exit_code, none.stderr.count("give the URL of a twin")) == (2, 1)
     read = run("audit", "ax-1", "--config", twin, "--json")
-    assert json.loads(read.stdout) == json.loads(asked.stdout)
+    assert json.loads(read.stdout) == json.loads(fetched.stdout)
     [link] = json.loads(read.stdout)
     assert (link["window"]["boot"], link["window"]["sequence"]) == ("b", 0)
     table = run("audit", "ax-1", "--config", twin)
-    assert told.stdout == table.stdout
+    assert printed.stdout == table.stdout
     assert run("servos", "--config", twin).stdout == everybody.stdout
     head, line = everybody.stdout.splitlines()
     assert line.split()[:2] == ["ax-1", "-"]

@@ -54,15 +54,15 @@ def told(process: subprocess.Popen[str], what: str) -> list[str]:
 
 def left_behind(path: Path) -> list[int]:
     """Processes that work in a folder."""
-    found = []
+    result = []
     for entry in Path("/proc").iterdir():
         try:
             command = (entry / "cmdline").read_bytes() if entry.name.isdecimal() else b""
         except OSError:
             continue
         if b"servotwin.runtime.child_process" in command and os.fsencode(path) in command:
-            found.append(int(entry.name))
-    return found
+            result.append(int(entry.name))
+    return result
 
 
 def eventually(holds: Callable[[], bool]) -> bool:

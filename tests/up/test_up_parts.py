@@ -77,10 +77,10 @@ def test_processor_time_of_groups_whatever_the_programs_are_called(tmp_path: Pat
     process(tmp_path, 12, 99, 500)
     process(tmp_path, 13, 98, 500)
     (tmp_path / "14").mkdir()
-    found = processor_times({10}, {13}, tmp_path)
-    assert found is not None
-    assert set(found) == {10, 11, 13}
-    assert found[10] / found[11] == pytest.approx(1.5)
+    result = processor_times({10}, {13}, tmp_path)
+    assert result is not None
+    assert set(result) == {10, 11, 13}
+    assert result[10] / result[11] == pytest.approx(1.5)
     assert processor_times({10}, set(), tmp_path / "nowhere") is None
 
 
@@ -194,11 +194,11 @@ def link(boot: str, status: str, gap: float) -> dict[str, Any]:
     """One of the evidence chain, as the twin tells it."""
     estimate = {"gap": gap, "interval": [gap - 0.01, gap + 0.01], "time": 42.0}
     trend = {"mean": [gap, 1e-5, 0.0], "covariance": [0.0, 0.0, 0.0, 0.0, 1e-12, 0.0, 0.0, 0.0, 0.0]}
-    found = [
+    result = [
         {"kind": "estimate", "status": status, "body": {"estimate": estimate}},
         {"kind": "trend", "status": "", "body": trend},
     ]
-    return {"window": {"boot": boot}, "found": found}
+    return {"window": {"boot": boot}, "found": result}
 
 
 def test_the_newest_good_estimate_and_the_newest_status() -> None:
@@ -206,8 +206,8 @@ def test_the_newest_good_estimate_and_the_newest_status() -> None:
     none = {"kind": "estimate", "status": "failed: no", "body": {"failed": "no"}}
     failed = {"window": {"boot": "b2"}, "found": [none]}
     links = [glanced, failed, link("b2", "lower bound", 9.0), link("b1", "ok", 0.2), link("b1", "ok", 0.1)]
-    found = newest_estimate(links)
-    assert found == ServoEstimate(
+    result = newest_estimate(links)
+    assert result == ServoEstimate(
         "b1", 42.0, 0.2, (0.19, 0.21000000000000002), "failed: no", 1e-5, pytest.approx(1.96e-6, rel=1e-3)
     )
     assert newest_estimate([glanced, failed]) is None
@@ -244,13 +244,13 @@ def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
 
 def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_terminal() -> None:
     state = MachineState(time_s=3723.0, gap_deg=9.131, speed=12.0, begun_s=0.0, written=0.0)
-    told = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
+    newest = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
     edge = {
         "version": 7, "fallback": True, "tolerance_m": 3.16e-5, "kp_v_per_m": 1377.7, "ki_v_per_m_s": 18907.6,
         "kd_v_s_per_m": -135.1, "feedforward_v": -0.05, "up": {"windows": 41, "trouble": ""}, "down": {"trouble": ""},
         "windows": {"waiting": 3, "dropped": {"withheld": 2, "outbox full": 1}},
     }  # fmt: skip
-    view = ServoStatus(SERVOS[2], state, edge, EstimateError(told, 9.0003, 58.0), 47, 4.2, 2)
+    view = ServoStatus(SERVOS[2], state, edge, EstimateError(newest, 9.0003, 58.0), 47, 4.2, 2)
     shown = picture(view, TwinStatus(5, 0.1, {"windows": 121, "refused": 0}))
     text = text_of(shown)
     for expected in (
@@ -265,11 +265,11 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
 
 
 def test_a_truth_outside_of_the_interval_is_marked() -> None:
-    told = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
-    assert isnan(told.rate)
-    assert EstimateError(told, 9.03, 1.0).inside
-    assert EstimateError(told, 9.05, 1.0).inside is False
-    assert EstimateError(told, None, None).inside is None
+    newest = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok")
+    assert isnan(newest.rate)
+    assert EstimateError(newest, 9.03, 1.0).inside
+    assert EstimateError(newest, 9.05, 1.0).inside is False
+    assert EstimateError(newest, None, None).inside is None
 
 
 def test_files_of_a_machine_belong_to_one_that_runs_on(tmp_path: Path) -> None:
