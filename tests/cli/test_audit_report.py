@@ -1,4 +1,4 @@
-"""The evidence chain as people read it."""
+"""The evidence chain as text."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""`servotwin demo`: the twin wins back what the servo alone loses, and the report says so."""
+"""`servotwin demo`: the twin settles the steps that the servo alone does not, and the report shows it."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""`servotwin identify`: a log in, the gap and its trend out; one sentence for every log that is none."""
+"""`servotwin identify`: the gap and its trend from a log; one sentence for every invalid log."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""`servotwin limit-cycle`: what it prints, what it refuses."""
+"""`servotwin limit-cycle`: its output and its errors."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""`servotwin simulate`: the same numbers in every format, units in the names, metadata, nothing half written."""
+"""`servotwin simulate`: the same numbers in every format, units in the names, metadata, no partly written file."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""`servotwin replay` on the store of a real twin: the same bit for bit, or what differs, window by window."""
+"""`servotwin replay` on the store of a real twin: the same bit for bit, or the differences, window by window."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""``pip install servotwin`` without extras simulates, estimates and redesigns; what is missing is one sentence."""
+"""``pip install servotwin`` without extras simulates, estimates and redesigns; a missing package is one sentence."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Settings declared once: what is read, checked, written and said follows from the declaration."""
+"""Settings declared once: reader, check, writer, messages and docstring follow from the declaration."""
 
 from dataclasses import dataclass, field
 from math import inf, pi

@@ -32,7 +32,7 @@ filter_time_s = 0.1
 
 
 def ended(folder: Path, *arguments: str) -> str:
-    """What a process that refuses its file says."""
+    """Sentence of a process that refuses its file."""
     environment = {key: value for key, value in os.environ.items() if key != "SERVOTWIN_STORE_PASSWORD"}
     done = subprocess.run(
         [sys.executable, "-m", *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=120,

@@ -1,4 +1,4 @@
-"""What crosses the link: round trips, quantisation, and that nothing but InvalidMessage comes out of bad bytes."""
+"""Messages of the link: round trips, quantisation, and nothing but InvalidMessage for invalid bytes."""
 
 import json
 import math

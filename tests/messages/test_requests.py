@@ -1,4 +1,4 @@
-"""Requests and answers as bytes: round trips, and what is refused."""
+"""Requests and answers as bytes: round trips and refusals."""
 
 import math
 from typing import Any

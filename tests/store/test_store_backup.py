@@ -1,4 +1,4 @@
-"""Backup, restore and retention: what is kept stays whole, and nothing is written over."""
+"""Backup, restore and retention: stored data stays whole, and nothing is overwritten."""
 
 import os
 import shutil

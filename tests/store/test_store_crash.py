@@ -1,4 +1,4 @@
-"""Processes on one store, killed with SIGKILL in the middle of it: what was acknowledged is there, nothing is twice."""
+"""Processes on one store, killed with SIGKILL at any time: acknowledged writes are stored, and stored once."""
 
 import os
 import signal
@@ -53,7 +53,7 @@ def lines(started: subprocess.Popen[str], number: int) -> list[list[str]]:
 
 
 def rest(started: subprocess.Popen[str]) -> list[list[str]]:
-    """What it still said before it was killed; a line that was cut off says nothing."""
+    """Remaining lines of a killed process, without a last one that was cut off."""
     return [line.split() for line in started.stdout if line.endswith("\n")]
 
 

@@ -1,4 +1,4 @@
-"""What surrounds the tables: addresses, migrations, passwords that are not public_address."""
+"""Around the tables: addresses, migrations, and passwords that are never shown."""
 
 import os
 import random

@@ -1,4 +1,4 @@
-"""Group commit: few transactions, answers only when they are safe, and no failure that it does not survive."""
+"""Group commit: few transactions, results only once they are safe, and recovery from every failure."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""The store against a dict: whatever order messages, claims, lapses of leases, outcomes and restarts come in."""
+"""The store against a model in a dict, for any order of messages, leases, expiries, results and restarts."""
 
 import shutil
 import tempfile
@@ -27,7 +27,7 @@ texts = st.sampled_from([b"x", b"y"])
 
 @dataclass
 class Model:
-    """What a servo should look like."""
+    """Expected state of a servo."""
 
     state: bytes = b""
     serial: int = 0

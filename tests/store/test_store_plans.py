@@ -1,4 +1,4 @@
-"""No query walks over what is kept for years: SQLite's own plans of all that a store asks."""
+"""No query scans a table that grows for years: SQLite's own plans of every statement of the store."""
 
 import re
 import sqlite3

@@ -1,4 +1,4 @@
-"""What the store tells: letters to the edges, summaries, windows, and the evidence chain in one query."""
+"""Queries of the store: outgoing messages, summaries, windows, and the evidence chain in one query."""
 
 import sqlalchemy as sa
 from store_cases import NewAddress, bodies_of, claim, letter, outcome, verification, window

@@ -1,4 +1,4 @@
-"""Killing processes of a fleet at random, and what must hold afterwards."""
+"""Random kills of the processes of a fleet, and the invariants that must hold afterwards."""
 
 import itertools
 import os
@@ -29,7 +29,7 @@ def by_boot(result: set[tuple[str, str, int]]) -> dict[tuple[str, str], list[int
 
 
 def complete_windows(first: int, last: int) -> int:
-    """How many windows samples first .. last - 1 hold: each begins with a change of the reference outside another."""
+    """Number of windows in samples first .. last - 1: each begins with a change of the reference outside another."""
     length, number, begin = round(WINDOW_S * RATE), 0, first
     while begin + length <= last:
         number += 1
@@ -92,7 +92,7 @@ class Killer:
 
 
 def is_link(process: int) -> bool:
-    """Whether that number is still the link process's."""
+    """True while that process id is still the link process's."""
     try:
         return b"servotwin.edge_process.link_process" in Path(f"/proc/{process}/cmdline").read_bytes()
     except OSError:

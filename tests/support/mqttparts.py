@@ -49,7 +49,7 @@ class Twin:
         assert self._began.wait(PATIENCE)
 
     def post(self, servo: str, body: bytes) -> None:
-        """What a worker's outcome does."""
+        """Post messages, as a worker's result does."""
         (claim,) = (each for each in self.store.lease("test", 10, 60.0, 0.0) if each.servo == servo)
         done = tuple(message.id for message in claim.messages)
         assert self.store.commit([WorkResult(servo, claim.serial, b"state", None, done, outgoing=(body,))], 0.0) == [

@@ -37,7 +37,7 @@ class Server(NamedTuple):
             connection.execute(statement)
 
     def answers(self) -> bool:
-        """Whether it takes connections."""
+        """True where it accepts connections."""
         try:
             psycopg.connect(self._parameters("postgres")).close()
         except psycopg.OperationalError:

@@ -1,4 +1,4 @@
-"""Programs that tests start: found where Debian puts them, or the test is skipped; in CI as root it fails instead."""
+"""Programs that tests start, from PATH or Debian packages; a missing one skips the test, or fails it in CI as root."""
 
 import os
 import shutil
@@ -10,7 +10,7 @@ PLACES = {"mosquitto": "/usr/sbin", "initdb": "/usr/lib/postgresql/*/bin", "pg_c
 
 
 def find(program: str) -> Path | None:
-    """Where a program is, in PATH or where its Debian package puts it."""
+    """Path of a program, from PATH or of its Debian package; None: it is missing."""
     known = shutil.which(program)
     if known is not None:
         return Path(known)
@@ -19,7 +19,7 @@ def find(program: str) -> Path | None:
 
 
 def needed(program: str) -> Path:
-    """Where a program is; without it the test is skipped, or fails where `tests/packages.sh` must have installed it."""
+    """Path of a program; without it the test is skipped, or fails where `tests/packages.sh` must have installed it."""
     path = find(program)
     if path is None:
         must = bool(os.environ.get("CI")) and os.geteuid() == 0

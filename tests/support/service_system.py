@@ -61,7 +61,7 @@ def bearer(token: str = TOKEN) -> dict[str, str]:
 
 
 def place(result: WindowMessage) -> str:
-    """Where a window is put."""
+    """Path of a window."""
     return f"/v1/servos/{result.servo}/windows/{result.boot}/{result.sequence}"
 
 
@@ -106,5 +106,5 @@ def trusting(certificate: Path) -> ssl.SSLContext:
 
 
 def unpacked(body: bytes) -> object:
-    """What MessagePack holds."""
+    """Decoded MessagePack."""
     return msgspec.msgpack.decode(body)

@@ -1,4 +1,4 @@
-"""Twins as services of their own, for tests."""
+"""Twins as service processes of their own, for tests."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Messages and outcomes for tests of the store; nothing in them has a meaning."""
+"""Messages and work results for tests of the store; their contents have no meaning."""
 
 import hashlib
 import itertools

@@ -1,4 +1,4 @@
-"""The dispatcher beside a store, a pool and a commit that do as they are told: who is blamed, and who is given back."""
+"""The dispatcher with a scripted store, pool and commit: failures are counted and leases released."""
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence

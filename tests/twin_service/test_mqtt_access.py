@@ -1,4 +1,4 @@
-"""The link over MQTT: who may connect, how, and what the guide and the files say of it."""
+"""The link over MQTT: access control, TLS, and the files of the guide."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""The twin's HTTP API: what is taken, what is refused and how, and that nothing is acknowledged that is not kept."""
+"""The twin's HTTP API: accepted requests, refused requests, and no acknowledgement without a commit."""
 
 import asyncio
 import threading

@@ -1,4 +1,4 @@
-"""Work on what came: once, whatever becomes of workers; shared by processes; proofs at their rate."""
+"""Messages are processed once, whatever happens to workers; processes share work; verifications keep their rate."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""Anything at all is sent to the service: it answers, in its own form, and never with an error of its own."""
+"""Random requests to the service: it always responds in the form of its API, and never with an internal error."""
 
 import asyncio
 import zlib

@@ -1,4 +1,4 @@
-"""Parts of the service by themselves: future, limits, metrics, logs, polls, tokens, the file."""
+"""Parts of the service: limits, metrics, logs, long polls, tokens and its file."""
 
 import asyncio
 import io

@@ -46,7 +46,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups
 
 
 def until(condition, seconds=PATIENCE):
-    """What a condition gives once it gives something."""
+    """Wait for a condition; returns its first true value."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if result := condition():

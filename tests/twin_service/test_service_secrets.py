@@ -1,4 +1,4 @@
-"""What is secret stays where it belongs: in the service, and with whom it was meant for."""
+"""Secrets stay within the service and with those for whom they are meant."""
 
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer

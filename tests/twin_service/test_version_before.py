@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def command(folder: Path, *words: str) -> str:
-    """What a command prints of the old store."""
+    """Output of a command on the old store."""
     result = CliRunner().invoke(cli.app, [*words, "quick", "--config", str(folder / "twin.toml")])
     assert result.exit_code == 0, result.output
     return result.stdout

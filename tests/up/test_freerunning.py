@@ -1,4 +1,4 @@
-"""Deployed and left to itself, in its own time, the loop finds what the co-simulation finds."""
+"""Deployed and free-running, in its own time, the loop gives the estimates of the co-simulation."""
 
 import json
 import math
@@ -135,7 +135,7 @@ def reached(folder: Path) -> int:
 
 
 def settled(folder: Path) -> bool:
-    """Whether all messages were worked on."""
+    """True once all messages are processed."""
     return ask(folder, "select count(*) from messages where done is null") == [(0,)]
 
 

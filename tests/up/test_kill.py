@@ -1,4 +1,4 @@
-"""Everything is killed at random, again and again, over a bad network; then the disks are asked what became of it."""
+"""Processes are killed at random, again and again, over a bad network; then the disks are checked."""
 
 from pathlib import Path
 

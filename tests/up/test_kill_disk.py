@@ -1,4 +1,4 @@
-"""Disks that are full or read-only under running processes: what was promised is kept, and the controller ticks on."""
+"""Full and read-only disks under running processes: no acknowledged window is lost, the controller keeps running."""
 
 import time
 from collections import Counter

@@ -1,4 +1,4 @@
-"""The parts of `servotwin up`: how fast, how much of the processor, which outages, and what is shown of it."""
+"""Parts of `servotwin up`: speed, share of the processor, outages and display."""
 
 import socket
 from dataclasses import replace
