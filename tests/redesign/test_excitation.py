@@ -96,7 +96,7 @@ def test_probes_keep_their_distance() -> None:
     times = [each.time for each, ask in zip(seen, asks(ALLOWED, seen), strict=True) if ask]
     assert times == [10.0, 70.0, 130.0, 190.0]
     why = run(ALLOWED, seen)[4].reason
-    assert why.endswith("the last probing move was asked for 30 s ago, where 60 s must lie between two")
+    assert why.endswith("the last probing move was requested 30 s ago, and 60 s must lie between two")
 
 
 @pytest.mark.parametrize("change", [{"upper": math.inf}, {"slack": math.nan}])
