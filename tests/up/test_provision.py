@@ -141,7 +141,7 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
     assert run("servos", "--config", twin).stdout == everybody.stdout
     head, line = everybody.stdout.splitlines()
     assert line.split()[:2] == ["ax-1", "-"]
-    assert line.index("2") == head.index("last heard")
+    assert line.index("2") == head.index("last message")
     assert [each["servo"] for each in json.loads(run("servos", "--config", twin, "--json").stdout)] == ["ax-1"]
     assert "boot b\n" in table.stdout
     line = r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d +0 .*(unidentifiable|mismatch|bound): .*\S$"
