@@ -89,12 +89,12 @@ def write_log(table: SignalTable, path: Path) -> None:
 
 
 def _whole(path: Path, columns: LogColumns) -> Window:
-    found = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
-    for name, place in (("position_m", found["position"]), (TIME, TIME if TIME in columns.values else None)):
+    chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
+    for name, place in (("position_m", chosen["position"]), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
             hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)
             raise InvalidInput(f"log {path}: column {name!r} is missing{hint}; it has {known or 'none'}")
-    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in found.items() if name is not None}
+    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in chosen.items() if name is not None}
     return Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
 
 

@@ -123,30 +123,30 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
     rules, model = settings.rules, settings.model
     leads = leads_at_rest(cut.signals["theta_m"], cut.signals["position"], model.rate, model.static_gain, _still(rules))
     state = _rested(_updated(state, cut, rules), leads)
-    found = _read(state, cut, settings)
-    if found is None:
+    estimate = _read(state, cut, settings)
+    if estimate is None:
         return _without_score(state, cut, settings)
-    seen = add_window(state.chart, found.gap, found.std, rules)
-    far = abs(found.gap - state.chart.anchor) > rules.outlier
-    news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
-    state = structs.replace(_after_score(state, cut, found, rules), chart=seen.chart)
+    charted = add_window(state.chart, estimate.gap, estimate.std, rules)
+    far = abs(estimate.gap - state.chart.anchor) > rules.outlier
+    news = SCORE if charted.sudden else CUSUM if charted.slow else LOST_MOTION if _lost(state, rules) else ""
+    state = structs.replace(_after_score(state, cut, estimate, rules), chart=charted.chart)
     reason = _reason(state, cut, settings, news)
     if news:
         state = structs.replace(state, unconditional=rules.confirm if far else 0)
     elif state.unconditional and reason:
         state = structs.replace(state, unconditional=state.unconditional - 1)
-    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, found, seen.change, _range(state))
+    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, estimate, charted.change, _range(state))
 
 
-def _after_score(state: NoveltyState, cut: Cut, found: Score, rules: NoveltyRules) -> NoveltyState:
+def _after_score(state: NoveltyState, cut: Cut, estimate: Score, rules: NoveltyRules) -> NoveltyState:
     """Update all but the chart with a window's score."""
     return structs.replace(
         state,
-        gap=max(0.0, found.gap),
+        gap=max(0.0, estimate.gap),
         uninformative=0,
         recent=(*state.recent, cut.sequence)[-_RECENT:],
-        offset=_carried(state.offset, found.offset, rules),
-        noise=found.noise,
+        offset=_carried(state.offset, estimate.offset, rules),
+        noise=estimate.noise,
     )
 
 

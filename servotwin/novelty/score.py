@@ -140,9 +140,9 @@ def score(
         return None
     window, best = _Window.prepared(angle, load, model, offset), None
     for start in _STARTS:
-        found = window.converged(_Place(max(gap, 0.0), start))
-        if found is not None and (best is None or found.noise < best.noise):
-            best = found
+        candidate = window.converged(_Place(max(gap, 0.0), start))
+        if candidate is not None and (best is None or candidate.noise < best.noise):
+            best = candidate
         if best is not None and best.noise <= _USUAL * usual:
             break
     return best
@@ -205,23 +205,23 @@ class _Window:
                 return None
             moved = place
             while place.near(moved) and fits <= _WHITENED_FITS:
-                found = columns.fitted(noise)
-                noise = burg(found.left[None], min(_ORDER, found.left.size // 8)).at_least(self.floor)
-                moved, fits = found.moved(place), fits + 1
+                fit = columns.fitted(noise)
+                noise = burg(fit.left[None], min(_ORDER, fit.left.size // 8)).at_least(self.floor)
+                moved, fits = fit.moved(place), fits + 1
             if place.near(moved):
-                return columns.score(found)
+                return columns.score(fit)
             place, fits = moved, min(fits, _WHITENED_FITS)
         return None
 
     def columns(self, place: _Place) -> _Columns | None:
         """Linearise at a place; None where the screw was not pushed, or one way only and the offset is not known."""
-        seen = contacts(self.theta_m, Gap(place.gap, place.screw))
-        pushes = int(np.count_nonzero(np.diff(seen[BY_GAP], prepend=0.0)))
+        followed = contacts(self.theta_m, Gap(place.gap, place.screw))
+        pushes = int(np.count_nonzero(np.diff(followed[BY_GAP], prepend=0.0)))
         if pushes < (2 if self.level is None else 1):
             return None
-        screw = seen[SCREW]
+        screw = followed[SCREW]
         # From zero at the first sample on; a constant and the free motions account for the rest.
-        signals = np.vstack([screw - screw[0], seen[BY_START] - 1.0, seen[BY_GAP]])
+        signals = np.vstack([screw - screw[0], followed[BY_START] - 1.0, followed[BY_GAP]])
         load, by_start, by_gap = self.reduce.rows(self.response.respond(signals))
         late = np.gradient(load)
         by_place, by_gap = 0.5 * place.gap * by_start, by_gap + 0.5 * place.place * by_start
@@ -232,10 +232,10 @@ class _Window:
 
 
 class _Fit(NamedTuple):
-    """Least squares, whether the place was held, the residual (m,) m, and its standard deviation when white."""
+    """Least squares, whether the place was fixed, the residual (m,) m, and its standard deviation when white."""
 
     solved: LeastSquares
-    held: bool
+    fixed_place: bool
     left: Array
     spread: float
 
@@ -246,7 +246,7 @@ class _Fit(NamedTuple):
 
     def moved(self, place: _Place) -> _Place:
         """Place that the fit leads to."""
-        change = 0.0 if self.held else float(self.solved.coefficients[-2])
+        change = 0.0 if self.fixed_place else float(self.solved.coefficients[-2])
         return _Place(max(0.0, place.gap + self.gap), min(max(place.place + change, -1.0), 1.0))
 
 
@@ -260,18 +260,18 @@ class _Columns(NamedTuple):
     travel: tuple[float, float]
 
     def fitted(self, noise: Autoregression | None) -> _Fit:
-        """Fit in white noise, or in that of an autoregression; a place that would leave the gap is held at its end."""
+        """Fit in white noise, or in that of an autoregression; a place that would leave the gap stays at its end."""
         table = np.vstack([self.residual, self.rows])
         white = self.with_level(table if noise is None else noise.whiten(table), plain=noise is None)
-        found = self._solved(white, held=False)
-        beyond = abs(self.place.place) == 1.0 and found.solved.coefficients[-2] * self.place.place > 0.0
-        return self._solved(np.delete(white, -2, axis=0), held=True) if beyond else found
+        fit = self._solved(white, fixed=False)
+        beyond = abs(self.place.place) == 1.0 and fit.solved.coefficients[-2] * self.place.place > 0.0
+        return self._solved(np.delete(white, -2, axis=0), fixed=True) if beyond else fit
 
-    def _solved(self, white: Array, held: bool) -> _Fit:
+    def _solved(self, white: Array, fixed: bool) -> _Fit:
         solved = independent_least_squares(white[1:], white[0])
         rest = white[0] - solved.coefficients @ white[1:]
-        left = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if held else self.rows)
-        return _Fit(solved, held, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
+        left = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if fixed else self.rows)
+        return _Fit(solved, fixed, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
 
     def with_level(self, white: Array, plain: bool) -> Array:
         """Append what is known of the offset to the whitened table as one more sample."""
@@ -289,22 +289,22 @@ class _Columns(NamedTuple):
         gain = self.window.model.static_gain
         return -0.5 * gain * self.place.gap, -0.5 * gain * self.place.place
 
-    def score(self, found: _Fit) -> Score | None:
+    def score(self, fit: _Fit) -> Score | None:
         """Turn the last fit into an estimate; None: it shows nothing."""
-        solved, gain = found.solved, self.window.model.static_gain
+        solved, gain = fit.solved, self.window.model.static_gain
         of_gap, of_level = np.zeros(solved.coefficients.size), np.zeros(solved.coefficients.size)
         of_gap[-1] = of_level[0] = 1.0
         by_place, of_level[-1] = self.by_level
-        if not found.held:
+        if not fit.fixed_place:
             of_level[-2] = by_place
-        std = found.spread * solved.deviation(of_gap)
-        if not isfinite(std + found.gap):
+        std = fit.spread * solved.deviation(of_gap)
+        if not isfinite(std + fit.gap):
             return None
         level = float(of_level @ solved.coefficients) - gain * self.place.screw
-        offset_std = found.spread * solved.deviation(of_level) / abs(gain)
+        offset_std = fit.spread * solved.deviation(of_level) / abs(gain)
         offset = EncoderOffset((level + self.window.origin) / gain, offset_std)
-        noise = sqrt(float(found.left @ found.left) / found.left.size)
-        return Score(self.place.gap + found.gap, std, offset, self.travel, noise)
+        noise = sqrt(float(fit.left @ fit.left) / fit.left.size)
+        return Score(self.place.gap + fit.gap, std, offset, self.travel, noise)
 
 
 def leads_at_rest(
@@ -328,12 +328,12 @@ def leads_at_rest(
     """
     angles, loads = np.asarray(theta_m, dtype=np.float64), np.asarray(position, dtype=np.float64)
     size = max(_PARTS, round(_BLOCK_S * rate))
-    part, found = size // _PARTS, []
+    part, leads = size // _PARTS, []
     for first in range(0, angles.size - size + 1, size):
         angle = angles[first : first + size]
         if float(np.ptp(angle)) >= still:
             continue
         means = loads[first : first + part * _PARTS].reshape(_PARTS, part).mean(axis=1) / static_gain
         if float(np.ptp(means)) < still:
-            found.append(float(angle.mean() - means.mean()))
-    return found
+            leads.append(float(angle.mean() - means.mean()))
+    return leads

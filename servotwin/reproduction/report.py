@@ -160,7 +160,7 @@ def _format(value: Value | None) -> str:
 
 def _figures(drawn: Sequence[DrawnFigure], preset: str) -> Iterator[str]:
     yield '<h2 id="figures">Figures</h2>'
-    yield f"<p>DrawnFigure with the preset <code>{escape(preset)}</code>.</p>"
+    yield f"<p>The figures are drawn with the preset <code>{escape(preset)}</code>.</p>"
     yield from map(_figure, drawn)
 
 

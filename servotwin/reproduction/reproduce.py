@@ -184,7 +184,7 @@ def _sorted(outcomes: Iterable[TaskResult], selection: Selection) -> tuple[list[
     """Figures and results in the paper's order, figures of ours last."""
     outcomes = list(outcomes)
     by_name = {one.name: one for one in outcomes if isinstance(one, DrawnFigure)}
-    by_key = {(r.claim.id, r.preset): r for found in outcomes if isinstance(found, tuple) for r in found}
+    by_key = {(r.claim.id, r.preset): r for results in outcomes if isinstance(results, tuple) for r in results}
     drawn = [by_name[name] for name in selection.figures]
     return drawn, [by_key[claim.id, preset] for claim in selection.claims for preset in PRESETS]
 

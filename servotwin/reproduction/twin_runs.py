@@ -228,10 +228,10 @@ def _window_bytes(loop: Loop) -> tuple[int, ...]:
 def setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
     """List every setting that was in force, in order; an update without gains leaves those in force before it."""
     start = loop.scenario.start
-    found = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
+    changes = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
     for begin, origin, tolerance, gains in sorted(_later_settings(loop), key=lambda change: change[0]):
-        found.append(SettingChange(begin, origin, tolerance, gains or found[-1].gains))
-    return tuple(found)
+        changes.append(SettingChange(begin, origin, tolerance, gains or changes[-1].gains))
+    return tuple(changes)
 
 
 def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, messages.Gains | None]]:

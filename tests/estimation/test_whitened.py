@@ -385,7 +385,7 @@ def evidence(case: WindowCase) -> FitEvidence:
     """Evidence of a clean fit with a spread of 0.01 deg, against which nothing speaks."""
     fitted = fit(measured(case), case.servo, None, WhitenedSettings())
     assert fitted.aligned is not None
-    gap, std = fitted.aligned.found.point.gap, math.radians(0.01)
+    gap, std = fitted.aligned.whitened.point.gap, math.radians(0.01)
     return FitEvidence(
         aligned=fitted.aligned,
         std=std,
@@ -404,7 +404,7 @@ def test_another_view_counts_from_three_standard_deviations_on(view: str, deviat
     """Noise moves every view of a window; only what it cannot explain is held against the model."""
     seen, given = evidence(clean()[1]), WhitenedSettings()
     std = math.radians(0.1)
-    most = 1.05 * seen.aligned.found.point.gap + given.contact_travel
+    most = 1.05 * seen.aligned.whitened.point.gap + given.contact_travel
     seen = {
         "free model": replace(seen, shift=ModelShift(deviations * std, std, "a stiffness off", 0.0)),
         "observer form": replace(seen, observer=(-deviations * std, std)),

@@ -172,12 +172,12 @@ def off_the_plain(misfit: Misfit, fit: SearchResult, largest: float, tolerance: 
 
 def _edges(theta_m: Array, point: Point) -> list[Point]:
     """Points a little beyond the edge of the plain on which `point` lies."""
-    seen = contacts(theta_m, point.screw(0.0))
-    touched = np.flatnonzero(seen[BY_START] == 0.0)
+    screw = contacts(theta_m, point.screw(0.0))
+    touched = np.flatnonzero(screw[BY_START] == 0.0)
     if not touched.size:
         return []
     first = int(touched[0])
-    side = 1.0 if seen[BY_GAP, first] < 0.0 else -1.0
+    side = 1.0 if screw[BY_GAP, first] < 0.0 else -1.0
     way = 0.5 * point.gap * (1.0 + side * point.place)
     edge = way - float(np.min(side * theta_m[: first + 1]))
     gaps = [(1.0 - share) * edge for share in _BEYOND]

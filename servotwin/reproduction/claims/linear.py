@@ -58,12 +58,12 @@ def loop_filter(runs: Runs) -> Finding:
     controller = with_loop_filter(runs.servo)
     margins = runs.servo.margins(controller)
     smallest = smallest_margin_deg(margins)
-    kept = margins.stable and smallest >= MARGIN_DEG
+    reproduced = margins.stable and smallest >= MARGIN_DEG
     state = "stable" if margins.stable else "unstable"
     why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {MARGIN_DEG:g} deg asked for"
     before = smallest_margin_deg(runs.servo.margins())
     values = (("phase margin with the filter", smallest, "deg"), ("without", before, "deg"), ("stable", margins.stable))
-    return decided(kept, why, *values)
+    return decided(reproduced, why, *values)
 
 
 @measures("pidtune")
@@ -173,11 +173,11 @@ def two_resonances(runs: Runs) -> Finding:
     """Local maxima of the closed loop above 1."""
     omega = np.geomspace(0.1, 1000.0, 20001)
     magnitude = np.abs(runs.servo.closed_loop().response(omega))
-    found = [int(i) for i in measure.peaks(magnitude) if magnitude[i] > 1.0]
-    where = " and ".join(f"{omega[i]:.3g} rad/s (gain {magnitude[i]:.3g})" for i in found)
-    values = [(f"resonance {n + 1}", float(omega[i]), "rad/s") for n, i in enumerate(found)]
-    gains = [(f"its gain {n + 1}", float(magnitude[i])) for n, i in enumerate(found)]
-    return decided(len(found) == 2, f"maxima above 1 lie at {where or 'no frequency'}", *values, *gains)
+    maxima = [int(i) for i in measure.peaks(magnitude) if magnitude[i] > 1.0]
+    where = " and ".join(f"{omega[i]:.3g} rad/s (gain {magnitude[i]:.3g})" for i in maxima)
+    values = [(f"resonance {n + 1}", float(omega[i]), "rad/s") for n, i in enumerate(maxima)]
+    gains = [(f"its gain {n + 1}", float(magnitude[i])) for n, i in enumerate(maxima)]
+    return decided(len(maxima) == 2, f"maxima above 1 lie at {where or 'no frequency'}", *values, *gains)
 
 
 @measures("overshoot")

@@ -33,18 +33,20 @@ def family(runs: Runs, square: Square, exact: bool = False) -> Family:
 @measures_both("always-restabilised")
 def restabilised(runs: Runs, square: Square) -> Finding:
     """Every step of every run settles."""
-    found, sampled = family(runs, square), fig15(runs, square, SAMPLED).trace.steps
-    moving = _unsettled_counts(found)
+    runs_steps, sampled = family(runs, square), fig15(runs, square, SAMPLED).trace.steps
+    moving = _unsettled_counts(runs_steps)
     shown = ", ".join(f"{step} in {count}" for step, count in moving.items())
     why = (
-        f"of {len(found)} runs, whose reference amplitudes differ by 0.1 %, these steps still move after 20 s:"
+        f"of {len(runs_steps)} runs, whose reference amplitudes differ by 0.1 %, these steps still move after 20 s:"
         f" {shown or 'none'}; in one sampled at 5 kHz {_settled_counts([sampled])[0]} of 10 steps settle"
     )
     values = [
-        (f"step {step} not settled, share of the runs", 100.0 * n / len(found), "%") for step, n in moving.items()
+        (f"step {step} not settled, share of the runs", 100.0 * n / len(runs_steps), "%") for step, n in moving.items()
     ]
-    worst = max(step.amplitude for steps in found for step in steps)
-    return decided(not moving, why, *_mean_settled("twin", found), *values, ("largest amplitude", worst * MM, "mm"))
+    worst = max(step.amplitude for steps in runs_steps for step in steps)
+    return decided(
+        not moving, why, *_mean_settled("twin", runs_steps), *values, ("largest amplitude", worst * MM, "mm")
+    )
 
 
 @measures_both("wider-range-than-fixed")
@@ -173,7 +175,7 @@ def _seconds(runs: Runs) -> list[float]:
 def unbiased(runs: Runs) -> Finding:
     """The published estimator on noise-free windows, after 0.25 s and after 0.40 s."""
     errors = {settle: runs.get(WindowJob(runs.preset, settle)) for settle in (0.25, 0.30, 0.40)}
-    means = {settle: float(np.mean(list(found.values()))) for settle, found in errors.items()}
+    means = {settle: float(np.mean(list(by_gap.values()))) for settle, by_gap in errors.items()}
     why = (
         f"its mean error is {means[0.25]:.2g} deg when 0.25 s are left out, {means[0.3]:.2g} deg for 0.30 s and"
         f" {means[0.4]:.2g} deg for 0.40 s: the observer's leftover transient biases it"
@@ -183,21 +185,21 @@ def unbiased(runs: Runs) -> Finding:
     return decided(abs(means[0.25]) < UNBIASED_DEG, why, *values, *each)
 
 
-def _settled_counts(found: Family) -> list[int]:
+def _settled_counts(runs_steps: Family) -> list[int]:
     """Number of settled steps, for each run."""
-    return [sum(step.settled for step in steps) for steps in found]
+    return [sum(step.settled for step in steps) for steps in runs_steps]
 
 
-def _unsettled_counts(found: Family) -> dict[int, int]:
+def _unsettled_counts(runs_steps: Family) -> dict[int, int]:
     """Number of runs in which a step does not settle, by the step's number; steps that always settle left out."""
-    counts = Counter(i for steps in found for i, step in enumerate(steps, start=1) if not step.settled)
+    counts = Counter(i for steps in runs_steps for i, step in enumerate(steps, start=1) if not step.settled)
     return dict(sorted(counts.items()))
 
 
-def _mean_settled(name: str, found: Family) -> list[tuple[str, float, str]]:
-    return [(f"settled steps of 10, {name}", float(np.mean(_settled_counts(found))), "")]
+def _mean_settled(name: str, runs_steps: Family) -> list[tuple[str, float, str]]:
+    return [(f"settled steps of 10, {name}", float(np.mean(_settled_counts(runs_steps))), "")]
 
 
-def _worst_biases(found: Family) -> Array:
+def _worst_biases(runs_steps: Family) -> Array:
     """Largest bias of a step, in % of 1 mm, for each run."""
-    return 100.0 / AMPLITUDE * np.max(np.abs([[step.bias for step in steps] for steps in found]), axis=1)
+    return 100.0 / AMPLITUDE * np.max(np.abs([[step.bias for step in steps] for steps in runs_steps]), axis=1)

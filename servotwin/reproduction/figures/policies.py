@@ -56,7 +56,7 @@ RunsByPolicy = list[tuple[str, TwinRun]]
 
 @dataclass(frozen=True, eq=False)
 class PolicyComparison:
-    """PolicyOutcome of each policy, the servo's own gains, and time (s), reference (m) and gap (rad) of all of them."""
+    """Outcome of each policy, the servo's own gains, and time (s), reference (m) and gap (rad) of all of them."""
 
     outcomes: tuple[PolicyOutcome, ...]
     own: Gains
