@@ -66,13 +66,13 @@ def _against_file(options: Options) -> tuple[Check, ...]:
         return ()
     if options.quick:
         raise InvalidInput("--reference belongs to the full W1; leave out --quick")
-    wear, wanted = options.wear, read_reference(options.reference)
-    every, rest = divmod(wear.samples - 1, wanted.size - 1)
+    wear, expected = options.wear, read_reference(options.reference)
+    every, rest = divmod(wear.samples - 1, expected.size - 1)
     if rest or every == 0:
         raise InvalidInput(
-            f"reference {options.reference}: q3 has {wanted.size} samples, which do not lie on W1's {wear.samples}"
+            f"reference {options.reference}: q3 has {expected.size} samples, which do not lie on W1's {wear.samples}"
         )
-    return (Check("to reference", MILLIMETRE, lambda q: _largest(q[::every] - wanted)),)
+    return (Check("to reference", MILLIMETRE, lambda q: _largest(q[::every] - expected)),)
 
 
 def read_reference(path: Path) -> Array:
@@ -85,12 +85,12 @@ def read_reference(path: Path) -> Array:
     """
     try:
         with np.load(path) as file:
-            wanted = np.asarray(file["q3"], dtype=float)
+            expected = np.asarray(file["q3"], dtype=float)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise InvalidInput(f"reference {path}: is not an npz file with positions q3 in m") from None
-    if wanted.ndim != 1 or wanted.size < 2:
-        raise InvalidInput(f"reference {path}: q3 has shape {wanted.shape}; it must be (n,) with n of at least 2")
-    return wanted
+    if expected.ndim != 1 or expected.size < 2:
+        raise InvalidInput(f"reference {path}: q3 has shape {expected.shape}; it must be (n,) with n of at least 2")
+    return expected
 
 
 def w2(options: Options) -> Workload:
@@ -159,7 +159,7 @@ def decision(options: Options) -> Workload:
         "decision",
         f"settings verified on {size} each",
         decisions.decisions(options.quick),
-        (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
+        (Check("not settled", "%", lambda result: 100.0 * (1.0 - float(result[0]))),),
         lambda _: "",
     )
 
@@ -188,8 +188,8 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
             hint = did_you_mean(name, (*WORKLOADS, *ALONE))
             known_ones = f"{', '.join(WORKLOADS)}, or {' or '.join(ALONE)} alone"
             raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {known_ones}")
-    wanted = {known[name.lower()] for name in names} or set(WORKLOADS)
-    return tuple(name for name in WORKLOADS if name in wanted)
+    selected = {known[name.lower()] for name in names} or set(WORKLOADS)
+    return tuple(name for name in WORKLOADS if name in selected)
 
 
 def _largest(difference: Array) -> float:

@@ -59,8 +59,8 @@ def endurance(
         # A process whose caches have grown is replaced by another; its jobs are not lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         running = track(shared(endured, tasks), "enduring", len(tasks), console=console, transient=True)
-        found = dict(running)
-    outcomes = tuple(found[task] for task in tasks)
+        result = dict(running)
+    outcomes = tuple(result[task] for task in tasks)
     console.print(shown(outcomes))
     console.print(verdict(outcomes), highlight=False)
     report.write(output, dumps(outcomes, date), console)

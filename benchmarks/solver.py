@@ -72,13 +72,13 @@ class SwitchedLoop:
         """Positive as long as the mode holds: first the dead zone's, then the gap's."""
         sign = 1.0 if self.on else -1.0
         reference, row, tolerance = self.reference, self.model.position, self.workload.tolerance
-        found: list[Guard] = [lambda _, x: sign * (abs(reference - float(row @ x[CHAIN:])) - tolerance)]
+        guards: list[Guard] = [lambda _, x: sign * (abs(reference - float(row @ x[CHAIN:])) - tolerance)]
         if self.contact:
-            found.append(lambda t, x: self.contact * x[SPEED] - self.half_gap_rate(t))
-            return found
-        found.append(lambda t, x: self.half_gap(t) - (x[ANGLE] - self.screw))
-        found.append(lambda t, x: self.half_gap(t) + (x[ANGLE] - self.screw))
-        return found
+            guards.append(lambda t, x: self.contact * x[SPEED] - self.half_gap_rate(t))
+            return guards
+        guards.append(lambda t, x: self.half_gap(t) - (x[ANGLE] - self.screw))
+        guards.append(lambda t, x: self.half_gap(t) + (x[ANGLE] - self.screw))
+        return guards
 
     def switch(self, guard: int) -> None:
         """Enter the next mode."""
@@ -116,7 +116,7 @@ def run(loop: SwitchedLoop, end: float, times: Array, out: Array) -> None:
         if answer.status != 1:
             loop.time, loop.state = end, np.asarray(answer.y[:, -1])
             return
-        guard = next(i for i, found in enumerate(answer.t_events) if len(found))
+        guard = next(i for i, events in enumerate(answer.t_events) if len(events))
         loop.time, loop.state = float(answer.t_events[guard][0]), np.asarray(answer.y_events[guard][0])
         loop.switch(guard)
 

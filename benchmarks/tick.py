@@ -31,7 +31,7 @@ Case = tuple[float, bool, bool]
 
 
 def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, console: Console | None = None) -> None:
-    """Measure every case, show, and write JSON when asked to.
+    """Measure every case, show, and write JSON if `output` is given.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, 
     cases = [(rate, busy, hurried) for hurried in (False, True) for rate in RATES for busy in (False, True)]
     runs = [measured(case, seconds) for case in track(cases, "ticking", console=console, transient=True)]
     console.print(shown(runs))
-    for line in said(runs):
+    for line in summary_lines(runs):
         console.print(line, highlight=False, soft_wrap=True)
     report.write(output, report.text(SCHEMA, date, seconds=seconds, runs=runs), console)
 
@@ -66,8 +66,8 @@ def measured(case: Case, seconds: float) -> dict[str, Any]:
         arguments = [str(rate), str(seconds), str(int(busy)), str(priority), folder]
         command = [sys.executable, "-m", "benchmarks.tickloop", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def shown(runs: Sequence[dict[str, Any]]) -> Table:
@@ -84,7 +84,7 @@ def shown(runs: Sequence[dict[str, Any]]) -> Table:
     return result
 
 
-def said(runs: Sequence[dict[str, Any]]) -> list[str]:
+def summary_lines(runs: Sequence[dict[str, Any]]) -> list[str]:
     """Explain the columns and their limits."""
     slowest = max(runs, key=lambda run: (run["rate_hz"], -run["pack_s"]))
     handling = f"{slowest['pack_s'] * 1e3:.1f} ms to pack and {slowest['put_s'] * 1e3:.1f} ms to put on disk"

@@ -36,9 +36,9 @@ class Delays(NamedTuple):
 def follow(chart: Chart, scores: Array, rules: NoveltyRules) -> Iterator[tuple[Chart, bool]]:
     """The chart after each of some windows (n, 2), and whether it was news."""
     for gap, std in scores.tolist():
-        seen = add_window(chart, gap, std, rules)
-        chart = seen.chart
-        yield chart, seen.sudden or seen.slow
+        result = add_window(chart, gap, std, rules)
+        chart = result.chart
+        yield chart, result.sudden or result.slow
 
 
 def run_length(pool: ScorePool, rules: NoveltyRules, windows: int, rng: np.random.Generator) -> tuple[float, int]:
@@ -52,19 +52,19 @@ def delays(
     before: ScorePool, after: ScorePool, rules: NoveltyRules, trials: int, rng: np.random.Generator, fresh: bool = False
 ) -> Delays:
     """Until a step from one gap to another is seen; `fresh`: the baseline has begun anew with the last window."""
-    found = [_delay(before, after, 0.0, rules, rng, fresh) for _ in range(trials)]
-    return _summary(found)
+    counts = [_delay(before, after, 0.0, rules, rng, fresh) for _ in range(trials)]
+    return _summary(counts)
 
 
 def wearing(pool: ScorePool, rate: float, rules: NoveltyRules, trials: int, rng: np.random.Generator) -> Delays:
     """Until a growth of `rate` (rad per window) is seen."""
-    found = [_delay(pool, pool, rate, rules, rng, fresh=False) for _ in range(trials)]
-    return _summary(found)
+    counts = [_delay(pool, pool, rate, rules, rng, fresh=False) for _ in range(trials)]
+    return _summary(counts)
 
 
-def _summary(found: list[float]) -> Delays:
-    middle, late = (float(np.quantile(found, share, method="higher")) for share in (0.5, 0.9))
-    return Delays(middle, late, float(np.mean(np.array(found) == 1.0)))
+def _summary(counts: list[float]) -> Delays:
+    middle, late = (float(np.quantile(counts, share, method="higher")) for share in (0.5, 0.9))
+    return Delays(middle, late, float(np.mean(np.array(counts) == 1.0)))
 
 
 def _delay(

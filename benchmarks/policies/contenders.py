@@ -39,11 +39,11 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     dead zones for gaps of 10, 30 and 60 deg."""
     policy = CertifiedPolicy(model, known)
     demands = replace(policy.demands, Ms=_NOT_BOUND)
-    own, found = model.controller, {}
+    own, policies = model.controller, {}
     for setting in candidates_of(model, demands, 0.0, disturbed=True, noisy=False):
         law = setting.controller
-        found[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
+        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
     for share in (1.0 / 6.0, 0.5, 1.0):
         width = model.tolerance_for(share * known.gap[1], 1.5)
-        found[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
-    return found
+        policies[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
+    return policies

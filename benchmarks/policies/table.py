@@ -79,8 +79,8 @@ def compare(
 
 def _row(block: str, name: str, those: Sequence[TrialMachine], model: Servo, competitor: Contender) -> PolicyScores:
     tasks = [_Task(place, machine, block, model, competitor) for place, machine in enumerate(those)]
-    found = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
-    return PolicyScores(block, name, Scores(*np.array([scores for _, scores in found]).T), tuple(those))
+    ordered = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
+    return PolicyScores(block, name, Scores(*np.array([scores for _, scores in ordered]).T), tuple(those))
 
 
 def _tried(task: _Task) -> Scores:

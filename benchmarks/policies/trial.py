@@ -93,8 +93,8 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
     for end in UPDATES if competitor.policy is not None else ():
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
-        seen = disturbance(window, model)
-        evidence = Evidence(_estimate(believed), seen, None, setting.setting(), told_for)
+        measured = disturbance(window, model)
+        evidence = Evidence(_estimate(believed), measured, None, setting.setting(), told_for)
         now = _redesigned(competitor, evidence, setting)
         told_for = believed
         if now != setting:

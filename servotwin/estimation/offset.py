@@ -25,8 +25,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 _GAP, _CONSTANT = 0, 1  # rows of the columns
-# A right offset leaves about the same residual as none. Searches that got lost in the offset's narrow valley stated gaps
-# 1 deg off with a small spread; their residual was a hundred times as large.
+# A right offset leaves about the same residual as none. Searches that got lost in its narrow valley stated gaps 1 deg
+# off with a small spread; their residual was a hundred times as large.
 _WORSE = 3.0
 
 

@@ -185,7 +185,7 @@ def test_nan_samples_are_refused_at_the_door():
         Window(position, clean()[0].window.theta_m, sample_rate=RATE)
 
 
-def test_what_the_window_must_bring():
+def test_a_window_without_theta_m_or_too_short_is_refused():
     window = clean()[0].window
     with pytest.raises(InvalidInput, match="no theta_m"):
         estimate_gap(Window(window.position, sample_rate=RATE), SERVO)
@@ -349,7 +349,7 @@ def one_contact():
                 yield measured(case), gap
 
 
-def test_rounding_proves_nothing():
+def test_rounding_carries_no_information():
     """A window that the model explains to 1e-18 m, whatever the gap: how the sum rounds is no evidence."""
     servo = Servo.preset("table1")
     calm, gap = servo.controller.replace(Ki=0.0), math.radians(2.2616)
