@@ -31,12 +31,12 @@ class Options:
 
     @property
     def wear(self) -> WearWorkload:
-        """In full 200 s with 10 reference steps; small 8 s with 4."""
+        """The wearing servo: in full 200 s with 10 reference steps; small 8 s with 4."""
         return WearWorkload(duration=8.0, period=4.0) if self.quick else WearWorkload()
 
     @property
     def sweep(self) -> SweepWorkload:
-        """In full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
+        """The ensemble: in full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
         return SweepWorkload(side=3, duration=1.0) if self.quick else SweepWorkload()
 
 
@@ -44,7 +44,7 @@ Build: TypeAlias = Callable[[Options], Workload]
 
 
 def w1(options: Options) -> Workload:
-    """One long run."""
+    """W1: one long run."""
     wear = options.wear
     slow = (solver.wearing(wear),) if options.slow else ()
     return Workload(
@@ -94,7 +94,7 @@ def read_reference(path: Path) -> Array:
 
 
 def w2(options: Options) -> Workload:
-    """An ensemble of short runs."""
+    """W2: an ensemble of short runs."""
     sweep, threads = options.sweep, cores()
     runs = sweep.side**2
 
@@ -121,7 +121,7 @@ def _sweepers(sweep: SweepWorkload, threads: int) -> tuple[Contestant, ...]:
 
 
 def w3(options: Options) -> Workload:
-    """The gap from windows."""
+    """W3: the gap from windows."""
     wear = options.wear
     return Workload(
         "W3",
@@ -165,7 +165,7 @@ def decision(options: Options) -> Workload:
 
 
 def start(options: Options) -> Workload:
-    """A process's first run."""
+    """The first run of a fresh process."""
     return Workload(
         "start", "a fresh process to the end of its first run of 1 s", startup.starters(options.slow), (), lambda _: ""
     )

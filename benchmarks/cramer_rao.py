@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound of the gap, by code of its own: nothing here is the estimator's.
+"""The Cramer-Rao bound of the gap, by code independent of the estimator.
 
 The structure runs through scipy's lsim, the play operator is differenced numerically, the noise is whitened by the
 Cholesky factor of its covariance.
@@ -115,7 +115,7 @@ def motor_unknowns(servo: Servo, voltage: Array, rate: float, zero_order_hold: b
 
 
 def _scaled(servo: Servo, name: str) -> Servo:
-    """With one of its numbers larger by the step."""
+    """Increase one number of the servo by the step."""
     value = getattr(servo, name)
     larger = tuple((1.0 + _STEP) * one for one in value) if isinstance(value, tuple) else (1.0 + _STEP) * value
     changes: dict[str, Any] = {name: larger}

@@ -68,13 +68,13 @@ def endurance(
 
 
 def endured(task: EnduranceTask) -> HostileOutcome:
-    """One machine with its twin."""
+    """Run one machine with its twin."""
     seed, kind, friction = task
     return hostile.endured(seed, kind, friction=friction)
 
 
 def verdict(outcomes: Sequence[HostileOutcome]) -> str:
-    """One sentence."""
+    """Sum up all outcomes in one sentence."""
     stated = [outcome for outcome in outcomes if not outcome.case.friction]
     band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in stated)
     limit = f"{band.error * 1e3:.3f} mm from {band.settling:g} s after each step on"

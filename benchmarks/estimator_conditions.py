@@ -69,7 +69,7 @@ def coarse_encoder(per_gap: int, seed: int, counts: int = 8192) -> list[Figure]:
 
 
 def wrong_model(per_gap: int, seed: int) -> list[Figure]:
-    """k off by 1 %, c by 20 %, and both: what is accepted, and whether std_total covers it if nothing is refused."""
+    """k off by 1 %, c by 20 %, and both: accepted windows, and coverage of std_total if nothing is refused."""
     rng = np.random.default_rng(seed)
     cases = [on_floor(c, FLOOR, rng) for c in clean_cases(per_gap, seed)]
     figures = []
@@ -110,7 +110,7 @@ def skewed(per_gap: int, seed: int, samples: Sequence[int] = (-5, -2, -1, 1, 3, 
 
 
 def compliant_screw(seed: int, stiffnesses: Sequence[float] = (1e7, 3e6, 1e6, 3e5, 1e5)) -> list[Figure]:
-    """A plant with an elastic screw, a model with a rigid one: the bias if nothing were refused, and what is said."""
+    """A plant with an elastic screw, a model with a rigid one: the bias if nothing were refused, and the statuses."""
     figures = []
     rng = np.random.default_rng(seed)
     for k_d in stiffnesses:

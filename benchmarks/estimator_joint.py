@@ -30,7 +30,7 @@ OFF = {"k": 1.05, "c": 1.2, "p": 1.01}
 
 @dataclass(frozen=True)
 class JointLoop:
-    """Where windows come from, and how long they are (s); each begins `before` (s) ahead of its step."""
+    """Origin and length (s) of windows; each begins `before` (s) ahead of its step."""
 
     name: str
     sampled: bool = False
@@ -91,7 +91,7 @@ def windows(loop: JointLoop, preset: str, runs: int, seed: int, floor: float = F
 
 
 def noise_free(groups: Sequence[Sequence[WindowCase]], loop: JointLoop, preset: str, voltage: bool) -> Figure:
-    """Largest error where only rounding and sampling are left."""
+    """Largest error without noise, from rounding and sampling alone."""
     results = Errors.of(groups, [estimates(group, loop, voltage, together=False) for group in groups])
     name = f"{_words(loop, preset, voltage)}, noise-free: largest error, deg"
     return Figure(name, results.largest, (0.0, LIMITS[voltage]), results.errors.size, f"{results.refused} refused")
@@ -126,7 +126,7 @@ class Errors:
 
     @classmethod
     def of(cls, groups: Sequence[Sequence[WindowCase]], results: Sequence[Sequence[GapEstimate]]) -> Errors:
-        """Of the windows of some groups."""
+        """Collect the errors of some groups of windows."""
         pairs = [pair for each in zip(groups, results, strict=True) for pair in zip(*each, strict=True)]
         known = [(one.gap - case.gap, one.std) for case, one in pairs if one.ok]
         errors, stds = np.degrees(np.array(known).reshape(-1, 2).T)
@@ -134,7 +134,7 @@ class Errors:
 
     @property
     def largest(self) -> float:
-        """Of the sizes, deg; 0 when all are refused."""
+        """Largest absolute error, deg; 0 when all are refused."""
         return float(np.abs(self.errors).max(initial=0.0))
 
     @property
@@ -148,7 +148,7 @@ def _words(loop: JointLoop, preset: str, voltage: bool) -> str:
 
 
 def estimates(group: Sequence[WindowCase], loop: JointLoop, voltage: bool, together: bool) -> tuple[GapEstimate, ...]:
-    """Of the windows of one machine, whose description is wrong."""
+    """Estimate the windows of one machine whose description is wrong."""
     servo, windows = group[0].servo, [case.window for case in group]
     wrong, free = described(servo, OFF), None
     if voltage:
@@ -160,7 +160,7 @@ def estimates(group: Sequence[WindowCase], loop: JointLoop, voltage: bool, toget
 
 
 def described(servo: Servo, factors: Mapping[str, float]) -> Servo:
-    """As a data sheet would have it that is wrong by these factors."""
+    """Servo as a data sheet that is wrong by these factors describes it."""
     changes: dict[str, Any] = {}
     for name, factor in factors.items():
         value = np.multiply(factor, getattr(servo, name)).tolist()

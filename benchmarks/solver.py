@@ -16,7 +16,7 @@ NAME = "scipy LSODA, events"
 RELATIVE, ABSOLUTE = 1e-10, 1e-14
 SPEED, ANGLE, INTEGRAL, LAGGED, CHAIN = 1, 2, 3, 4, 5
 STATES = 9
-BLIND = 1e-8  # s after a restart in which no event is looked for, or the one just left is found again
+BLIND = 1e-8  # s after a restart without a search for events: the event just handled would be detected again
 Guard: TypeAlias = Callable[[float, Array], float]
 
 
@@ -92,7 +92,7 @@ class SwitchedLoop:
 
 
 def run(loop: SwitchedLoop, end: float, times: Array, out: Array) -> None:
-    """Go on to `end`; positions at those of `times` (n,) that are passed."""
+    """Integrate to `end`; return the positions at the `times` (n,) on the way."""
     from scipy.integrate import solve_ivp
 
     while loop.time < end:

@@ -1,4 +1,4 @@
-"""What is sent in the closed loop, and what it costs, where the edge tells which windows are worth sending."""
+"""Windows sent in the closed loop, and the accuracy that is left, where the edge selects the windows to send."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LoopCase(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What one loop sent and how well it did.
+    """Windows that one loop sent, and the accuracy of its twin.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ def accounts(loops: Sequence[tuple[str, float, bool]]) -> Iterator[tuple[LoopCas
 
 
 def account(case: LoopCase) -> Account:
-    """One loop."""
+    """Run one loop and sum it up."""
     return summary(cosimulate(scenario(case)))
 
 
 def scenario(case: LoopCase) -> Scenario:
-    """The packaged one, its wear stretched."""
+    """Vary the packaged scenario: stretch its wear."""
     packaged = Scenario.preset(case.scenario)
     gap = SCurve(0.0, GROWTH, duration=case.seconds) if case.wears else 0.5 * GROWTH
     recording = replace(packaged.recording, novelty=case.rules)
@@ -92,7 +92,7 @@ def scenario(case: LoopCase) -> Scenario:
 
 
 def summary(loop: Loop) -> Account:
-    """What it sent and how well it did."""
+    """Sum up the windows that a loop sent, and the accuracy of its twin."""
     run = loop.run
     every, seldom = (max(1, round(run.sample_rate / rate)) for rate in (_SAMPLES, _KNOWN))
     errors, known = (values - run.gap[::seldom] for values in _knowledge(loop, run.time[::seldom]))
@@ -115,7 +115,7 @@ def summary(loop: Loop) -> Account:
 
 
 def _knowledge(loop: Loop, time: Array) -> tuple[Array, Array]:
-    """(n,) the gap as last estimated, and as the trend predicts it; NaN before the first estimate."""
+    """(n,) gap of the last estimate, and gap that the trend predicts; NaN before the first estimate."""
     estimated, known = np.full((2, time.size), math.nan)
     pairs = [(e, t) for e, t in zip(loop.estimates, loop.trends, strict=True) if e.ok and t is not None]
     ends = [*(estimate.time for estimate, _ in pairs[1:]), math.inf]

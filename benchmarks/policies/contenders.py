@@ -20,7 +20,7 @@ _NOT_BOUND = 100.0
 
 @cache
 def contender(name: str, model: Servo, known: Uncertainty) -> Contender:
-    """A policy by name, with the model and what is stated of it."""
+    """Make a policy by name, with the model and its stated uncertainty."""
     own = Design(model.controller)
     if name == "no dead zone":
         return Contender(None, own)
@@ -35,8 +35,11 @@ def contender(name: str, model: Servo, known: Uncertainty) -> Contender:
 
 
 def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
-    """Constant settings by name: what `certified` chooses from, without its bound on Ms, and the paper's gains with
-    dead zones for gaps of 10, 30 and 60 deg."""
+    """List constant settings by name.
+
+    They are the candidates of `certified`, without its bound on Ms, and the paper's gains with dead zones for gaps of
+    10, 30 and 60 deg.
+    """
     policy = CertifiedPolicy(model, known)
     demands = replace(policy.demands, Ms=_NOT_BOUND)
     own, policies = model.controller, {}

@@ -16,11 +16,11 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
 _ROWS = 20_000  # of a CSV file written at a time
-_METADATA = "metadata"  # name of the last column of a CSV file, whose first row holds them
+_METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
 
 
 class LogColumns(NamedTuple):
-    """Columns that were asked for, as the file holds them; names of all columns; metadata."""
+    """Requested columns as the file holds them; names of all columns; metadata."""
 
     values: Mapping[str, Any]
     names: Sequence[str]
@@ -36,12 +36,12 @@ class SignalTable:
 
 
 class LogFormat(NamedTuple):
-    """One format: how to read the wanted columns of a file, how to write a table, and the library it needs.
+    """One format: its reader, its writer, and the library that it needs.
 
     Attributes
     ----------
     read : callable
-        (path, wanted column names) -> `LogColumns`.
+        (path, requested column names) -> `LogColumns`.
     write : callable
         (table, path) -> None.
     library, extra : str
@@ -65,8 +65,8 @@ class LogFormat(NamedTuple):
 def _read_csv(path: Path, requested: Collection[str]) -> LogColumns:
     """Read a line of names, then numbers.
 
-    Metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is; in
-    files of the version before they stand in a first line that begins with #.
+    The metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is.
+    In files of the previous version they are a first line that begins with #.
     """
     try:
         with path.open(encoding="utf-8-sig") as file:

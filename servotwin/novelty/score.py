@@ -3,7 +3,7 @@
 The motor's angle goes through the play operator at a gap, the screw's angle through the structure. What the position
 has beyond that is regressed on its sensitivity to the gap, db = phi'r / phi'phi. Beside that sensitivity stand columns
 for where the screw began, the encoder's offset, the structure's motion from before the window and a delay between the
-channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than a little, the
+channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than 2 mrad, the
 regression is repeated at the new one.
 
 A window in which the screw is pushed one way only shows the gap if the encoder's offset is known from other windows of
@@ -30,18 +30,18 @@ from servotwin.novelty.settings import NoveltyModel, ResponseMode
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-# Samples that are judged per period of the structure's fastest mode: the load moves no faster, and what the sensor adds
-# above is left out. With 36 the spread is the same and an autoregression of it needs four times the order.
+# Judged samples per period of the structure's fastest mode: the load moves no faster, and noise above is left out. With
+# 36 the spread is the same and an autoregression of it needs four times the order.
 PER_PERIOD = 9.0
 _LINEARISATIONS = 8  # at most
 _WHITENED_FITS = 2  # fits in the noise that the one before has left
 _CLOSE = 2e-3  # rad: nearer than that one more linearisation changes nothing that matters
-_STARTS = 0.0, 0.9, -0.9  # places in the gap that are tried until one leads somewhere
-_USUAL = 1.5  # times the usual residual is no reason to look elsewhere
+_STARTS = 0.0, 0.9, -0.9  # places in the gap, tried in turn until a fit converges with a usual residual
+_USUAL = 1.5  # times the usual residual: up to this, no other start is tried
 _ORDER = 8  # of the autoregression, at most
 _ROUNDING = 1e-13  # of the largest motion
 _PER_COLUMN = 3  # judged samples, at least
-_LARGEST = 1e100  # rad or m: no sensor's; the squares of larger numbers overflow
+_LARGEST = 1e100  # rad or m: no sensor gives more, and the squares of larger numbers overflow
 _BLOCK_S, _PARTS = 0.1, 5  # s of rest that make one lead; parts of it whose means must agree
 
 
@@ -130,7 +130,7 @@ def score(
     offset : EncoderOffset, optional
         Known from other windows; None: the window stands alone.
     usual : float
-        m: residual (rms) that fits usually leave. Where one leaves more, the screw may have begun elsewhere.
+        m, usual residual (rms) of a fit. Where it is larger, the screw may have begun elsewhere.
     """
     angle, load = np.asarray(theta_m, dtype=np.float64), np.asarray(position, dtype=np.float64)
     fewest = _PER_COLUMN * (2 * len(model.modes) + 4)
@@ -166,9 +166,9 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Window made ready: angle and decimated position from their first samples on.
+    """Prepared window: angle and decimated position, counted from their first samples.
 
-    `level` is what is known of the position's constant less the screw's first angle, m; `floor` the rounding, m.
+    `level` is the known constant of the position less the screw's first angle, m; `floor` the rounding, m.
     """
 
     theta_m: Array
@@ -197,7 +197,7 @@ class _Window:
         )
 
     def converged(self, place: _Place) -> Score | None:
-        """Linearise until nothing moves any more, and fit in the noise that the last fit has left."""
+        """Linearise until gap and place converge, and fit in the noise of the last fit's residual."""
         noise, fits = None, 0
         for _ in range(_LINEARISATIONS):
             columns = self.columns(place)
@@ -220,7 +220,7 @@ class _Window:
         if pushes < (2 if self.level is None else 1):
             return None
         screw = followed[SCREW]
-        # From zero at the first sample on; a constant and the free motions account for the rest.
+        # All signals start from zero; the constant and the free motions account for what happened before.
         signals = np.vstack([screw - screw[0], followed[BY_START] - 1.0, followed[BY_GAP]])
         load, by_start, by_gap = self.reduce.rows(self.response.respond(signals))
         late = np.gradient(load)
@@ -245,7 +245,7 @@ class _Fit(NamedTuple):
         return float(self.solved.coefficients[-1])
 
     def moved(self, place: _Place) -> _Place:
-        """Place that the fit leads to."""
+        """Place after the fit's step."""
         change = 0.0 if self.fixed_place else float(self.solved.coefficients[-2])
         return _Place(max(0.0, place.gap + self.gap), min(max(place.place + change, -1.0), 1.0))
 
@@ -274,7 +274,7 @@ class _Columns(NamedTuple):
         return _Fit(solved, fixed, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
 
     def with_level(self, white: Array, plain: bool) -> Array:
-        """Append what is known of the offset to the whitened table as one more sample."""
+        """Append the known offset to the whitened table as one more sample."""
         level = self.window.level
         if level is None:
             return white
@@ -290,7 +290,7 @@ class _Columns(NamedTuple):
         return -0.5 * gain * self.place.gap, -0.5 * gain * self.place.place
 
     def score(self, fit: _Fit) -> Score | None:
-        """Turn the last fit into an estimate; None: it shows nothing."""
+        """Turn the last fit into an estimate; None: it does not show the gap."""
         solved, gain = fit.solved, self.window.model.static_gain
         of_gap, of_level = np.zeros(solved.coefficients.size), np.zeros(solved.coefficients.size)
         of_gap[-1] = of_level[0] = 1.0
@@ -324,7 +324,7 @@ def leads_at_rest(
     static_gain : float
         m/rad.
     still : float
-        rad: what moves by less rests. Of the load the means of fiftieths of a second count.
+        rad: a signal that moves by less is at rest. Of the load, the means of fiftieths of a second count.
     """
     angles, loads = np.asarray(theta_m, dtype=np.float64), np.asarray(position, dtype=np.float64)
     size = max(_PARTS, round(_BLOCK_S * rate))

@@ -136,7 +136,7 @@ def reproduce(
 
 
 def select(only: Sequence[str]) -> Selection:
-    """Figures and claims by name; several names may stand in one text, with commas."""
+    """Select figures and claims by name; a text may hold several names, separated by commas."""
     names = {one.name: one for one in figures.FIGURES}
     listed = {claim.id: claim for claim in claims.claims()}
     requested = [name.strip() for text in only for name in text.split(",") if name.strip()]
@@ -155,7 +155,7 @@ def select(only: Sequence[str]) -> Selection:
 
 
 def planned(selection: Selection, preset: str, directory: Path) -> list[ReproductionTask[TaskResult]]:
-    """Independent tasks, preset by preset and that of the figures last, so that neighbours can share runs."""
+    """Plan independent tasks preset by preset, the figures' preset last, so that neighbours can share runs."""
     groups = [tuple(group) for _, group in groupby(sorted(selection.claims, key=claims.group), key=claims.group)]
     presets = sorted(PRESETS, key=lambda each: each == preset)
     measuring = [ClaimsTask(each, group) for each in presets for group in reversed(groups)]
@@ -170,9 +170,10 @@ def _workers(tasks: Sequence[ReproductionTask[TaskResult]]) -> int:
 
 def _with_progress(tasks: Sequence[ReproductionTask[TaskResult]], workers: int, console: Console) -> list[TaskResult]:
     """Perform all tasks under a progress bar."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     results = []
-    with Progress(*columns, console=console) as progress:
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console
+    ) as progress:
         bar = progress.add_task("reproducing", total=len(tasks))
         for result in perform(tasks, workers):
             results.append(result)
@@ -181,7 +182,7 @@ def _with_progress(tasks: Sequence[ReproductionTask[TaskResult]], workers: int, 
 
 
 def _sorted(outcomes: Iterable[TaskResult], selection: Selection) -> tuple[list[DrawnFigure], list[ClaimResult]]:
-    """Figures and results in the paper's order, figures of ours last."""
+    """Sort figures and results into the paper's order; figures beyond the paper come last."""
     outcomes = list(outcomes)
     by_name = {one.name: one for one in outcomes if isinstance(one, DrawnFigure)}
     by_key = {(r.claim.id, r.preset): r for results in outcomes if isinstance(results, tuple) for r in results}

@@ -21,7 +21,7 @@ PERIOD, DURATION = 40.0, 200.0  # s, section 3.2
 STEP_DURATION = 60.0  # s, of the runs with one step
 END_DEG, STRESS_DEG = 20.0, 30.0  # where the gap's S-curve ends (erratum E15)
 ESTIMATE_DEG = 10.0  # the fixed estimate of Figs 11 and 12
-RATE, KEPT = 5000.0, 500.0  # Hz: simulated and recorded; kept for plots and measures
+RATE, TRACE_RATE = 5000.0, 500.0  # Hz: simulated and recorded; stored for plots and measures
 
 _R = TypeVar("_R", covariant=True)
 
@@ -45,7 +45,7 @@ class Square:
 
     @property
     def family(self) -> tuple[Square, ...]:
-        """Nine squares whose amplitudes differ by 0.1 %: no machine could tell them apart beforehand (erratum E17)."""
+        """Nine squares whose amplitudes differ by 0.1 %, less than any machine is known to (erratum E17)."""
         return tuple(self.scaled(1.0 + 1e-3 * k) for k in range(-4, 5))
 
 
@@ -55,7 +55,7 @@ UNIPOLAR = Square("0/1 mm", AMPLITUDE / 2.0, AMPLITUDE / 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The signals of a run at `KEPT` Hz, each (N,), SI units."""
+    """The signals of a run at `TRACE_RATE` Hz, each (N,), SI units."""
 
     time: Array
     position: Array
@@ -68,8 +68,8 @@ class Trace:
 
     @classmethod
     def of(cls, run: Run) -> Trace:
-        """Every tenth sample of a 5 kHz run."""
-        every = round(run.sample_rate / KEPT)
+        """Decimate a run: every tenth sample at 5 kHz."""
+        every = round(run.sample_rate / TRACE_RATE)
         names = cls.__dataclass_fields__
         return cls(**{name: np.ascontiguousarray(getattr(run, name)[::every]) for name in names})
 

@@ -31,7 +31,7 @@ Progress = Callable[[float], object]
 
 @dataclass(frozen=True, slots=True)
 class EstimateRecord:
-    """One estimate: time of its window's middle (s), total gap, spread and interval (rad), the truth then (rad).
+    """One estimate: time of its window's middle (s), total gap, spread and interval (rad), the true gap then (rad).
 
     `seconds` is the wall time of the estimation. Where the status is not OK, `gap` is the prior or a bound.
     """
@@ -136,7 +136,7 @@ class TwinJob:
         )
 
     def run(self) -> TwinRun:
-        """Co-simulate; keep what figures and claims need."""
+        """Co-simulate; reduce the run to the needs of figures and claims."""
         return run_twin(self.scenario_to_run(), exact=self.exact)
 
 

@@ -62,8 +62,13 @@ def loop_filter(runs: Runs) -> Finding:
     state = "stable" if margins.stable else "unstable"
     why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {MARGIN_DEG:g} deg asked for"
     before = smallest_margin_deg(runs.servo.margins())
-    values = (("phase margin with the filter", smallest, "deg"), ("without", before, "deg"), ("stable", margins.stable))
-    return decided(reproduced, why, *values)
+    return decided(
+        reproduced,
+        why,
+        ("phase margin with the filter", smallest, "deg"),
+        ("without", before, "deg"),
+        ("stable", margins.stable),
+    )
 
 
 @measures("pidtune")
@@ -111,9 +116,14 @@ def pd_bandwidth(runs: Runs) -> Finding:
         f" rad/s {len(stable)} are stable, the best with {best:.3g} deg (Kp = {law.Kp:.5g}, Kd = {law.Kd:.5g},"
         f" Tf = {law.Tf:.3g} s: in effect a lag)"
     )
-    values = (("crossover of the printed PD", first, "rad/s"), ("best margin of a PD at 10 rad/s", best, "deg"))
-    counts = (("filtered PDs tried", len(laws)), ("of them stable", len(stable)))
-    return decided(best < MARGIN_DEG, why, *values, *counts)
+    return decided(
+        best < MARGIN_DEG,
+        why,
+        ("crossover of the printed PD", first, "rad/s"),
+        ("best margin of a PD at 10 rad/s", best, "deg"),
+        ("filtered PDs tried", len(laws)),
+        ("of them stable", len(stable)),
+    )
 
 
 def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller]:

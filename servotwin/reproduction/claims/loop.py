@@ -67,8 +67,13 @@ def settling_lengthened(runs: Runs, square: Square) -> Finding:
         f"the median is {median:.3g} s (longest {max(times):.3g} s) against {linear:.3g} s of the linear loop; updates"
         " take effect 3 s after each step"
     )
-    values = (("median settling time", median, "s"), ("longest", max(times), "s"), ("linear", linear, "s"))
-    return decided(median > linear, why, *values)
+    return decided(
+        median > linear,
+        why,
+        ("median settling time", median, "s"),
+        ("longest", max(times), "s"),
+        ("linear", linear, "s"),
+    )
 
 
 @measures_both("bias-present")
@@ -91,9 +96,14 @@ def bias_under_5_percent(runs: Runs, square: Square) -> Finding:
         f"the worst bias of a run is {low:.2g} to {high:.2g} % of 1 mm, below 5 % in {share:.0f} % of {len(ours)}"
         " runs whose reference amplitudes differ by 0.1 %"
     )
-    values = (("worst bias", high, "%"), ("one run sampled", float(sampled.max()), "%"))
-    known = ("worst with the gap known exactly", float(exact.max()), "%")
-    return decided(high < 5.0, why, ("runs below 5 %", share, "%"), *values, known)
+    return decided(
+        high < 5.0,
+        why,
+        ("runs below 5 %", share, "%"),
+        ("worst bias", high, "%"),
+        ("one run sampled", float(sampled.max()), "%"),
+        ("worst with the gap known exactly", float(exact.max()), "%"),
+    )
 
 
 @measures_both("estimate-good-enough")
@@ -106,8 +116,13 @@ def good_enough(runs: Runs, square: Square) -> Finding:
         f"in the mean {ours:.3g} of 10 steps settle with estimates that are off by up to {error:.2g} deg, and"
         f" {best:.3g} with the true gap sent over the same delays"
     )
-    values = (*_mean_settled("estimates", estimated), *_mean_settled("truth", exact))
-    return decided(ours >= best, why, *values, ("largest error", error, "deg"))
+    return decided(
+        ours >= best,
+        why,
+        *_mean_settled("estimates", estimated),
+        *_mean_settled("truth", exact),
+        ("largest error", error, "deg"),
+    )
 
 
 @measures("update-delay")
@@ -136,13 +151,18 @@ def transmission(runs: Runs) -> Finding:
         f"two channels of int16 take {two:.4g} ms; our whole message, which also carries voltage and reference, takes"
         f" {whole:.4g} ms; int16 rounds the position by at most {record.quantisation * 1e6:.2g} µm"
     )
-    values = (("two channels", two, "ms"), ("whole message", whole, "ms"))
-    return decided(abs(two - 1.6) < 0.016, why, *values, ("rounding", record.quantisation * 1e6, "µm"))
+    return decided(
+        abs(two - 1.6) < 0.016,
+        why,
+        ("two channels", two, "ms"),
+        ("whole message", whole, "ms"),
+        ("rounding", record.quantisation * 1e6, "µm"),
+    )
 
 
 @measures("router-microseconds")
 def router(_runs: Runs) -> Finding:
-    """Nothing here routes packets."""
+    """No router is simulated."""
     why = "a simulated link has the delay it is given; a router would have to be measured"
     return Finding(Verdict.CANNOT_BE_CHECKED, why, listed())
 

@@ -71,8 +71,12 @@ def linear_negligible(runs: Runs, square: Square) -> Finding:
         f"in the last 5 s of step 1 the position's standard deviation is {noisy_std * MM:.2g} mm ({without * MM:.2g} mm"
         f" without noise), under a measurement noise of {NOISE.std * MM:.2g} mm"
     )
-    values = (("standard deviation, step 1", noisy_std * MM, "mm"), ("without noise", without * MM, "mm"))
-    return decided(noisy_std < 0.02 * AMPLITUDE, why, *values)
+    return decided(
+        noisy_std < 0.02 * AMPLITUDE,
+        why,
+        ("standard deviation, step 1", noisy_std * MM, "mm"),
+        ("without noise", without * MM, "mm"),
+    )
 
 
 @measures_both("noise-steps-4-5")
@@ -123,8 +127,13 @@ def bias_from_noise(runs: Runs, square: Square) -> Finding:
     joint = math.hypot(error, error_without)
     reproduced = abs(mean) - abs(without) > 2.0 * joint
     why = f"the mean error is {mean:.2g} deg with noise and {without:.2g} deg without (difference known to {joint:.1g})"
-    values = (("with noise", mean, "deg"), ("without", without, "deg"), ("joint standard error", joint, "deg"))
-    return decided(reproduced, why, *values)
+    return decided(
+        reproduced,
+        why,
+        ("with noise", mean, "deg"),
+        ("without", without, "deg"),
+        ("joint standard error", joint, "deg"),
+    )
 
 
 @measures_both("noise-copes")
