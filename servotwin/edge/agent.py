@@ -1,10 +1,11 @@
 """The edge's agent: samples and messages in, messages out; its clock is sample time.
 
 It records, cuts a window after each change of the reference, repeats it until the twin acknowledges it, and lets its
-supervisor decide about parameters. It does not control: whoever ticks the law asks `parameters` before each sample, or
-`controller` where updates may set gains, and carries its state over by `servotwin.control.law.transfer`; it gives the
-law the wanted position plus `offset`, which is zero but for a probing move that the twin has requested and the edge's
-settings allow. Such a move begins while the reference rests, ends by itself, and ends at once when the reference moves.
+supervisor decide about parameters. It does not control: the caller ticks the law. Before each sample the caller reads
+`parameters`, or `controller` where updates may set gains, and transfers the law's state by
+`servotwin.control.law.transfer`. It adds `offset` to the reference; the offset is zero except during a probing move
+that the twin has requested and the edge's settings allow. Such a move begins while the reference rests, and ends by
+itself, or at once when the reference moves.
 """
 
 from array import array
@@ -37,7 +38,7 @@ class ScheduledMessage(NamedTuple):
     message: Message
 
 
-class OpenWindow(NamedTuple):
+class _OpenWindow(NamedTuple):
     """A window that is being recorded, samples first .. last - 1, and its reason."""
 
     first: int
@@ -58,9 +59,9 @@ class Agent:
     outbox : Outbox, optional
         In memory by default.
     store : ParameterStore, optional
-        Of the last parameters that kept their band; without one each boot begins as configured.
+        Stores the last parameters under which the loop kept its band; without one each boot begins as configured.
     outlet : Outlet, optional
-        Takes the cut windows; by default they are packed here and kept in `outbox`.
+        Takes the cut windows; by default they are packed here and put into `outbox`.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Agent:
             self._supervisor.window_sent(0.0)
         self._requests = GrantedRequests(settings.window_samples, settings.pre_trigger_samples)
         self._reference = self._expected = settings.reference
-        self._open_window: OpenWindow | None = None
+        self._open_window: _OpenWindow | None = None
         self._cut_at = 0
         self._deadline = self._next_deadline()
 
@@ -122,16 +123,16 @@ class Agent:
 
     @property
     def deadline(self) -> int | None:
-        """`samples` at which it will send something by itself while the reference rests; None: never."""
+        """Value of `samples` at which it acts by itself while the reference rests; None: never."""
         return None if self._deadline == inf else int(self._deadline)
 
     @property
     def dropped(self) -> Counter[str]:
-        """Windows that will never be sent again without having been acknowledged, by reason."""
+        """Number of windows dropped without an acknowledgement, by reason."""
         return Counter(self.outlet.dropped)
 
     def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[ScheduledMessage]:
-        """Take one sample (m, rad, m, V); return what is to be sent now."""
+        """Take one sample (m, rad, m, V); return the messages to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
         if reference != self._expected:
             self._reference_changed(reference)
@@ -157,7 +158,7 @@ class Agent:
         return sent
 
     def receive(self, message: Message) -> list[ScheduledMessage]:
-        """Take a message from the twin; return what is to be sent now. Messages not meant for an edge are ignored."""
+        """Take a message from the twin; return the messages to be sent now. Messages not for an edge are ignored."""
         if isinstance(message, Update):
             replies = self._supervisor.offer(message)
             self._twin_answered(message.servo)
@@ -170,7 +171,7 @@ class Agent:
         return []
 
     def outlet_changed(self) -> None:
-        """Take note that the outlet's unacknowledged windows have changed by themselves."""
+        """Note that the outlet's unacknowledged windows have changed by themselves."""
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(self.time)
         else:
@@ -178,7 +179,7 @@ class Agent:
         self._deadline = self._next_deadline()
 
     def restore(self, former: Parameters) -> list[ScheduledMessage]:
-        """Put former parameters in force again, as the drive has refused the present ones; return messages."""
+        """Put former parameters in force again, since the drive has refused the present ones; return messages."""
         messages = self._supervisor.restore(former)
         self._deadline = self._next_deadline()
         return [ScheduledMessage(self.samples, each) for each in messages]
@@ -210,7 +211,7 @@ class Agent:
         self._requests, answer = decide(request, self._requests, s, here, self._at_rest())
         move = self.probe
         if move is not None and move is not before:
-            self._open_window = OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
+            self._open_window = _OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
             self._expected = self._reference + self.offset
         self._twin_answered(request.servo)
         return [ScheduledMessage(self.samples, answer)]
@@ -223,12 +224,12 @@ class Agent:
         )
 
     def _reference_changed(self, reference: float) -> None:
-        """Note a new reference in the last sample, and abort a probing move; what that has added is in the sample."""
+        """Note the new reference in the last sample, and abort a probing move."""
         self._reference = reference
         self._abort()
         if self._open_window is None:
             first = max(0, self.samples - 1 - self._requests.pre_trigger)
-            self._open_window = OpenWindow(first, first + self._requests.window, "reference")
+            self._open_window = _OpenWindow(first, first + self._requests.window, "reference")
             self._deadline = self._next_deadline()
 
     def _abort(self) -> None:
@@ -239,14 +240,14 @@ class Agent:
         self._expected = self._reference
 
     def _act(self) -> list[ScheduledMessage]:
-        """Cut the window that is complete, and send what is due."""
+        """Cut the window that is complete, and return the messages that are due."""
         opened = self._open_window
         if opened is not None and self.samples >= opened.last:
             self._cut(opened)
             self._abort()
             self._open_window = None
         elif opened is None and self.samples >= self._timed:
-            self._cut(OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
+            self._cut(_OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
         sent = [ScheduledMessage(self.samples, window) for window in self.outlet.due(self.time)]
         messages = self._supervisor.check()
         if any(isinstance(each, Fallback) for each in messages):
@@ -255,15 +256,15 @@ class Agent:
         self._deadline = self._next_deadline()
         return sent + [ScheduledMessage(self.samples, each) for each in messages]
 
-    def _cut(self, opened: OpenWindow) -> None:
-        """Cut a window and hand it to the outlet, which knows whether the twin then owes an answer."""
+    def _cut(self, opened: _OpenWindow) -> None:
+        """Cut a window and hand it to the outlet."""
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
         self._cut_at = self.samples
         self.outlet.offer(self._cut_samples(opened, sequence), self.time)
-        if self.outlet.unacknowledged:
+        if self.outlet.unacknowledged:  # not so where the filter kept the window back
             self._supervisor.window_sent(self.time)
 
-    def _cut_samples(self, opened: OpenWindow, sequence: int) -> Cut:
+    def _cut_samples(self, opened: _OpenWindow, sequence: int) -> Cut:
         """Copy the samples, and note the parameters in force."""
         p, signals = self.parameters, self._recorder.cut(opened.first, opened.last)
         basis = p.window[1] if p.window is not None and p.window[0] == self.settings.boot else None
@@ -271,15 +272,15 @@ class Agent:
 
     @property
     def _timed(self) -> float:
-        """`samples` at which a window is cut if nothing else has led to one."""
+        """Value of `samples` at which a window is cut although the reference rests."""
         return self._cut_at + max(self.settings.look_samples, self._requests.window)
 
     def _before(self, first: int) -> float:
-        """The reference just before a sample, m."""
+        """Reference just before a sample, m."""
         return self._recorder.cut(first - 1, first)["reference"][0] if first > 0 else self.settings.reference
 
     def _next_deadline(self) -> float:
-        """`samples` at which to act again, always in the future or now complete; inf: nothing to wait for."""
+        """Value of `samples` at which to act again; inf: there is nothing to wait for."""
         deadline = self._supervisor.next_check
         deadline = min(deadline, self._timed if self._open_window is None else self._open_window.last)
         if self.probe is not None:

@@ -1,16 +1,16 @@
 """Drive: the interface between the edge and its machine, in one of two roles.
 
-*Control*: the edge ticks the law. The drive paces: `read` waits for the next sample instant, `write` gives the voltage
-that is held until the one after it. *Supervise*: the drive has a controller of its own. `read` gives the samples since
-the last one, `write` the parameters it is to run on.
+*Control*: the edge ticks the law, and the drive sets the pace: `read` waits for the next sample instant, `write` sets
+the voltage that is held until the one after it. *Supervise*: the drive has a controller of its own: `read` returns the
+samples since the last call, `write` sets the parameters of that controller.
 
-Samples are numbered by the machine, from 0 when it starts. Whoever reads them compares: a number other than the one
-that is due means that samples are missing (the edge was too slow, or away for too long), another `machine` after
-`connect` that the count began anew. Windows are uniform in time: a few missing samples cost the windows they were in;
+The machine numbers its samples from 0 when it starts. The reader compares the numbers: a number other than the one that
+is due means that samples are missing (the edge was too slow, or away for too long); another `machine` after `connect`
+means that the count began anew. Windows are uniform in time, so a few missing samples cost the windows they were in;
 where more than a second is missing, or the count began anew, the agent begins a new boot.
 
-A drive that cannot be reached raises `DriveLost`, and `connect` is to be tried again, at intervals of the caller's
-choice; a run that is over gives None. Nothing else ends a reading loop. All numbers are SI.
+A drive that cannot be reached raises `DriveLost`; the caller tries `connect` again, at intervals of its choice. `read`
+returns None when the run is over. Nothing else ends a reading loop. All numbers are SI.
 """
 
 from array import array
@@ -20,11 +20,11 @@ from servotwin.edge.parameters import Parameters
 
 
 class DriveLost(Exception):
-    """The drive cannot be reached, or went silent; `connect` may bring it back."""
+    """The drive cannot be reached, or went silent; `connect` may reach it again."""
 
 
 class DriveRefused(Exception):
-    """The drive does not take these parameters; it runs on with those it had."""
+    """The drive refuses the parameters; it runs on with those it had."""
 
 
 class DriveSample(NamedTuple):
@@ -33,9 +33,9 @@ class DriveSample(NamedTuple):
     Attributes
     ----------
     number : int
-        Its number since the machine's start.
+        Number of the sample since the machine's start.
     reference, theta_m, position : float
-        m (wanted by the machine, without any probing move), rad, m.
+        m (the machine's own reference, without a probing move), rad, m.
     """
 
     number: int
@@ -52,7 +52,7 @@ class Block(NamedTuple):
     first : int
         Number of its first sample since the machine's start.
     version : int
-        Of the parameters that these samples ran under: the first block with a version says at which sample it began.
+        Version of the parameters in these samples; it begins with the first block that carries it.
     reference, theta_m, position, voltage : array of float
         m (a probing move included), rad, m, V; equally long, perhaps empty.
     """
@@ -71,7 +71,7 @@ class Block(NamedTuple):
 
 
 class Drive(Protocol):
-    """Interface that both roles have in common."""
+    """Interface common to both roles."""
 
     @property
     def rate(self) -> float:
@@ -79,18 +79,25 @@ class Drive(Protocol):
 
     @property
     def machine(self) -> str:
-        """Name of the machine's present run: another one means that samples are counted from 0 again."""
+        """Name of the machine's present run; with another name the samples are counted from 0 again."""
 
     @property
     def lag(self) -> float:
-        """s by which the machine is behind its pace, as last reported; 0 for a real one."""
+        """Time by which a simulated machine is behind its pace, as last reported, s; 0 for a real one."""
 
     def connect(self) -> None:
-        """Reach the machine, at first or again; raises `DriveLost` when it is not there, `InvalidInput` when it never
-        will be: another role, another protocol, no access."""
+        """Connect to the machine, at first or again.
+
+        Raises
+        ------
+        DriveLost
+            The machine cannot be reached now.
+        InvalidInput
+            Another try is useless: the machine has another role or protocol, or refuses access.
+        """
 
     def close(self) -> None:
-        """Let go of it; the machine runs on. Closing twice is harmless."""
+        """Close the connection; the machine runs on. Closing twice is harmless."""
 
 
 class ControlDrive(Drive, Protocol):
@@ -100,7 +107,7 @@ class ControlDrive(Drive, Protocol):
         """Wait for the next sample instant; None: the run is over. Raises `DriveLost`."""
 
     def write(self, voltage: float) -> None:
-        """The voltage (V) from the last sample on; where none is written the last one holds. Raises `DriveLost`."""
+        """Set the voltage (V) from the last sample on; without a call the last one holds. Raises `DriveLost`."""
 
 
 class SupervisedDrive(Drive, Protocol):
@@ -108,20 +115,20 @@ class SupervisedDrive(Drive, Protocol):
 
     @property
     def can_move(self) -> bool:
-        """It adds probing moves to its reference; where not, the agent's settings must allow none."""
+        """True where it adds probing moves to its reference; otherwise the agent's settings must allow none."""
 
     @property
     def patient(self) -> bool:
-        """Samples wait until they are read, however long that takes."""
+        """True where samples wait until they are read, however long that takes."""
 
     def read(self, most: int = 0) -> Block | None:
-        """The next samples, at least one of them unless nothing came for a while; None: the run is over.
+        """Return the next samples; the block is empty where nothing came for a while; None: the run is over.
 
         Parameters
         ----------
         most : int
-            Samples at most; 0: as many as suits the drive. A machine in lock-step goes on by no more than these, so
-            that what is written next holds from `Block.last` on.
+            Largest number of samples; 0: as many as suits the drive. A machine in lock-step advances by no more than
+            these, so that the parameters written next hold from `Block.last` on.
 
         Raises
         ------
@@ -129,16 +136,17 @@ class SupervisedDrive(Drive, Protocol):
         """
 
     def write(self, parameters: Parameters) -> None:
-        """Run on these: version, tolerance and gains, all at once; the blocks to come say from which sample on. Gains
-        come without a jump of the voltage; None leaves them as they are, and sets the dead zone as it is.
+        """Put version, tolerance and gains in force, all at once; the next blocks tell the sample at which they began.
+
+        New gains do not make the voltage jump. Where `parameters.setting.gains` is None the gains stay as they are.
 
         Raises
         ------
         DriveLost
-            Whether they were taken is not known: the next block's version tells.
+            It is not known whether they are in force: the version of the next block tells.
         DriveRefused
-            They are not in force, and why.
+            They are not in force; the message has the reason.
         """
 
     def move(self, offset: float) -> None:
-        """Add this (m) to the reference from the next sample on, until told otherwise. Raises `DriveLost`."""
+        """Add `offset` (m) to the reference from the next sample on, until the next call. Raises `DriveLost`."""

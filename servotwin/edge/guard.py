@@ -2,11 +2,11 @@
 
 Several updates may be in flight. Each names the version it replaces, and only one that replaces the version in force
 is applied (compare-and-swap); so of two made on the same base the first to arrive wins, and the other is refused.
-Every receipt, every window and every hello names the version in force. The twin keeps only its newest estimate as its
+Every receipt, every window and every hello names the version in force. The twin has only its newest estimate as its
 goal and, when a receipt says that the goal was refused for its base or version, sends it again on the base the receipt
 names. The newest data therefore win in the end, and no update is ever applied on an assumption that does not hold.
-A repeated update gets its first answer again, so that a lost receipt costs nothing. When an admissible update is
-applied is `servotwin.edge.switch`'s business.
+A repeated update gets its first answer again, so that a lost receipt costs nothing. `servotwin.edge.switch` chooses the
+instant at which an admissible update is applied.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ def is_repeat(update: Update, current: Parameters, here: Instant) -> bool:
 
 
 def updated_parameters(update: Update, current: Parameters, sample: int) -> Parameters:
-    """Parameters in force from `sample` on; an update without gains leaves them."""
+    """Make the parameters in force from `sample` on; an update without gains leaves the gains as they are."""
     gains = current.setting.gains if update.setting.gains is None else update.setting.gains
     setting = replace(update.setting, gains=gains)
     return Parameters(update.version, setting, update.data_time, update.window, sample, gap=update.gap)

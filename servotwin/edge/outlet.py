@@ -1,7 +1,7 @@
-"""Outlet of the agent's cut windows: the protocol, and the outlet that packs, keeps and repeats them in this process.
+"""Outlet of the agent's cut windows: the protocol, and the outlet that packs, stores and repeats them in this process.
 
 The edge process hands them to a link process instead, so that neither packing nor the disk delays a sample. Both write
-windows into an outbox by `WindowWriter`, and repeat them by one `servotwin.link.session.Session`.
+windows into an outbox by a `WindowWriter`, and repeat them by a `servotwin.link.session.Session`.
 """
 
 from collections import Counter
@@ -36,20 +36,20 @@ class Outlet(Protocol):
 
     @property
     def unacknowledged(self) -> bool:
-        """The twin owes the acknowledgement of a window."""
+        """True where a window waits for the twin's acknowledgement."""
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Windows that will never be sent (again) without having been acknowledged, by reason."""
+        """Number of windows dropped without an acknowledgement, by reason."""
 
     def offer(self, cut: Cut, now: float) -> None:
-        """Take charge of a cut window."""
+        """Take over a cut window."""
 
     def due(self, now: float) -> list[WindowMessage]:
         """Return the windows that the agent is to send now, oldest first; each counts as sent."""
 
     def acknowledge(self, message: Acknowledge) -> bool:
-        """Take the twin's acknowledgement of a window; False when the window was not kept any more."""
+        """Take the twin's acknowledgement of a window; False when the window was not stored any more."""
 
 
 class WindowWriter:
@@ -58,7 +58,7 @@ class WindowWriter:
     Parameters
     ----------
     settings : AgentSettings
-        Of that boot; its window filter goes on from the state that an earlier boot left in the outbox.
+        Settings of that boot; its window filter goes on from the state that an earlier boot left in the outbox.
     outbox : Outbox
     faults : Counter, optional
         Counts the windows whose filter failed, which are then sent; None: such an error is raised.
@@ -75,12 +75,12 @@ class WindowWriter:
 
     def write(self, cut: Cut) -> None:
         """Put a window into the outbox, or count why it is not sent."""
-        wanted = self._filtered(cut) if is_finite(cut) else cut
-        if wanted is None:
+        chosen = self._filtered(cut) if is_finite(cut) else cut  # packing refuses one that is not finite
+        if chosen is None:
             self._outbox.count_dropped(FILTERED)
             return
         try:
-            window = pack(wanted, self._settings)
+            window = pack(chosen, self._settings)
         except InvalidMessage:
             self._outbox.count_dropped(NOT_FINITE)
         else:
@@ -90,18 +90,18 @@ class WindowWriter:
         if self._filter is None:
             return cut
         try:
-            wanted = self._filter(cut)
-        except Exception:
+            chosen = self._filter(cut)
+        except Exception:  # a fault of an optional feature must not cost a window
             if self._faults is None:
                 raise
             self._faults[UNFILTERED] += 1
             return cut
         self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
-        return wanted
+        return chosen
 
 
 class LocalOutlet:
-    """Keeps windows in an outbox of this process; the agent sends them, and repeats them until they are acknowledged.
+    """Stores windows in an outbox of this process; the agent sends and repeats them until they are acknowledged.
 
     Parameters
     ----------
@@ -122,16 +122,16 @@ class LocalOutlet:
 
     @property
     def unacknowledged(self) -> bool:
-        """The twin owes the acknowledgement of a window."""
+        """True where a window waits for the twin's acknowledgement."""
         return bool(self.outbox.pending())
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Windows that will never be sent (again) without having been acknowledged, by reason."""
+        """Number of windows dropped without an acknowledgement, by reason."""
         return self.outbox.dropped
 
     def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
-        """Take charge of a cut window: it is due at once."""
+        """Take over a cut window: it is due at once."""
         self._writer.write(cut)
 
     def due(self, now: float) -> list[WindowMessage]:
@@ -142,5 +142,5 @@ class LocalOutlet:
         return [self.outbox.get(key) for key in keys]
 
     def acknowledge(self, message: Acknowledge) -> bool:
-        """Forget a window that the twin has; False when it was not kept any more."""
+        """Remove a window that the twin has acknowledged; False when it was not stored any more."""
         return self._session.acknowledge((message.boot, message.sequence))

@@ -16,7 +16,7 @@ MAX_CHANGES = 256
 
 
 def pack(cut: Cut, settings: AgentSettings) -> WindowMessage:
-    """Pack a cut into the window that is sent.
+    """Pack a cut into the window message.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def _packed(name: str, values: "array[float]", fine_angle: bool) -> tuple[Channe
 
 
 def _changes(cut: Cut, rate: float) -> tuple[tuple[float, float], ...]:
-    """(time, new value) of the first changes of the reference inside a window."""
+    """List (time, new value) of the first changes of the reference inside a window."""
     steps = enumerate(pairwise((cut.before, *cut.signals["reference"])), cut.first)
     changes = [(index / rate, new) for index, (old, new) in steps if new != old]
     return tuple(changes[:MAX_CHANGES])

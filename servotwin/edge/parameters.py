@@ -14,7 +14,7 @@ OFF = Setting(0.0)
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Setting of the edge's controller, and the data that it stands on.
+    """Setting of the edge's controller, and the data from which it was computed.
 
     Parameters
     ----------
@@ -23,9 +23,9 @@ class Parameters:
     setting : Setting
         Gains None: those that the edge was configured with.
     data_time : float
-        Sample time of the data they stand on, s; -inf: none of this boot.
+        Sample time of the data from which they were computed, s; -inf: none of this boot.
     window : (str, int), optional
-        (boot, sequence) of the window they stand on.
+        (boot, sequence) of the window from which they were computed.
     sample : int
         First sample under them.
     fallback : bool
@@ -33,7 +33,7 @@ class Parameters:
     not_before : int
         First sample at which an update may replace them.
     gap : float, optional
-        rad, that the update was made for; None: not known.
+        Total gap for which the update was made, rad; None: not known.
 
     Raises
     ------

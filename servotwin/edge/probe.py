@@ -1,4 +1,4 @@
-"""A probing move of the reference: how large it may be, and the one under way."""
+"""Probing moves of the reference: their limits, and the one under way."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from servotwin.messages import Probe
 @settings("probe")
 @dataclass(frozen=True, slots=True)
 class ProbeLimits:
-    """Probing moves that an edge makes."""
+    """Limits of the probing moves that an edge makes."""
 
     size: Annotated[float, key("size_mm", "size_m", above=0.0, help="Largest move, either way.")]
     interval_s: Annotated[float, key(minimum=0.0, help="Shortest time from the beginning of one to the next.")] = 60.0
@@ -28,10 +28,11 @@ class ProbingMove:
     Parameters
     ----------
     first : int
-        First sample of it.
+        First sample of the move.
     size : float
         m.
     hold, strokes : int
+        Samples at each offset, and number of repetitions.
     """
 
     first: int
@@ -40,26 +41,26 @@ class ProbingMove:
     strokes: int
 
     @classmethod
-    def of(cls, asked: Probe, first: int, rate: float) -> "ProbingMove":
-        """From a sample on, at `rate` Hz."""
-        return cls(first, asked.size, max(1, round(asked.hold_s * rate)), asked.strokes)
+    def of(cls, probe: Probe, first: int, rate: float) -> "ProbingMove":
+        """Make the requested move from sample `first` on, at `rate` Hz."""
+        return cls(first, probe.size, max(1, round(probe.hold_s * rate)), probe.strokes)
 
     @property
     def last(self) -> int:
-        """First sample after it."""
+        """First sample after the move."""
         return self.first + 2 * self.strokes * self.hold
 
     def offset(self, sample: int) -> float:
-        """m, at a sample."""
+        """Offset at a sample, m."""
         if not self.first <= sample < self.last:
             return 0.0
         return 0.0 if (sample - self.first) // self.hold % 2 else self.size
 
     def changes(self) -> Iterator[tuple[int, float]]:
-        """Samples from which on the offset is another, with the offset."""
+        """Yield the samples at which the offset changes, with the new offset (m)."""
         for sample in range(self.first, self.last, self.hold):
             yield sample, self.offset(sample)
 
     def next_change(self, sample: int) -> int:
-        """The first change after a sample, or the end."""
+        """First change after a sample, or the end of the move."""
         return min(self.last, self.first + ((sample - self.first) // self.hold + 1) * self.hold)

@@ -9,7 +9,7 @@ from servotwin.errors import InvalidInput
 Floats = Iterable[float]
 
 TIMED = "timed"
-"""Reason of a window that was cut because the filter's longest pause was over."""
+"""Reason of a window that is cut because the filter's longest pause is over."""
 
 
 class Cut(NamedTuple):
@@ -22,17 +22,17 @@ class Cut(NamedTuple):
     sequence : int
         Number of the window in this boot.
     reason : str
-        For which it was cut.
+        Reason for which it was cut.
     parameter_version : int
-        In force when it was cut.
+        Version in force when it was cut.
     before : float
         Reference just before the first sample, m.
     signals : dict of str to array of double
-        Channel by channel, equally long: m, rad, m, V.
+        Channels, equally long: m, rad, m, V.
     gap : float or None
-        rad, that the update in force was made for; None: none is in force, or it has none.
+        Total gap for which the update in force was made, rad; None: no update is in force, or it names no gap.
     basis : int or None
-        Sequence of the window of this boot that this update was made from.
+        Sequence of the window of this boot from which this update was made.
     """
 
     first: int
@@ -75,7 +75,7 @@ class Recorder:
 
     @property
     def oldest(self) -> int:
-        """Index of the oldest sample kept."""
+        """Index of the oldest sample in the buffer."""
         return max(0, self.samples - self.capacity)
 
     def append(self, *values: float) -> None:
@@ -98,7 +98,7 @@ class Recorder:
         Raises
         ------
         InvalidInput
-            When some are not recorded yet or not kept any more.
+            Some of them are not recorded yet, or overwritten.
         """
         if not self.oldest <= first < last <= self.samples:
             raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
@@ -112,7 +112,7 @@ class Recorder:
         return values.pop() if len(values) == 1 else None
 
     def _write(self, ring: "array[float]", block: "array[float]", end: int) -> None:
-        """Put a block of at most `capacity` samples where it ends before index `end`."""
+        """Write a block of at most `capacity` samples, the last of which has index `end` - 1."""
         place = (end - len(block)) % self.capacity
         room = self.capacity - place
         ring[place : place + len(block)] = block[:room]

@@ -1,7 +1,7 @@
 """Decisions about the twin's requests for longer windows and probing moves. Pure functions.
 
-A request that was decided gets its first answer again, so that a lost answer costs nothing. One that came at a bad
-moment is not decided: the same request may be taken later.
+A request that was decided gets its first answer again, so that a lost answer costs nothing. One that came too soon, or
+while the reference moved, stays undecided: the same request may be granted later.
 """
 
 from dataclasses import dataclass, replace
@@ -15,18 +15,18 @@ from servotwin.messages import Answer, LongerWindow, Probe, Request, RequestOutc
 
 @dataclass(frozen=True, slots=True)
 class GrantedRequests:
-    """State that requests have led to.
+    """Window lengths and probing move in force after the requests so far.
 
     Parameters
     ----------
     window, pre_trigger : int
-        Samples of a window, and of it before the change of the reference.
+        Samples of a window, and those of them before the change of the reference.
     probe : ProbingMove, optional
-        Under way.
+        Move under way.
     probed : int, optional
         First sample of the last probing move.
     answer : Answer, optional
-        To the last request that was decided.
+        Answer to the last request that was decided.
     """
 
     window: int
@@ -51,7 +51,7 @@ class RequestDecision(NamedTuple):
 def decide(
     request: Request, state: GrantedRequests, settings: AgentSettings, here: Instant, at_rest: bool
 ) -> RequestDecision:
-    """Take a request, or say why not.
+    """Grant a request, or refuse it with a reason.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def _rested(state: GrantedRequests, limits: ProbeLimits, here: Instant) -> bool:
 
 
 def _grant(request: Request, state: GrantedRequests, settings: AgentSettings, here: Instant) -> GrantedRequests:
-    """Windows are at least as configured."""
+    """Apply a request; windows never get shorter than configured."""
     ask, rate = request.ask, settings.sample_rate
     if isinstance(ask, Probe):
         return replace(state, probe=ProbingMove.of(ask, here.sample, rate), probed=here.sample)

@@ -20,7 +20,7 @@ from servotwin.runtime.retry import Retry
 @settings("supervision")
 @dataclass(frozen=True, slots=True)
 class Supervision:
-    """How the edge looks after itself.
+    """Supervision of the control loop by the edge, and its fallback set.
 
     Parameters
     ----------

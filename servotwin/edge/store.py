@@ -1,4 +1,4 @@
-"""The last parameters that the loop kept its band under: stored, so that a restart goes on from them."""
+"""Store of the last parameters under which the loop kept its band: a restart goes on from them."""
 
 import os
 from pathlib import Path
@@ -18,10 +18,10 @@ class ParameterStore(Protocol):
     """Stores one set of parameters."""
 
     def save(self, parameters: Parameters) -> None:
-        """Replace the stored parameters; return when the new ones are safe."""
+        """Replace the stored parameters; return when the new ones are stored safely."""
 
     def load(self) -> Parameters | None:
-        """The stored parameters, as those of a new boot; None: nothing was ever stored."""
+        """Return the stored parameters, as those of a new boot; None: nothing was ever stored."""
 
 
 class StoredParameters(Struct, frozen=True, tag="parameters/2"):
@@ -33,16 +33,16 @@ class StoredParameters(Struct, frozen=True, tag="parameters/2"):
 
     @classmethod
     def of(cls, parameters: Parameters) -> "StoredParameters":
-        """The part of these parameters that outlives a boot."""
+        """Take the part of parameters that outlives a boot."""
         return cls(parameters.version, parameters.setting, parameters.fallback)
 
     def parameters(self) -> Parameters:
-        """The same as parameters that stand on no data of this boot."""
+        """Make parameters for a new boot, computed from no data of it."""
         return Parameters(self.version, self.setting, fallback=self.fallback)
 
 
 class MemoryParameterStore:
-    """In memory, for simulation and tests."""
+    """A parameter store in memory, for simulation and tests."""
 
     def __init__(self) -> None:
         self._stored: StoredParameters | None = None
@@ -52,28 +52,28 @@ class MemoryParameterStore:
         self._stored = StoredParameters.of(parameters)
 
     def load(self) -> Parameters | None:
-        """The stored parameters."""
+        """Return the stored parameters; None: nothing was ever stored."""
         return None if self._stored is None else self._stored.parameters()
 
 
 class FileParameterStore:
-    """In one file, replaced as a whole: a crash leaves the old one or the new one.
+    """A parameter store in one file, replaced as a whole: a crash leaves the old file or the new one.
 
     Parameters
     ----------
     path : path
-        Its folder exists; a neighbour with `.new` at its name's end is used for writing.
+        Its folder exists; a neighbour NAME.new is used for writing.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
 
     def save(self, parameters: Parameters) -> None:
-        """Replace the file; return when the disk has it. Raises OSError."""
+        """Replace the file; return when it is on the disk. Raises OSError."""
         replace_file(self._path, msgspec.json.encode(StoredParameters.of(parameters)), durable=True)
 
     def load(self) -> Parameters | None:
-        """The parameters in the file, in this version's form or the one before.
+        """Return the parameters in the file, in the form of this version or of the one before; None: there is no file.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """Supervisor of the parameters in force: it joins the switch, the watch, the twin's silence and the parameter store.
 
-It checks every `period` samples, at multiples of the period, and only when there is something to check; so it decides
-the same whether samples come one by one or in blocks.
+It checks at multiples of its period, and only when there is something to check; so its decisions are the same whether
+samples come one by one or in blocks.
 """
 
 from dataclasses import replace
@@ -24,15 +24,15 @@ Messages = tuple[Receipt | Fallback, ...]
 
 
 class Supervisor:
-    """Decides about parameters; the agent reports what happens.
+    """Decides about parameters; the agent reports updates, windows sent, and answers of the twin.
 
     Parameters
     ----------
     settings : AgentSettings
     recorder : Recorder
-        The agent's samples.
+        Samples of the agent.
     store : ParameterStore, optional
-        Its parameters replace the configured ones.
+        Its parameters, where it has some, replace the configured ones.
     """
 
     def __init__(self, settings: AgentSettings, recorder: Recorder, store: ParameterStore | None = None) -> None:
@@ -64,14 +64,14 @@ class Supervisor:
         ):
             return inf
         late = (self._unanswered_since + self._fallback.silence_s) * self._settings.sample_rate
-        return max(next_one, ceil(late / period - 1e-9) * period)
+        return max(next_one, ceil(late / period - 1e-9) * period)  # 1e-9: rounding of a time that is a multiple
 
     def offer(self, update: Update) -> Messages:
         """Take an update from the twin."""
         return self._advance(switch.offer(self._state, update, self._rules, self._here, self._error))
 
     def restore(self, former: Parameters) -> Messages:
-        """Put former parameters in force again: the drive has refused the present ones."""
+        """Put former parameters in force again, since the drive has refused the present ones."""
         return self._advance(switch.restore(self._state, former, self._here))
 
     def window_sent(self, now: float) -> None:
@@ -83,7 +83,7 @@ class Supervisor:
         self._unanswered_since = now if more else None
 
     def check(self) -> Messages:
-        """Check the loop and the twin, if this is one of the samples at which to."""
+        """Check the loop and the twin, if a check is due at this sample."""
         if self._recorder.samples % self._settings.period_samples != 0:
             return ()
         violation = self._violation()
@@ -145,7 +145,7 @@ class Supervisor:
             self._saved = True
 
     def _violation(self) -> Violation | None:
-        """Evidence against the parameters in force; none against the fallback set, since nothing is left to do."""
+        """Evidence against the parameters in force; never against the fallback set, which nothing can replace."""
         if self._fallback is None or self.parameters.fallback:
             return None
         return self._watch_loop() or self._silence()
@@ -161,7 +161,5 @@ class Supervisor:
     def _silence(self) -> Violation | None:
         if self._fallback is None or self._unanswered_since is None:
             return None
-        waited = self._here.time - self._unanswered_since
-        return (
-            Violation(Cause.SILENCE, waited, self._fallback.silence_s) if waited >= self._fallback.silence_s else None
-        )
+        waited, allowed = self._here.time - self._unanswered_since, self._fallback.silence_s
+        return Violation(Cause.SILENCE, waited, allowed) if waited >= allowed else None

@@ -3,14 +3,14 @@
 A change of the dead zone is safe while the error is smaller than every threshold, old and new, or larger than every one
 of them: the loop is open before and after, or closed before and after. Gains change at any instant, since
 `servotwin.control.law.transfer` leaves the voltage where it is. An update that still waits after `Limits.patience_s` is
-applied wherever the error is: the voltage does not jump even then, while a loop that rests near its threshold would
-otherwise never get the setting that was verified for it.
+applied wherever the error is: the voltage does not jump even then. Without this a loop that rests near its threshold
+would never get the setting that was verified for it.
 
 One update is pending at a time. A newer one that may be applied takes its place; the older one is refused. Before it is
 applied an update is judged once more, and refused where it has expired.
 
-The fallback set gets a version of its own, so that every update on its way to the version it replaced is refused, as is
-every update that stands on data from before. After a second fallback, updates are refused for twice as long, and so on.
+The fallback set gets a version of its own. So every update in flight is refused whose base is the version it replaced,
+or whose data are from before the fallback. After each further fallback, updates are refused for twice as long.
 """
 
 from dataclasses import dataclass, replace
@@ -26,8 +26,8 @@ from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.watch import Violation
 from servotwin.messages import Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 
-MOST_DOUBLINGS = 6
-REFUSE_AFTER_DRIVE_S = 10.0
+_MOST_DOUBLINGS = 6
+_REFUSE_AFTER_DRIVE_S = 10.0
 """Time for which updates are refused after a drive has refused one; twice as long after the next."""
 
 
@@ -39,7 +39,7 @@ class Rules:
     ----------
     limits : Limits
     controller : Controller, optional
-        As configured, with what updates do not change. None: the edge knows of no gains and of no thresholds.
+        Configured controller, with the limits that updates do not change. None: the edge knows no gains or thresholds.
     own : Gains, optional
         The servo's own gains, in the middle of the box; None: the controller's.
     """
@@ -50,13 +50,13 @@ class Rules:
 
     @property
     def centre(self) -> Gains | None:
-        """Gains in the middle of the box; None: no gains are accepted."""
+        """Gains in the middle of the allowed box; None: no gains are accepted."""
         return self.own if self.own is not None or self.controller is None else gains_of(self.controller)
 
 
 @dataclass(frozen=True, slots=True)
 class PendingUpdate:
-    """An admissible update, and the sample at which it came."""
+    """An admissible update, and the sample at which it arrived."""
 
     update: Update
     since: int
@@ -79,7 +79,7 @@ class Transition(NamedTuple):
 
 
 def offer(state: Switch, update: Update, rules: Rules, here: Instant, error: float | None) -> Transition:
-    """Take an update: apply it, keep it pending for a safe instant, or refuse it.
+    """Decide about an update: apply it, let it wait for a safe instant, or refuse it.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def offer(state: Switch, update: Update, rules: Rules, here: Instant, error: flo
 
 
 def apply_pending(state: Switch, rules: Rules, here: Instant, error: float | None) -> Transition:
-    """Apply the pending update if this is a safe instant or its patience is over; refuse it where it has expired."""
+    """Apply the pending update at a safe instant or when its patience is over; refuse it where it has expired."""
     pending = state.pending
     if pending is None:
         return Transition(state)
@@ -126,7 +126,7 @@ def fall_back(state: Switch, fallback: FallbackSet, violation: Violation, here: 
 def restore(state: Switch, former: Parameters, here: Instant) -> Transition:
     """Put former parameters in force again, since the drive has refused the present ones; refuse the pending update."""
     new = replace(former, data_time=here.time, window=None)
-    return _replace(state, new, former.setting.gains, Violation(Cause.DRIVE, 0.0, 0.0), REFUSE_AFTER_DRIVE_S, here)
+    return _replace(state, new, former.setting.gains, Violation(Cause.DRIVE, 0.0, 0.0), _REFUSE_AFTER_DRIVE_S, here)
 
 
 def _replace(
@@ -135,7 +135,7 @@ def _replace(
     """Put other parameters in force at the next sample, under a new version, and refuse updates for a while."""
     old, pending = state.current, state.pending
     version = 1 + max(old.version, 0 if pending is None else pending.update.version)
-    not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, MOST_DOUBLINGS) * here.rate)
+    not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, _MOST_DOUBLINGS) * here.rate)
     new = replace(new, version=version, sample=here.sample, not_before=not_before)
     message = Fallback(
         here.servo, here.boot, here.sample, *violation, old.version, version, Setting(new.setting.tolerance, gains)
@@ -145,15 +145,15 @@ def _replace(
 
 
 def is_safe(old: Parameters, new: Parameters, controller: Controller | None, error: float | None) -> bool:
-    """True where the change neither opens nor closes the loop: see the module's text.
+    """True where the change of the dead zone neither opens nor closes the loop (see the module).
 
     Parameters
     ----------
     old, new : Parameters
     controller : Controller, optional
-        For the thresholds; None: they are the tolerances.
+        Gives the thresholds; None: they are the tolerances.
     error : float, optional
-        m; None: there was no sample yet, nothing can jump.
+        Last tracking error, m; None: there was no sample yet, so nothing can jump.
     """
     before, after = _thresholds(old, controller), _thresholds(new, controller)
     if before == after or error is None:
@@ -169,7 +169,7 @@ def _thresholds(parameters: Parameters, controller: Controller | None) -> tuple[
 
 
 def _judge_with_pending(update: Update, state: Switch, rules: Rules, here: Instant) -> Reason:
-    """Judge as the guard does, and refuse what is not newer than the pending update."""
+    """Judge as the guard does, and refuse an update that is not newer than the pending one."""
     reason = judge(update, state.current, rules.limits, here, rules.centre)
     if reason is not Reason.APPLIED or state.pending is None:
         return reason

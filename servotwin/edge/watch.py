@@ -1,11 +1,10 @@
 """Watch of the control loop: it compares the loop with the prediction for the parameters in force.
 
-The error is watched at all times: while the loop may still follow its reference it may be as large as the reference
-moved and a little more, otherwise it stays within the band. Limit cycles and energies are evidence only while the
-reference rests and the loop had time to settle, since the last step of the reference and since the last change of
-parameters; in that time new parameters are compared with the certified band, then with the predicted one. Samples are
-taken together in slots of 10 ms: the mean error of a slot keeps the loop's motion and little of the sensor's noise, the
-sums of squares keep everything.
+The error is watched at all times: while the loop follows a move of its reference, the error may be a little larger than
+that move; otherwise it must stay within the band. Limit cycles and energies count as evidence only while the reference
+rests and the loop had time to settle since the last move and the last change of parameters. Until then new parameters
+are compared with the certified band, afterwards with the predicted one. Samples are grouped in slots of 10 ms: the mean
+error of a slot has the loop's motion and little of the sensor's noise; the sums of squares have both.
 """
 
 from collections import deque
@@ -80,9 +79,9 @@ class Watch:
     rate : float
         Samples per second.
     reference : float
-        Before the first sample, m.
+        Reference before the first sample, m.
     certified : Band, optional
-        Band that the loop has to stay within at all times, whatever is predicted.
+        Band within which the loop must stay at all times, whatever the prediction is.
     """
 
     def __init__(
@@ -98,12 +97,13 @@ class Watch:
 
     @property
     def verified(self) -> bool:
-        """The loop kept the predicted band for a whole window under the parameters in force."""
+        """True where the loop kept the predicted band for a full window under the parameters in force."""
         return len(self._squares) == self._squares.maxlen
 
     def restart(self, predicted: Band | None, sample: int) -> None:
         """Begin anew with other parameters, in force from a sample on."""
-        self._band = effective_band(predicted, self._certified)
+        self._band = _effective_band(predicted, self._certified)
+        # A sine has sqrt(2) times its root mean square as amplitude: smaller swings are inside the band.
         self._floor = max(self.settings.error_floor, 0.0 if self._band is None else sqrt(2.0) * self._band.error_rms)
         self._verify_from = sample + self._settling
         self._outside = 0
@@ -135,7 +135,7 @@ class Watch:
     def _update_slot(
         self, sample: int, reference: Sequence[float], errors: Sequence[float], voltage: Sequence[float]
     ) -> Violation | None:
-        """Take one more slot, which begins with a sample."""
+        """Take one more slot, the first sample of which has number `sample`."""
         mean = sum(errors) / len(errors)
         if not isfinite(mean):
             return None
@@ -168,7 +168,7 @@ class Watch:
         self._turns = TurningPoints(self._floor, self.settings.swings)
 
     def _check_error(self, sample: int, size: float) -> Violation | None:
-        """Compare the error with the band and the reference's moves: it may be larger for a short time."""
+        """Compare the error with the band and the reference's moves; it may exceed them for `persist_s`."""
         band = self._certified if sample < self._verify_from else self._band
         if band is None:
             return None
@@ -180,7 +180,7 @@ class Watch:
         return Violation(Cause.ERROR, size, allowed) if long else None
 
     def _check_cycle(self, mean: float) -> Violation | None:
-        """Look for an oscillation that lasts."""
+        """Check for a sustained oscillation."""
         if not self._turns.add(mean):
             return None
         amplitude = self._turns.sustained(self._floor, self.settings.similarity)
@@ -201,10 +201,10 @@ class Watch:
         return None
 
 
-def effective_band(predicted: Band | None, certified: Band | None) -> Band | None:
-    """Band that the loop is compared with: error and settling are certified at worst, the effort is predicted.
+def _effective_band(predicted: Band | None, certified: Band | None) -> Band | None:
+    """Combine the bands: error and settling at least as tight as certified, effort as predicted.
 
-    A smaller error counts where the loop is predicted to come to it as soon as to what is certified.
+    A predicted error below the certified one counts only where the predicted settling is not slower than the certified.
     """
     if predicted is None or certified is None:
         return predicted or certified
@@ -218,7 +218,7 @@ def effective_band(predicted: Band | None, certified: Band | None) -> Band | Non
     )
 
 
-class Extreme(NamedTuple):
+class _Extreme(NamedTuple):
     """A value (m), and the sample until which it counts."""
 
     until: int
@@ -230,8 +230,9 @@ class ReferenceMoves:
 
     def __init__(self) -> None:
         self._until = 0
-        self._lows: deque[Extreme] = deque()
-        self._highs: deque[Extreme] = deque()
+        # Monotonic queues: an extreme that a later, more extreme one outlives is dropped, so the ends are the extremes.
+        self._lows: deque[_Extreme] = deque()
+        self._highs: deque[_Extreme] = deque()
 
     def __bool__(self) -> bool:
         """True while the loop may still follow a move."""
@@ -249,32 +250,31 @@ class ReferenceMoves:
             self._lows.pop()
         while self._highs and self._highs[-1].value <= high:
             self._highs.pop()
-        self._lows.append(Extreme(self._until, low))
-        self._highs.append(Extreme(self._until, high))
+        self._lows.append(_Extreme(self._until, low))
+        self._highs.append(_Extreme(self._until, high))
 
     def expire(self, sample: int) -> None:
-        """Forget moves that need not be followed any more."""
+        """Remove the moves that are over at a sample."""
         for extremes in (self._lows, self._highs):
             while extremes and extremes[0].until <= sample:
                 extremes.popleft()
 
 
 class TurningPoints:
-    """Turning points of a signal, by their size: one counts when the signal has come back from it by more than
-    `reversal`.
+    """Turning points of a signal: an extreme counts once the signal has come back from it by more than `reversal`.
 
     Parameters
     ----------
     reversal : float
         In the signal's unit.
     swings : int
-        Swings, from turn to turn, that are kept.
+        Number of last swings, from turn to turn, that are stored.
     """
 
     def __init__(self, reversal: float, swings: int) -> None:
         self._reversal, self._swings = reversal, swings
         self._points: deque[tuple[int, float]] = deque(maxlen=swings + 1)
-        self._found = 0
+        self._turns = 0
         self._place, self._direction = 0, 1.0
         self._extreme: tuple[int, float] | None = None
 
@@ -287,7 +287,7 @@ class TurningPoints:
         if abs(value - self._extreme[1]) <= self._reversal:
             return False
         self._points.append(self._extreme)
-        self._found += 1
+        self._turns += 1
         self._direction, self._extreme = -self._direction, (self._place, value)
         return True
 
@@ -301,7 +301,7 @@ class TurningPoints:
         similarity : float
             Factor by which a swing may be smaller than one before it, and half a period differ from another.
         """
-        if self._found < self._swings + 2:  # the first point is where the record began, no turn
+        if self._turns < self._swings + 2:  # the first point is where the record began, no turn
             return None
         pairs = list(pairwise(self._points))
         sizes = [abs(after[1] - before[1]) for before, after in pairs]

@@ -1,6 +1,6 @@
-"""Hook of an optional window filter: it looks at each cut window and chooses which are sent.
+"""Hook of an optional window filter, which chooses the cut windows that are sent.
 
-The agent's settings carry a `WindowFilterSettings`. The edge's core names no implementation; novelty is one.
+The agent's settings carry a `WindowFilterSettings`. The edge's core names no implementation; `servotwin.novelty` is one.
 """
 
 from typing import Protocol
@@ -12,7 +12,7 @@ class WindowFilter(Protocol):
     """A filter at work on the windows of one boot."""
 
     def __call__(self, cut: Cut) -> Cut | None:
-        """Return the window to send, perhaps with another reason; None: it is not sent."""
+        """Return the window to send, perhaps with another reason; None: do not send it."""
 
     def dumps(self) -> bytes:
         """Encode the state, which `WindowFilterSettings.start` takes in the next boot."""

@@ -13,7 +13,7 @@ from servotwin.edge.switch import Rules
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput
-from servotwin.link.url import is_encrypted
+from servotwin.link.url import is_encrypted, tls_context
 from servotwin.runtime.extras import check_extra
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import locked
@@ -43,13 +43,7 @@ def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
         check_extra("paho", f"{config.source}: [twin]: url = {twin.url!r}")
     if twin.ca_file is None or not is_encrypted(twin.url):
         return
-    import ssl
-
-    path = config.path(twin.ca_file)
-    try:
-        ssl.create_default_context(cafile=str(path))
-    except OSError as error:
-        raise InvalidInput(f"{path}: holds no certificates that can be read ({error.strerror or error})") from None
+    tls_context(str(config.path(twin.ca_file)))
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A connection to an MQTT 5 broker that comes back by itself; what both ends of the link over MQTT stand on.
+"""Connection to an MQTT 5 broker, which reconnects by itself; the edge and the twin both use it.
 
 Needs paho-mqtt (extra `mqtt`), which is imported when a connection is made.
 """
@@ -6,7 +6,6 @@ Needs paho-mqtt (extra `mqtt`), which is imported when a connection is made.
 from __future__ import annotations
 
 import socket
-import ssl
 import sys
 import threading
 from collections.abc import Callable
@@ -15,18 +14,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
+from servotwin.link.url import tls_context
 from servotwin.runtime.extras import missing_extra
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, MQTTMessage
 
-SCHEMES = {"mqtt": 1883, "mqtts": 8883}
-KEEP_ALIVE_S = 20
-"""A connection over which nothing comes for half as long again is given up."""
-QUEUED = 10_000
-"""Messages that wait for the broker at most."""
-LINGER_S = 1.0
-"""For a last word when the connection is let go."""
+_SCHEMES = {"mqtt": 1883, "mqtts": 8883}
+_KEEP_ALIVE_S = 20
+"""Period of the pings; a connection that is silent for half as long again counts as broken."""
+_MOST_QUEUED = 10_000
+"""Largest number of messages that wait for the broker."""
+_LINGER_S = 1.0
+"""Longest time that a DISCONNECT may take when the connection is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +39,9 @@ class Broker:
         mqtt(s)://host[:port].
     user : str, optional
     password : str, optional
-        Not shown.
+        Not shown in `repr`.
     ca_file : str, optional
-        Certificates that the broker's is checked against; None: the system's.
+        File of the certificates that the broker's is checked against; None: the system's.
     """
 
     url: str
@@ -64,15 +64,15 @@ class Broker:
     def address(self) -> tuple[str, int]:
         """Host and port."""
         parts = urlsplit(self.url)
-        return parts.hostname or "", parts.port or SCHEMES[parts.scheme]
+        return parts.hostname or "", parts.port or _SCHEMES[parts.scheme]
 
 
 def is_mqtt(url: str) -> bool:
-    """True for a broker's address: mqtt(s)://host[:port]."""
+    """True where a URL is a broker's: mqtt(s)://host[:port]."""
     try:
         parts = urlsplit(url)
         plain = parts.path in ("", "/") and not (parts.query or parts.fragment) and parts.username is None
-        return parts.scheme in SCHEMES and bool(parts.hostname) and plain and parts.port != 0
+        return parts.scheme in _SCHEMES and bool(parts.hostname) and plain and parts.port != 0
     except ValueError:
         return False
 
@@ -83,15 +83,15 @@ class MqttSession(NamedTuple):
     Attributes
     ----------
     client_id : str
-        The broker knows a session by it.
+        Identifies the session at the broker.
     topics : tuple of str
-        Subscribed to, at least once each.
+        Subscriptions, with delivery at least once.
     session_s : int
-        How long the broker keeps a session, and what comes for it, when its connection broke.
+        Time for which the broker keeps the session, and the messages for it, after its connection broke.
     receive : int
-        Messages under way to this end that are not acknowledged yet.
+        Largest number of messages to this end that are not acknowledged yet.
     will : str
-        Topic of what the broker says when the connection breaks; empty: nothing.
+        Topic of the message that the broker publishes when the connection breaks; empty: none.
     """
 
     client_id: str
@@ -107,23 +107,24 @@ class MqttCallbacks(NamedTuple):
     Attributes
     ----------
     message : callable
-        Topic, payload, and what acknowledges it to the broker (from any thread; without effect on a later connection).
+        Called with topic, payload, and a function that acknowledges the message to the broker (from any thread; it has
+        no effect on a later connection).
     ready : callable
-        Subscribed; whether the broker has forgotten the session.
+        Called after the subscription; the argument is True where the broker has forgotten the session.
     lost : callable
-        The connection broke or was refused, and why.
-    unheard : callable
-        The broker took the message of that number, but nobody has subscribed to its topic.
+        Called with the reason when the connection broke or was refused.
+    no_subscriber : callable
+        Called with the number of a message that the broker accepted although its topic has no subscriber.
     """
 
     message: Callable[[str, bytes, Callable[[], None]], None]
     ready: Callable[[bool], None]
     lost: Callable[[str], None]
-    unheard: Callable[[int], None] = lambda _: None
+    no_subscriber: Callable[[int], None] = lambda _: None
 
 
 class Connection:
-    """Kept up until it is closed.
+    """Connection that is restored after every loss until it is closed.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ class Connection:
     """
 
     def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
-        self._wanted, self._events = session, events
+        self._session, self._events = session, events
         self._number, self._fresh, self._up, self._closing = 0, True, False, False
         self._client = _client(broker, session)
         self._client.on_socket_open = _no_delay
@@ -142,26 +143,26 @@ class Connection:
         self._client.on_publish = self._published
         self._client.on_connect_fail = self._failed
         self._client.connect_async(
-            *broker.address, keepalive=KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(session)
+            *broker.address, keepalive=_KEEP_ALIVE_S, clean_start=False, properties=_connect_properties(session)
         )
         self._client.loop_start()
 
     def publish(self, topic: str, payload: bytes, expiry_s: float) -> int | None:
-        """Send at least once, while anybody may still want it; its number, None where too much waits already."""
+        """Send at least once, within `expiry_s`; return the message's number, None where too many wait already."""
         properties = _properties("PUBLISH", MessageExpiryInterval=max(1, round(expiry_s)))
         info = self._client.publish(topic, payload, qos=1, properties=properties)
         return info.mid if info.rc in (0, _NO_CONNECTION) else None
 
     def close(self) -> None:
-        """Say good-bye and let go; a broker that does not listen is waited for no longer than a moment."""
+        """Disconnect; a broker that does not respond delays this by `_LINGER_S` at most."""
         self._closing = True
-        line = self._client.socket()
+        connection = self._client.socket()
         self._client.disconnect()
-        cut = threading.Timer(LINGER_S, _shut, (line,))
-        cut.start()
+        timer = threading.Timer(_LINGER_S, _shut, (connection,))  # loop_stop waits for the socket, without a limit
+        timer.start()
         self._client.loop_stop()
-        cut.cancel()
-        cut.join()
+        timer.cancel()
+        timer.join()
 
     def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
@@ -169,7 +170,7 @@ class Connection:
             return
         self._number, self._up = self._number + 1, True
         self._fresh = not flags.session_present
-        client.subscribe([(topic, _at_least_once()) for topic in self._wanted.topics])
+        client.subscribe([(topic, _at_least_once()) for topic in self._session.topics])
 
     def _subscribed(self, client: Client, _user: Any, _mid: int, reasons: list[Any], _properties: Any) -> None:
         if any(reason.is_failure for reason in reasons):
@@ -184,27 +185,27 @@ class Connection:
         self._up = False
 
     def _failed(self, _client: Client, _user: Any) -> None:
-        """Called while the exception is being handled, which paho does not pass on."""
+        # paho calls this while it handles the exception, which it does not pass on.
         self._events.lost(f"the broker cannot be reached ({sys.exc_info()[1]})")
 
     def _published(self, _client: Client, _user: Any, mid: int, reason: Any, _properties: Any) -> None:
         if reason.value == _NO_SUBSCRIBERS:
-            self._events.unheard(mid)
+            self._events.no_subscriber(mid)
 
     def _message(self, _client: Client, _user: Any, message: MQTTMessage) -> None:
         number, mid, qos = self._number, message.mid, message.qos
 
         def acknowledge() -> None:
-            if number == self._number:
+            if number == self._number:  # message ids begin again with each connection
                 self._client.ack(mid, qos)
 
         self._events.message(message.topic, bytes(message.payload), acknowledge)
 
 
 _NO_SUBSCRIBERS = 0x10
-"""MQTT's reason code of a message that nobody gets."""
+"""MQTT's reason code "no matching subscribers"."""
 _NO_CONNECTION = 4
-"""paho's code: the message is kept and sent when there is a connection."""
+"""paho's code for a message that is queued until there is a connection."""
 
 
 def _client(broker: Broker, session: MqttSession) -> Client:
@@ -214,23 +215,16 @@ def _client(broker: Broker, session: MqttSession) -> Client:
     except ModuleNotFoundError:
         raise missing_extra("paho", "the link over MQTT") from None
     client = Client(CallbackAPIVersion.VERSION2, session.client_id, protocol=MQTTv5, manual_ack=True)
-    client.max_queued_messages_set(QUEUED)
+    client.max_queued_messages_set(_MOST_QUEUED)
     client.max_inflight_messages_set(session.receive)
     client.reconnect_delay_set(1, 4)
     if broker.user is not None:
         client.username_pw_set(broker.user, broker.password)
     if broker.tls:
-        client.tls_set_context(_context(broker.ca_file))
+        client.tls_set_context(tls_context(broker.ca_file))
     if session.will:
         client.will_set(session.will, b"", qos=1)
     return client
-
-
-def _context(ca_file: str | None) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca_file)
-    except (OSError, ssl.SSLError) as error:
-        raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({error})") from None
 
 
 def _connect_properties(session: MqttSession) -> Any:
@@ -253,14 +247,14 @@ def _at_least_once() -> Any:
     return SubscribeOptions(qos=1)
 
 
-def _no_delay(_client: Any, _user: Any, line: Any) -> None:
-    """Measured without it: 88 ms there and back on one machine, since every small packet waits for an ACK of TCP."""
-    line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+def _no_delay(_client: Any, _user: Any, connection: Any) -> None:
+    # Without it a round trip on one machine took 88 ms: every small packet waits for TCP's ACK of the last one.
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-def _shut(line: Any) -> None:
+def _shut(connection: Any) -> None:
     try:
-        if line is not None:
-            line.shutdown(socket.SHUT_RDWR)
+        if connection is not None:
+            connection.shutdown(socket.SHUT_RDWR)
     except OSError:
         return

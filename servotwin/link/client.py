@@ -1,4 +1,4 @@
-"""The edge's half of the link over a transport that answers: one step sends one message, or polls once."""
+"""The edge's half of the link over a transport with responses: one step sends one message, or polls once."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -20,11 +20,11 @@ class Sent(NamedTuple):
     Attributes
     ----------
     wait_s : float
-        Time until something is due; inf: until something is put into the outbox.
+        Time until something is due; inf: nothing is due until something is put into the outbox.
     window : Key, optional
-        The window that the twin has now.
+        Window that the twin has acknowledged in this step.
     reconnected : bool
-        The twin was out of reach before.
+        The twin is reached again after it was out of reach.
     """
 
     wait_s: float = 0.0
@@ -34,7 +34,7 @@ class Sent(NamedTuple):
 
 @dataclass(slots=True)
 class Sender:
-    """Delivers what a session says is due.
+    """Delivers the messages that are due in a session.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Sender:
         try:
             outbox = session.outbox
             self.transport.deliver(outbox.letter(item) if isinstance(item, bytes) else outbox.parcel(item))
-        except KeyError:  # dropped meanwhile, or its file cannot be read just now
+        except KeyError:  # another thread has dropped it meanwhile, or the disk cannot be read just now
             session.retry_later(item, now)
         except Unreachable as error:
             session.unreachable(now, str(error))
@@ -75,7 +75,7 @@ class Received(NamedTuple):
     wait_s : float
         Time to wait before the next poll.
     messages : list of (int, bytes)
-        Serial and encoded message, rising.
+        Serials, in rising order, and encoded messages.
     """
 
     wait_s: float
@@ -84,7 +84,7 @@ class Received(NamedTuple):
 
 @dataclass(slots=True)
 class Receiver:
-    """Polls a transport; each message is checked, and returned once and in order.
+    """Polls a transport, checks each message, and returns it once and in order.
 
     Parameters
     ----------
@@ -94,14 +94,14 @@ class Receiver:
         Serial of the last message that was handled.
     retry : Retry
     chance : callable
-        Uniform in 0 .. 1.
+        Returns random numbers, uniform in 0 .. 1.
 
     Attributes
     ----------
     counts : Counter
-        Messages received, polls that failed, messages rejected and why.
+        Messages received, polls that failed, and messages rejected, by reason.
     trouble : str
-        Why nothing is received; empty: it is.
+        Reason for which nothing is received; empty: there is none.
     """
 
     transport: Transport
@@ -118,7 +118,7 @@ class Receiver:
         self._backoff = Backoff(self.retry)
 
     def step(self) -> Received:
-        """Poll once; this waits as long as the transport does."""
+        """Poll once; this blocks as long as the transport does."""
         try:
             received = self.transport.listen(self.after)
         except Unreachable as error:
@@ -126,14 +126,14 @@ class Receiver:
         except Refused as error:
             return self._pause(f"refused: {error.reason.value}", str(error), error.after_s)
         messages = [message for message in map(self._checked, received) if message is not None]
-        if received and not messages:  # or the same would come again at once, for ever
+        if received and not messages:  # without a pause the next poll would bring the same at once, for ever
             return self._pause("nothing new", "the twin's messages are broken, repeated or not for an edge", 0.0)
         self._backoff.succeeded()
         self.trouble = ""
         return Received(0.0, messages)
 
     def _checked(self, data: bytes) -> tuple[int, bytes] | None:
-        """Return serial and body of a message whose seal is whole, that is new, and that an edge takes."""
+        """Return serial and body of a message for an edge that is new and whose seal is intact; else None."""
         try:
             sealed = opened(key_of(verifier_of(self.token)), TO_EDGE, self.servo, data, MAX_BYTES)
         except InvalidMessage:

@@ -3,34 +3,38 @@
 from __future__ import annotations
 
 import socket
-import ssl
 import time
 from collections.abc import Callable
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from threading import Lock
+from typing import TYPE_CHECKING
 from urllib.parse import quote, urlsplit
 
 import msgspec
 
-from servotwin.errors import InvalidInput
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.link.url import is_encrypted
+from servotwin.link.url import is_encrypted, tls_context
 from servotwin.messages import MAX_BYTES, Acknowledge, InvalidMessage, Refusal, decode
 
+if TYPE_CHECKING:
+    import ssl
+
 BODY = "application/msgpack"
-LONGEST_PAUSE_S = 300.0
+_LONGEST_PAUSE_S = 300.0
+"""A longer Retry-After is cut to this."""
 _PIECE = 65536
-_ANSWER, _ERROR = 64 * 1024, 8 * 1024
+_LONGEST_RESPONSE, _LONGEST_ERROR = 64 * 1024, 8 * 1024
+"""Bytes of a response to a message, and of an error, that are read."""
 
 
 class _RefusalBody(msgspec.Struct, frozen=True):
-    """The body of a refusal."""
+    """Body of a refusal."""
 
     code: Refusal
     detail: str = ""
 
 
-class HttpReply(msgspec.Struct, frozen=True):
+class _Response(msgspec.Struct, frozen=True):
     """Status, body and Retry-After of a response."""
 
     status: int
@@ -38,8 +42,8 @@ class HttpReply(msgspec.Struct, frozen=True):
     retry_after: str
 
 
-class HttpLine:
-    """One connection, kept open from request to request; opened again when the other side has closed it.
+class _PersistentConnection:
+    """One connection, which stays open from request to request and is opened again when the server has closed it.
 
     Parameters
     ----------
@@ -47,11 +51,11 @@ class HttpLine:
         http(s)://host[:port][/path].
     token : str
     timeout_s : float
-        For one request, with its answer, s.
+        Time limit of one request and its response, s.
     context : ssl.SSLContext, optional
         For https.
     clock : callable
-        Monotonic, s.
+        Returns monotonic seconds.
     """
 
     def __init__(
@@ -67,20 +71,21 @@ class HttpLine:
         self._connection: HTTPConnection | None = None
         self._closed, self._busy = False, Lock()
 
-    def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
-        """One request and its answer, of `limit` bytes at most; raises Unreachable."""
+    def request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
+        """Send one request and return its response, of `limit` bytes at most; raises Unreachable."""
         with self._busy:
-            return self._ask(method, path, body, headers, limit)
+            return self._request(method, path, body, headers, limit)
 
-    def _ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
+    def _request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
         fresh = self._connection is None
         try:
-            return self._once(method, path, body, headers, limit)
+            return self._request_once(method, path, body, headers, limit)
         except (OSError, HTTPException, ValueError) as error:
             self.drop()
+            # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
             if fresh or isinstance(error, TimeoutError):
                 raise Unreachable(f"{type(error).__name__}: {error}") from None
-        return self._ask(method, path, body, headers, limit)
+        return self._request(method, path, body, headers, limit)
 
     def drop(self) -> None:
         """Close the connection; the next request opens another."""
@@ -89,7 +94,7 @@ class HttpLine:
             connection.close()
 
     def close(self) -> None:
-        """No more requests; the one under way fails at once."""
+        """Allow no more requests; the one under way fails at once."""
         self._closed = True
         connection = self._connection
         if self._busy.acquire(blocking=False):
@@ -98,16 +103,17 @@ class HttpLine:
         elif connection is not None and connection.sock is not None:
             _shut(connection)
 
-    def _once(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> HttpReply:
+    def _request_once(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int
+    ) -> _Response:
         connection = self._connection or self._open()
         deadline = self._clock() + self._timeout
         connection.request(method, self._parts.path.rstrip("/") + path, body, {**self._headers, **headers})
         response = connection.getresponse()
         data = self._read(response, limit, deadline)
-        answer = HttpReply(response.status, data, response.headers.get("Retry-After", ""))
         if response.will_close:
             self.drop()
-        return answer
+        return _Response(response.status, data, response.headers.get("Retry-After", ""))
 
     def _open(self) -> HTTPConnection:
         if self._closed:
@@ -120,17 +126,17 @@ class HttpLine:
         return self._connection
 
     def _read(self, response: HTTPResponse, limit: int, deadline: float) -> bytes:
-        """The body; a server that sends too much, or byte by byte, is left."""
+        """Read the body; raise where it is longer than `limit` bytes, or not complete at the deadline."""
         pieces: list[bytes] = []
         size = 0
         while piece := response.read1(_PIECE):
             size += len(piece)
             if size > limit:
-                raise HTTPException(f"an answer of more than {limit} bytes")
+                raise HTTPException(f"a response of more than {limit} bytes")
             if self._clock() > deadline:
-                raise TimeoutError("the answer takes too long")
+                raise TimeoutError("the response takes too long")
             pieces.append(piece)
-        response.close()  # all of it is read: the connection is free for the next request
+        response.close()  # the connection is free for the next request only after this
         return b"".join(pieces)
 
 
@@ -143,11 +149,11 @@ class HttpTransport:
         http(s)://host[:port][/path].
     servo, token : str
     ca_file : str, optional
-        Certificates that the twin's is checked against; None: the system's.
+        File of the certificates that the twin's is checked against; None: the system's.
     timeout_s : float
-        For an answer, s.
+        Time limit of a response, s.
     wait_s : float
-        How long one poll waits, s.
+        Time for which one poll waits for a message, s.
     """
 
     def __init__(
@@ -159,10 +165,10 @@ class HttpTransport:
         timeout_s: float = 10.0,
         wait_s: float = 25.0,
     ) -> None:
-        context = _context(ca_file) if is_encrypted(url) else None
+        context = tls_context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
-        self._up = HttpLine(url, token, timeout_s, context)
-        self._down = HttpLine(url, token, timeout_s + wait_s, context)
+        self._up = _PersistentConnection(url, token, timeout_s, context)
+        self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
@@ -170,60 +176,56 @@ class HttpTransport:
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
         if not parcel.is_window:
-            _checked(self._up.ask("POST", f"{self._base}/letters", parcel.body, headers, _ANSWER), (200, 202))
+            path = f"{self._base}/letters"
+            _checked(self._up.request("POST", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 202))
             return
         path = f"{self._base}/windows/{quote(parcel.boot, safe='')}/{parcel.sequence}"
-        answer = _checked(self._up.ask("PUT", path, parcel.body, headers, _ANSWER), (200, 201))
+        response = _checked(self._up.request("PUT", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 201))
         expected = Acknowledge(parcel.servo, parcel.boot, parcel.sequence)
-        if not any(_is(expected, data) for data in _listed(answer.body)):
+        # A proxy's login page has status 200 too: only the acknowledgement itself counts.
+        if not any(_is(expected, data) for data in _decode_list(response.body)):
             raise Unreachable("the answer to a window does not acknowledge it: whoever answers is not the twin")
 
     def listen(self, after: int) -> list[bytes]:
-        """The twin's messages with serials above `after`; see `Transport`."""
+        """Return the twin's messages with serials above `after`; see `Transport`."""
         path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
-        return _listed(_checked(self._down.ask("GET", path, None, {}, 4 * MAX_BYTES), (200,)).body)
+        return _decode_list(_checked(self._down.request("GET", path, None, {}, 4 * MAX_BYTES), (200,)).body)
 
     def close(self) -> None:
-        """Let go of both connections."""
+        """Close both connections."""
         self._up.close()
         self._down.close()
 
 
-def _context(ca_file: str | None) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca_file)
-    except (OSError, ssl.SSLError) as error:
-        raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({error})") from None
-
-
 def _shut(connection: HTTPConnection) -> None:
-    """Wake whoever waits for an answer on it."""
+    """Wake the thread that waits for a response on a connection."""
     try:
         connection.sock.shutdown(socket.SHUT_RDWR)
     except OSError:
         return
 
 
-def _checked(answer: HttpReply, good: tuple[int, ...]) -> HttpReply:
-    """The answer, if it is a good one.
+def _checked(response: _Response, good: tuple[int, ...]) -> _Response:
+    """Return a response whose status is good; raise `Refused` or `Unreachable` for any other.
 
-    Only a reason code of the twin's own refuses a message; whatever else stands in between makes it unreachable.
+    Only a reason code of the twin refuses a message; any other error, as of a proxy, means that the twin is out of
+    reach.
     """
-    if answer.status in good:
-        return answer
+    if response.status in good:
+        return response
     try:
-        said = msgspec.json.decode(answer.body[:_ERROR], type=_RefusalBody)
+        refusal = msgspec.json.decode(response.body[:_LONGEST_ERROR], type=_RefusalBody)
     except (msgspec.MsgspecError, UnicodeDecodeError):
-        raise Unreachable(f"HTTP status {answer.status}, without a reason code of the twin's") from None
-    raise Refused(said.code, said.detail[:200], _seconds(answer.retry_after))
+        raise Unreachable(f"HTTP status {response.status}, without a reason code of the twin's") from None
+    raise Refused(refusal.code, refusal.detail[:200], _retry_after_s(response.retry_after))
 
 
-def _seconds(text: str) -> float:
-    """Of a Retry-After header; 0 where it says nothing useful."""
-    return min(float(text), LONGEST_PAUSE_S) if text.isascii() and text.isdigit() else 0.0
+def _retry_after_s(text: str) -> float:
+    """Time in a Retry-After header, s; 0 where it is no number of seconds."""
+    return min(float(text), _LONGEST_PAUSE_S) if text.isascii() and text.isdigit() else 0.0
 
 
-def _listed(body: bytes) -> list[bytes]:
+def _decode_list(body: bytes) -> list[bytes]:
     try:
         return msgspec.msgpack.decode(body, type=list[bytes])
     except (msgspec.MsgspecError, ValueError, RecursionError):

@@ -1,8 +1,8 @@
 """Link over an MQTT 5 broker: the same guarantees as over HTTP, whatever the broker forgets.
 
-A window counts as delivered when a twin has answered that it is committed; that the broker has it means nothing. What
-is not answered is asked again by whoever keeps the windows. The twin's messages are asked for by serial, so that
-none is missed while the broker, or the edge, is away.
+A window counts as delivered when a twin has responded that it is committed; the broker's own acknowledgement does not
+count. The session repeats a request without a response. A poll names the serial after which it wants the twin's
+messages, so that none is missed while the broker or the edge is away.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
 
-SESSION_S = 3600
-NO_SUBSCRIBER = "no twin listens at the broker"
+_SESSION_S = 3600
+_NO_SUBSCRIBER = "no twin listens at the broker"
 
 
 class MqttTransport:
@@ -44,23 +44,23 @@ class MqttTransport:
     ----------
     broker : Broker
     servo, token : str
-        The token is never sent: it seals.
+        The token is never sent: its key seals the messages.
     timeout_s : float
-        For an answer, s.
+        Time limit of a response, s.
     wait_s : float
-        How long one poll waits, s.
+        Time for which one poll waits for a message, s.
     """
 
     def __init__(self, broker: Broker, servo: str, token: str, timeout_s: float = 10.0, wait_s: float = 25.0) -> None:
         self._servo, self._key = servo, key_of(verifier_of(token))
         self._timeout, self._wait = timeout_s, wait_s
-        # Beginning anywhere, so that no answer to an earlier process is taken for one to this.
+        # Serials begin at random, so that a response to an earlier process does not match a request of this one.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
         self._waiting: dict[int, Future[MqttResponse | UnknownPeer]] = {}
-        self._sent: dict[int, Future[MqttResponse | UnknownPeer]] = {}
-        self._unheard: set[int] = set()
+        self._published: dict[int, Future[MqttResponse | UnknownPeer]] = {}
+        self._without_subscriber: set[int] = set()
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
-        session = MqttSession(f"servotwin-edge-{servo}", (response_topic(servo), TWIN_GONE), SESSION_S)
+        session = MqttSession(f"servotwin-edge-{servo}", (response_topic(servo), TWIN_GONE), _SESSION_S)
         self._connection = Connection(
             broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._no_subscriber)
         )
@@ -74,21 +74,21 @@ class MqttTransport:
             raise Unreachable("the answer to a message does not acknowledge it")
 
     def listen(self, after: int) -> list[bytes]:
-        """The twin's messages with serials above `after`; see `Transport`."""
+        """Return the twin's messages with serials above `after`; see `Transport`."""
         response = self._request(PollRequest(after, self._wait), self._wait + self._timeout)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection; requests under way raise `Unreachable`."""
         self._closed = True
-        self._give_up("the link is closed")
+        self._fail_all("the link is closed")
         self._ready.set()
         self._connection.close()
 
     def _request(self, request: MqttRequest, patience: float) -> MqttResponse:
-        """The answer to a question; raises Refused and Unreachable."""
+        """Send a request and return its response; raises Refused and Unreachable."""
         if not self._ready.wait(self._timeout):
             raise Unreachable(self._why)
         serial, future = self._expect()
@@ -101,7 +101,7 @@ class MqttTransport:
         finally:
             with self._lock:
                 del self._waiting[serial]
-                self._sent.pop(number, None)
+                self._published.pop(number, None)
         if isinstance(response, UnknownPeer):
             raise Refused(Refusal.BAD_TOKEN, "the twin knows the servo by another token")
         if isinstance(response, RefusedResponse):
@@ -115,31 +115,32 @@ class MqttTransport:
         return serial, future
 
     def _send(self, data: bytes, patience: float, future: Future[MqttResponse | UnknownPeer]) -> int:
-        """Publish a question; the broker may have response that nobody hears it before its number is known here."""
+        """Publish a request and return its number at the broker."""
         number = None if self._closed else self._connection.publish(request_topic(self._servo), data, patience)
         if number is None:
             raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
         with self._lock:
-            self._sent[number] = future
-            unheard = number in self._unheard
-            self._unheard.discard(number)
-        if unheard:
-            _set_result(future, Unreachable(NO_SUBSCRIBER))
+            self._published[number] = future
+            # The broker may report that there is no subscriber before `publish` has returned the number.
+            without_subscriber = number in self._without_subscriber
+            self._without_subscriber.discard(number)
+        if without_subscriber:
+            _set_result(future, Unreachable(_NO_SUBSCRIBER))
         return number
 
     def _no_subscriber(self, number: int) -> None:
         with self._lock:
-            future = self._sent.get(number)
+            future = self._published.get(number)
             if future is None:
-                self._unheard.add(number)
+                self._without_subscriber.add(number)
         if future is not None:
-            _set_result(future, Unreachable(NO_SUBSCRIBER))
+            _set_result(future, Unreachable(_NO_SUBSCRIBER))
 
     def _message(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        """Something came: an answer, or word that a twin is gone; what cannot be used is as if it had not come."""
+        """Handle a response, or the news that a twin is gone; ignore anything else."""
         acknowledge()
         if topic == TWIN_GONE:
-            self._give_up("a twin is gone")
+            self._fail_all("a twin is gone")
             return
         try:
             serial, response = decode_response(self._key, self._servo, payload)
@@ -151,18 +152,18 @@ class MqttTransport:
             _set_result(future, response)
 
     def _connected(self, forgotten: bool) -> None:
-        """A broker that has forgotten the session has forgotten the questions too."""
+        """Fail the requests under way where the broker has forgotten the session, and them with it."""
         if forgotten:
-            self._give_up("the broker has forgotten this edge")
+            self._fail_all("the broker has forgotten this edge")
         self._ready.set()
 
     def _lost(self, why: str) -> None:
-        """Questions under way stay: broker and edge go on with them when the connection is back."""
+        """Keep the requests under way: broker and edge go on with them when the connection is restored."""
         self._why = why
         if not self._closed:
             self._ready.clear()
 
-    def _give_up(self, why: str) -> None:
+    def _fail_all(self, why: str) -> None:
         with self._lock:
             waiting = list(self._waiting.values())
         for future in waiting:
@@ -170,7 +171,7 @@ class MqttTransport:
 
 
 def _set_result(future: Future[MqttResponse | UnknownPeer], result: MqttResponse | UnknownPeer | Exception) -> None:
-    """The first answer counts."""
+    """Set the result of a future; where it has one already, that one counts."""
     try:
         if isinstance(result, Exception):
             future.set_exception(result)

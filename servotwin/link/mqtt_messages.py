@@ -1,7 +1,7 @@
 """Requests and responses of edge and twin over a broker: both sealed, matched by a serial.
 
-A broker only passes messages on, so that a token must not be shown to it: whoever can seal a request for a servo has
-the servo's token. A response is sealed with the serial of its request, so that nobody can repeat an old one.
+The broker passes messages on and must not see a token: a valid seal shows that the sender of a request has the servo's
+token. A response is sealed with the serial of its request, so that nobody can repeat an old one.
 
 Topics: `servotwin/SERVO/up` to the twins, `servotwin/SERVO/down` back, `servotwin/gone` when a twin's connection broke.
 """
@@ -19,9 +19,9 @@ from servotwin.messages.checks import Count
 ROOT = "servotwin"
 TWIN_GONE = f"{ROOT}/gone"
 REQUEST_TOPICS = f"{ROOT}/+/up"
-ANSWER = "answer to edge"
+_TO_EDGE = "answer to edge"  # the direction is part of the seal: changing it breaks links between versions
 LIMIT = 4 * MAX_BYTES + 2 * OVERHEAD
-"""Bytes of the largest answer: as many messages as one answer over HTTP holds."""
+"""Bytes of the largest response: as many messages as one response over HTTP holds."""
 _UP = re.compile(ROOT + r"/([A-Za-z0-9][A-Za-z0-9._-]{0,63})/up")
 
 
@@ -31,9 +31,9 @@ class PutRequest(Struct, frozen=True, tag="carry/1"):
     Attributes
     ----------
     body : bytes
-        Encoded, then compressed as `encoding` says.
+        Encoded message, compressed as `encoding` says.
     encoding : str
-        As HTTP's Content-Encoding; nothing stands for identity.
+        As HTTP's Content-Encoding; "" stands for identity.
     """
 
     body: bytes
@@ -46,9 +46,9 @@ class PollRequest(Struct, frozen=True, tag="listen/1"):
     Attributes
     ----------
     after : int
-        Only those of higher serials.
+        Only messages with higher serials are requested.
     wait : float
-        s to wait for the first one.
+        Time to wait for the first one, s.
     """
 
     after: Count
@@ -56,11 +56,11 @@ class PollRequest(Struct, frozen=True, tag="listen/1"):
 
 
 class PutResponse(Struct, frozen=True, tag="taken/1"):
-    """Response: the message is stored, now or from before."""
+    """Response: the message is stored, by this request or an earlier one."""
 
 
 class PollResponse(Struct, frozen=True, tag="heard/1"):
-    """Response: messages, each sealed, serials rising."""
+    """Response: messages, each sealed, with rising serials."""
 
     messages: list[bytes]
 
@@ -74,7 +74,7 @@ class RefusedResponse(Struct, frozen=True, tag="refused/1"):
     detail : str
         One sentence.
     after_s : float
-        Nothing is to be asked before that time has gone by.
+        Time for which the edge shall send no request, s.
     """
 
     code: Refusal
@@ -83,7 +83,10 @@ class RefusedResponse(Struct, frozen=True, tag="refused/1"):
 
 
 class UnknownPeer(Struct, frozen=True, tag="stranger/1"):
-    """Response to a request whose seal does not fit the servo's token; not sealed, and no reason to drop anything."""
+    """Response to a request whose seal does not fit the servo's token.
+
+    It is not sealed, so anybody may have sent it: the edge drops nothing because of it.
+    """
 
     serial: Count
 
@@ -93,16 +96,16 @@ MqttResponse = PutResponse | PollResponse | RefusedResponse
 
 
 class ReceivedRequest(NamedTuple):
-    """A request whose seal is whole."""
+    """A request whose seal is intact."""
 
     servo: str
     serial: int
-    question: MqttRequest
+    content: MqttRequest
 
 
-_question: msgspec.msgpack.Decoder[MqttRequest] = msgspec.msgpack.Decoder(MqttRequest)
-_answer: msgspec.msgpack.Decoder[MqttResponse] = msgspec.msgpack.Decoder(MqttResponse)
-_down: msgspec.msgpack.Decoder[Sealed | UnknownPeer] = msgspec.msgpack.Decoder(Sealed | UnknownPeer)
+_request_decoder: msgspec.msgpack.Decoder[MqttRequest] = msgspec.msgpack.Decoder(MqttRequest)
+_response_decoder: msgspec.msgpack.Decoder[MqttResponse] = msgspec.msgpack.Decoder(MqttResponse)
+_envelope_decoder: msgspec.msgpack.Decoder[Sealed | UnknownPeer] = msgspec.msgpack.Decoder(Sealed | UnknownPeer)
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -117,51 +120,51 @@ def response_topic(servo: str) -> str:
 
 
 def servo_of(topic: str) -> str | None:
-    """Return the servo of a request topic; None: it is none."""
-    found = _UP.fullmatch(topic)
-    return None if found is None else found.group(1)
+    """Return the servo of a request topic; None: it is not a request topic."""
+    match = _UP.fullmatch(topic)
+    return None if match is None else match.group(1)
 
 
-def encode_request(key: bytes, servo: str, serial: int, question: MqttRequest) -> bytes:
+def encode_request(key: bytes, servo: str, serial: int, request: MqttRequest) -> bytes:
     """Encode and seal a request."""
-    return seal(key, TO_TWIN, servo, serial, _encode(question))
+    return seal(key, TO_TWIN, servo, serial, _encode(request))
 
 
 def decode_request(key: bytes, servo: str, data: bytes) -> ReceivedRequest:
-    """Decode a request; raises InvalidMessage as `seal.opened` does, or where it is none."""
-    found = opened(key, TO_TWIN, servo, data, MAX_BYTES + OVERHEAD)
+    """Decode a request; raises InvalidMessage as `seal.opened` does, or where the body is not a request."""
+    sealed = opened(key, TO_TWIN, servo, data, MAX_BYTES + OVERHEAD)
     try:
-        return ReceivedRequest(servo, found.serial, _question.decode(found.body))
+        return ReceivedRequest(servo, sealed.serial, _request_decoder.decode(sealed.body))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidMessage(f"question not understood: {error}") from None
+        raise InvalidMessage(f"request not understood: {error}") from None
 
 
-def encode_response(key: bytes, servo: str, serial: int, said: MqttResponse) -> bytes:
+def encode_response(key: bytes, servo: str, serial: int, response: MqttResponse) -> bytes:
     """Encode and seal the response to the request of that serial."""
-    return seal(key, ANSWER, servo, serial, _encode(said))
+    return seal(key, _TO_EDGE, servo, serial, _encode(response))
 
 
 def encode_unknown_peer(data: bytes) -> bytes | None:
     """Encode the response to a request whose seal is broken; None where not even its serial can be read."""
-    found = _read(data, MAX_BYTES + 2 * OVERHEAD)
-    return _encode(UnknownPeer(found.serial)) if isinstance(found, Sealed) else None
+    envelope = _decode_envelope(data, MAX_BYTES + 2 * OVERHEAD)
+    return _encode(UnknownPeer(envelope.serial)) if isinstance(envelope, Sealed) else None
 
 
 def decode_response(key: bytes, servo: str, data: bytes) -> tuple[int, MqttResponse | UnknownPeer]:
-    """Decode a response and the serial of its request; raises InvalidMessage where the bytes are no good."""
-    found = _read(data, LIMIT + OVERHEAD)
-    if isinstance(found, UnknownPeer):
-        return found.serial, found
-    whole = opened(key, ANSWER, servo, data, LIMIT)
+    """Decode a response and the serial of its request; raises InvalidMessage where the bytes are not a response."""
+    envelope = _decode_envelope(data, LIMIT + OVERHEAD)
+    if isinstance(envelope, UnknownPeer):
+        return envelope.serial, envelope
+    sealed = opened(key, _TO_EDGE, servo, data, LIMIT)
     try:
-        return whole.serial, _answer.decode(whole.body)
+        return sealed.serial, _response_decoder.decode(sealed.body)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidMessage(f"answer not understood: {error}") from None
+        raise InvalidMessage(f"response not understood: {error}") from None
 
 
-def _read(data: bytes, limit: int) -> Sealed | UnknownPeer | None:
-    """None: neither, or too large to look at."""
+def _decode_envelope(data: bytes, limit: int) -> Sealed | UnknownPeer | None:
+    """Decode without a check of the seal; None: the bytes are neither, or too many to decode."""
     try:
-        return _down.decode(data) if len(data) <= limit else None
+        return _envelope_decoder.decode(data) if len(data) <= limit else None
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return None

@@ -1,4 +1,4 @@
-"""Outbox of an edge: windows and letters kept until the twin has them; the protocol, and the one in memory.
+"""Outbox of an edge, which holds windows and letters until the twin acknowledges them: protocol and memory outbox.
 
 A letter is an encoded hello, receipt, fallback or answer. `servotwin.link.sqlite_outbox` is the outbox on disk.
 """
@@ -19,68 +19,68 @@ FULL = "outbox full"
 
 
 class Dropped(NamedTuple):
-    """A window that was given up, and why."""
+    """A window that was dropped, and the reason."""
 
     key: Key
     reason: str
 
 
 class Outbox(Protocol):
-    """Bounded store of unacknowledged messages, which counts the windows it drops."""
+    """Bounded store of unacknowledged messages, which counts the windows that it drops."""
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Windows given up so far, by reason."""
+        """Number of windows dropped so far, by reason."""
 
     def put(self, window: WindowMessage) -> Sequence[Dropped]:
-        """Keep a window; return what was dropped to make room, oldest first."""
+        """Store a window; return the windows dropped to make room, oldest first."""
 
     def get(self, key: Key) -> WindowMessage:
-        """Return a window; KeyError when it is not (or no longer) kept."""
+        """Return a window; KeyError when it is not stored (any more)."""
 
     def parcel(self, key: Key) -> Parcel:
-        """Return a window as it is sent; KeyError when it is not (or no longer) kept."""
+        """Return a window as it is sent; KeyError when it is not stored (any more)."""
 
     def remove(self, key: Key) -> bool:
-        """Forget an acknowledged window; False when it was not there."""
+        """Remove an acknowledged window; False when it was not there."""
 
     def drop(self, key: Key, reason: str) -> None:
-        """Give a window up, for a reason that is counted."""
+        """Drop a window and count it under a reason."""
 
     def count_dropped(self, reason: str) -> None:
-        """Count a window that was given up before it was put here."""
+        """Count a window that was dropped before it was put here."""
 
     def pending(self) -> Sequence[Key]:
         """Keys of all windows, oldest first."""
 
     def put_letter(self, body: bytes) -> None:
-        """Keep a letter (an encoded message); the same one twice is one."""
+        """Store a letter (an encoded message); equal letters are stored once."""
 
     def letters(self) -> Sequence[bytes]:
         """Digests of all letters, oldest first."""
 
     def letter(self, digest: bytes) -> Parcel:
-        """Return a letter as it is sent; KeyError when it is not kept."""
+        """Return a letter as it is sent; KeyError when it is not stored."""
 
     def remove_letter(self, digest: bytes) -> bool:
-        """Forget a letter; False when it was not there."""
+        """Remove a letter; False when it was not there."""
 
     def set_value(self, name: str, value: bytes) -> None:
-        """Keep some bytes under a name."""
+        """Store bytes under a name."""
 
     def value(self, name: str) -> bytes | None:
-        """Return the bytes kept under a name."""
+        """Return the bytes stored under a name; None: there are none."""
 
 
 class MemoryOutbox:
-    """An outbox that lives as long as the process.
+    """An outbox in memory, which ends with the process.
 
     Parameters
     ----------
     capacity : int
-        Windows kept at most; the oldest are dropped first.
+        Largest number of windows; the oldest are dropped first.
     servo : str
-        For parcels; "" where none is asked for.
+        Name in the parcels; "" where no parcels are made.
     """
 
     def __init__(self, capacity: int = 256, servo: str = "") -> None:
@@ -95,11 +95,11 @@ class MemoryOutbox:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Windows given up so far, by reason."""
+        """Number of windows dropped so far, by reason."""
         return self._dropped
 
     def put(self, window: WindowMessage) -> list[Dropped]:
-        """Keep a window; return what was dropped to make room, oldest first."""
+        """Store a window; return the windows dropped to make room, oldest first."""
         self._windows[window.boot, window.sequence] = window
         excess = len(self._windows) - self._capacity
         drops = [Dropped(key, FULL) for key in list(self._windows)[: max(0, excess)]]
@@ -108,25 +108,25 @@ class MemoryOutbox:
         return drops
 
     def get(self, key: Key) -> WindowMessage:
-        """Return a window; KeyError when it is not (or no longer) kept."""
+        """Return a window; KeyError when it is not stored (any more)."""
         return self._windows[key]
 
     def parcel(self, key: Key) -> Parcel:
-        """Return a window as it is sent; KeyError when it is not (or no longer) kept."""
+        """Return a window as it is sent; KeyError when it is not stored (any more)."""
         return Parcel(self._servo, *deflated(encode(self._windows[key])), *key)
 
     def remove(self, key: Key) -> bool:
-        """Forget an acknowledged window; False when it was not there."""
+        """Remove an acknowledged window; False when it was not there."""
         return self._windows.pop(key, None) is not None
 
     def drop(self, key: Key, reason: str) -> None:
-        """Give a window up, for a reason that is counted."""
+        """Drop a window and count it under a reason."""
         if self.remove(key):
             self.count_dropped(reason)
             self.recently_dropped.append(Dropped(key, reason))
 
     def count_dropped(self, reason: str) -> None:
-        """Count a window that was given up before it was put here."""
+        """Count a window that was dropped before it was put here."""
         self._dropped[reason] += 1
 
     def pending(self) -> list[Key]:
@@ -134,7 +134,7 @@ class MemoryOutbox:
         return list(self._windows)
 
     def put_letter(self, body: bytes) -> None:
-        """Keep a letter; the same one twice is one."""
+        """Store a letter; equal letters are stored once."""
         self._letters[letter_digest(body)] = body
 
     def letters(self) -> list[bytes]:
@@ -142,22 +142,22 @@ class MemoryOutbox:
         return list(self._letters)
 
     def letter(self, digest: bytes) -> Parcel:
-        """Return a letter as it is sent; KeyError when it is not kept."""
+        """Return a letter as it is sent; KeyError when it is not stored."""
         return Parcel(self._servo, self._letters[digest])
 
     def remove_letter(self, digest: bytes) -> bool:
-        """Forget a letter; False when it was not there."""
+        """Remove a letter; False when it was not there."""
         return self._letters.pop(digest, None) is not None
 
     def set_value(self, name: str, value: bytes) -> None:
-        """Keep some bytes under a name."""
+        """Store bytes under a name."""
         self._values[name] = value
 
     def value(self, name: str) -> bytes | None:
-        """Return the bytes kept under a name."""
+        """Return the bytes stored under a name; None: there are none."""
         return self._values.get(name)
 
 
 def letter_digest(body: bytes) -> bytes:
-    """Digest that identifies a letter."""
+    """Compute the digest that identifies a letter."""
     return blake2b(body, digest_size=16).digest()

@@ -1,8 +1,8 @@
-"""The edge's half of the link without I/O: what to send when, and what follows from the twin's answer.
+"""The edge's half of the link without I/O: it schedules the messages and handles the twin's answers.
 
-Everything in the outbox is repeated until the twin acknowledges it. Letters go before windows, the oldest first. Time
-comes from outside. A transport that answers each message (`link.client.Sender`) reports the answer at once; one that
-does not (the simulated link) reports that a message was sent, and later the acknowledgement.
+The session repeats everything in the outbox until the twin acknowledges it: letters before windows, the oldest first.
+The caller gives the time. A transport that answers each message (`link.client.Sender`) reports the answer at once; one
+that does not (the simulated link) reports that a message was sent, and later its acknowledgement.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ Item = Key | bytes
 
 @dataclass(slots=True)
 class _Attempt:
-    """A message that was tried: not again before `due`."""
+    """Tries of one message; the next one is at `due`, s."""
 
     due: float
     backoff: Backoff
@@ -32,18 +32,18 @@ class Session:
     Parameters
     ----------
     outbox : Outbox
-        What it already holds, after a restart, is due at once.
+        Messages that it holds already, after a restart, are due at once.
     retry : Retry, optional
         Pauses, for each message and for the link as a whole.
     chance : callable, optional
-        Uniform in 0 .. 1, which spreads the pauses; 1 by default, so that nothing is random.
+        Returns random numbers, uniform in 0 .. 1, which spread the pauses; 1 by default, so that nothing is random.
 
     Attributes
     ----------
     counts : Counter
         Messages delivered, tries that failed, refusals by reason.
     trouble : str
-        Why nothing is delivered; empty: it is.
+        Reason for which nothing is delivered; empty: there is none.
     """
 
     def __init__(self, outbox: Outbox, retry: Retry | None = None, chance: Callable[[], float] = lambda: 1.0) -> None:
@@ -65,12 +65,12 @@ class Session:
         return max(0.0, self._not_before - now)
 
     def due(self, now: float) -> Iterator[Item]:
-        """Yield what is to be sent now, in order."""
+        """Yield the messages to be sent now, in order."""
         if now >= self._not_before:
             yield from (item for item in self._items() if self._due_time(item) <= now)
 
     def retry_later(self, item: Item, now: float, after_s: float = 0.0) -> None:
-        """Let a message that was sent, or could not be read, be due again after its next pause, at least `after_s`."""
+        """Schedule a message that was sent, or could not be read, after its next pause, at least `after_s`."""
         attempt = self._attempts.setdefault(item, _Attempt(now, Backoff(self._retry)))
         attempt.due = now + max(after_s, attempt.backoff.failed(self._chance()))
 
@@ -80,7 +80,7 @@ class Session:
         return self.outbox.remove_letter(item) if isinstance(item, bytes) else self.outbox.remove(item)
 
     def delivered(self, item: Item) -> bool:
-        """Note that the twin has answered, and has the message; True when it was out of reach before."""
+        """Remove a message that the twin has acknowledged; True when the twin was out of reach before."""
         reconnected, self.trouble = bool(self.trouble), ""
         self._backoff.succeeded()
         self.counts["letters" if isinstance(item, bytes) else "windows"] += 1
@@ -88,14 +88,14 @@ class Session:
         return reconnected
 
     def refused(self, item: Item, now: float, reason: Refusal, detail: str, after_s: float) -> None:
-        """Drop and count what is never taken; retry later what is too early; else pause for all."""
+        """Handle a refusal: drop the message, retry it later, or pause the link, as the reason says."""
         self.counts[f"refused: {reason.value}"] += 1
         if not reason.passing:
             if isinstance(item, bytes):
                 self.outbox.remove_letter(item)
             else:
                 self.outbox.drop(item, reason.value)
-        elif reason is Refusal.FUTURE:
+        elif reason is Refusal.FUTURE:  # concerns this message only: the others go on
             self.retry_later(item, now, after_s)
         else:
             self._pause(now, "refused", detail, after_s)
@@ -111,7 +111,7 @@ class Session:
 
     def _items(self) -> list[Item]:
         items: list[Item] = [*self.outbox.letters(), *self.outbox.pending()]
-        if self._attempts:
+        if self._attempts:  # the outbox may have dropped some by itself
             for dropped in self._attempts.keys() - set(items):
                 del self._attempts[dropped]
         return items

@@ -1,4 +1,4 @@
-"""A link on the virtual clock: delay, jitter, loss, duplicates, reordering, outages; all bytes accounted for."""
+"""A simulated link on the virtual clock, with delay, jitter, loss, duplicates, reordering, outages and a record."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -75,10 +75,10 @@ class SentCopy:
     Attributes
     ----------
     serial, copy : int
-        The message's number in its direction; 0, or 1 for a duplicate.
+        Number of the message in its direction; 0, or 1 for a duplicate.
     data : bytes
     sent, arrival : float
-        s; the arrival of a lost one is when it would have come.
+        Times, s; a lost copy has the arrival that it would have had.
     fate : Fate
     """
 
@@ -96,7 +96,7 @@ class LinkDirection:
     Parameters
     ----------
     name : str
-        Names its random source, together with `seed`.
+        Name of its random source, together with `seed`.
     clock : VirtualClock
     deliver : callable
         Called with the bytes when they arrive.
@@ -114,7 +114,7 @@ class LinkDirection:
         self._random = Random(derive_seed(seed, name))
 
     def send(self, data: bytes) -> None:
-        """Offer a message at the clock's time."""
+        """Send a message at the clock's time."""
         serial, self.offered = self.offered, self.offered + 1
         first, second, lost, twice = self._delay(), self._delay(), self._chance("loss"), self._chance("duplicate")
         self._launch(SentCopy(serial, 0, data, self._clock.now, self._clock.now + first), lost)
@@ -142,9 +142,9 @@ class LinkDirection:
         self._deliver(record.data)
 
     def _delay(self) -> float:
-        """Drawn alike whatever the settings, so that changing one leaves the other draws alone."""
-        jitter, hold, held = self._random.random(), self._random.random(), self._chance("reorder")
-        return self.settings.delay_s + jitter * self.settings.jitter_s + held * hold * self.settings.hold_s
+        # All three are drawn whatever the settings are: a change of one leaves the other draws as they are.
+        jitter, hold, is_held = self._random.random(), self._random.random(), self._chance("reorder")
+        return self.settings.delay_s + jitter * self.settings.jitter_s + is_held * hold * self.settings.hold_s
 
     def _chance(self, key: str) -> bool:
         return self._random.random() < float(getattr(self.settings, key))
@@ -179,6 +179,6 @@ class SimulatedLink:
 
 
 def derive_seed(root: int, *names: str) -> int:
-    """A 64-bit seed for a named random source, the same on every machine and in every run."""
+    """Derive the 64-bit seed of a named random source, the same on every machine and in every run."""
     text = "\0".join((str(root), *names))
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")

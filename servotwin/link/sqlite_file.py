@@ -1,4 +1,4 @@
-"""The file under an edge's outbox: opened, checked, put aside when it is broken."""
+"""SQLite file of an edge's outbox: schema, statements, opening and check, and renaming of a corrupt file."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ _BESIDE = ("-wal", "-shm")
 
 
 class Statement(NamedTuple):
-    """SQL statement and its values, to be executed."""
+    """SQL statement and its values."""
 
     text: str
     values: tuple[Any, ...]
 
 
 def is_broken(error: sqlite3.Error) -> bool:
-    """True where the file is corrupt; otherwise it cannot be written or read just now."""
+    """True where the file is corrupt; otherwise the error may pass."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF in _BROKEN
 
 
 def was_read_only(error: Exception) -> bool:
-    """True where the disk was read-only when the file was opened: the connection stays so."""
+    """True where the disk was read-only when the file was opened: SQLite's connection stays read-only after that."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY
 
 
 def connect(path: Path, check: bool = True) -> sqlite3.Connection:
-    """An outbox's file, made where there is none; `check` looks whether it is whole.
+    """Open an outbox's file, made where there is none; `check` tests its integrity.
 
     Raises
     ------
     sqlite3.Error
-        It cannot be opened, or `is_broken`.
+        The file cannot be opened, or is corrupt (`is_broken`).
     """
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
     try:
         connection.executescript(_SCHEMA)
-        found = connection.execute("PRAGMA quick_check(1)").fetchone()[0] if check else "ok"
-        if found != "ok":
-            error = sqlite3.DatabaseError(found)
+        result = connection.execute("PRAGMA quick_check(1)").fetchone()[0] if check else "ok"
+        if result != "ok":
+            error = sqlite3.DatabaseError(result)
             error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
             raise error
     except sqlite3.Error:
@@ -69,7 +69,7 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
 
 
 def put_aside(path: Path) -> Path:
-    """Rename a broken file, so that somebody may look into it; where it is now."""
+    """Rename a corrupt file, so that it can be examined; return its new path."""
     number = 1
     while (aside := path.with_name(f"{path.name}.broken-{number}")).exists():
         number += 1

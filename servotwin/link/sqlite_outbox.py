@@ -1,8 +1,8 @@
-"""An outbox on disk: windows and letters that outlive the process, and what else the link has to remember.
+"""An outbox on disk: windows and letters that outlive the process, and the counts and values of the link.
 
-The disk may be full, read-only or broken; the outbox goes on. What it knows is in memory first (an index, and the few
-rows that the disk does not have yet), and every change is written in one transaction before it counts as done; a change
-that cannot be written is tried again. Every statement may be repeated, so that nothing depends on how far one got.
+The outbox goes on while the disk is full, read-only or corrupt. Memory has the index and the few rows that are not on
+the disk yet. Each change is written in one transaction before it counts as done, and again where the disk fails. Every
+statement may be repeated, so that a transaction whose outcome is not known is simply written again.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from servotwin.messages import WindowMessage, decode, encode
 
 BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000
-"""Bytes of windows kept in memory while the disk cannot be written."""
-MOST_LETTERS = 10_000
-UNINFORMATIVE = ("periodic",)
-"""Reasons, by their first word, of windows that are dropped first."""
+"""Bytes of windows held in memory while the disk cannot be written."""
+_MOST_LETTERS = 10_000
+_UNINFORMATIVE = ("periodic",)
+"""First words of the reasons of windows that are dropped first."""
 
 _DROPPED = "dropped: "
 
 
 class _Entry(NamedTuple):
-    """Window as the index knows it: its bytes, and whether its reason is one of `UNINFORMATIVE`."""
+    """Entry of the index for a window: its size in bytes; True where its reason is one of `_UNINFORMATIVE`."""
 
     size: int
     uninformative: bool
@@ -54,7 +54,7 @@ class _Entry(NamedTuple):
 class SqliteOutbox:
     """Unacknowledged windows and letters, counts and values; for use from any thread.
 
-    When it is full the oldest uninformative windows go first, then the oldest.
+    A full outbox drops the oldest uninformative windows first, then the oldest.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class SqliteOutbox:
         Its folder exists.
     servo : str
     windows, size : int
-        Windows, and bytes of windows, kept at most.
+        Largest number of windows, and of their bytes.
     """
 
     def __init__(self, path: Path, servo: str, windows: int = 5000, size: int = 256_000_000) -> None:
@@ -84,7 +84,7 @@ class SqliteOutbox:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Windows given up since the file was made, by reason."""
+        """Number of windows dropped since the file was made, by reason."""
         counts = dict(self._counts).items()
         return {name.removeprefix(_DROPPED): number for name, number in counts if name.startswith(_DROPPED)}
 
@@ -95,7 +95,7 @@ class SqliteOutbox:
             return not self._unwritten and self._connection is not None
 
     def put(self, window: WindowMessage) -> list[Dropped]:
-        """Keep a window, on the disk when this returns unless `flushed` is False; what had to go to make room."""
+        """Store a window; return the windows dropped to make room. It is on the disk unless `flushed` is False."""
         body, encoding = deflated(encode(window))
         key = window.boot, window.sequence
         with self._lock:
@@ -110,14 +110,14 @@ class SqliteOutbox:
             return drops
 
     def get(self, key: Key) -> WindowMessage:
-        """The window; KeyError when it is not (or no longer) kept."""
+        """Return a window; KeyError when it is not stored (any more)."""
         parcel = self.parcel(key)
         window = decode(zlib.decompress(parcel.body) if parcel.encoding == DEFLATE else parcel.body)
         assert isinstance(window, WindowMessage)
         return window
 
     def parcel(self, key: Key) -> Parcel:
-        """The window as it is sent; KeyError when it is not (or no longer) kept."""
+        """Return a window as it is sent; KeyError when it is not stored (any more)."""
         with self._lock:
             if key not in self._index:
                 raise KeyError(key)
@@ -129,7 +129,7 @@ class SqliteOutbox:
             return Parcel(self._servo, body, encoding, *key)
 
     def remove(self, key: Key) -> bool:
-        """Forget an acknowledged window; False when it was not there."""
+        """Remove an acknowledged window; False when it was not there."""
         with self._lock:
             known = key in self._index
             if known:
@@ -138,40 +138,40 @@ class SqliteOutbox:
             return known
 
     def drop(self, key: Key, reason: str) -> None:
-        """Give a window up, for a reason that is counted."""
+        """Drop a window and count it under a reason."""
         with self._lock:
             if key in self._index:
                 self._forget(key, reason)
                 self.flush()
 
     def count_dropped(self, reason: str) -> None:
-        """Count a window that was given up before it was put here."""
+        """Count a window that was dropped before it was put here."""
         with self._lock:
             self._count(_DROPPED + reason)
             self.flush()
 
     def pending(self) -> list[Key]:
-        """Keys of every window kept, oldest first."""
+        """Keys of all windows, oldest first."""
         with self._lock:
             return list(self._index)
 
     def put_letter(self, body: bytes) -> None:
-        """Keep a letter (an encoded message) until it is taken; the same one twice is one."""
+        """Store a letter (an encoded message); equal letters are stored once."""
         digest = letter_digest(body)
         with self._lock:
             self._letters[digest] = None
             self._unwritten["letter", digest] = Statement(POST, (digest, body))
-            if len(self._letters) > MOST_LETTERS:
+            if len(self._letters) > _MOST_LETTERS:
                 self._count(_DROPPED + LETTERS)
                 self.remove_letter(next(iter(self._letters)))
             self.flush()
 
     def letters(self) -> list[bytes]:
-        """Digests of the letters kept, oldest first."""
+        """Digests of all letters, oldest first."""
         return list(self._letters)
 
     def letter(self, digest: bytes) -> Parcel:
-        """A letter as it is sent; KeyError when it is not kept."""
+        """Return a letter as it is sent; KeyError when it is not stored."""
         with self._lock:
             unwritten = self._unwritten.get(("letter", digest)) if digest in self._letters else None
             row = self._read("SELECT body FROM letters WHERE digest = ?", (digest,))
@@ -180,7 +180,7 @@ class SqliteOutbox:
             return Parcel(self._servo, unwritten.values[1] if unwritten is not None else row[0][0])
 
     def remove_letter(self, digest: bytes) -> bool:
-        """Forget a letter; False when it was not there."""
+        """Remove a letter; False when it was not there."""
         with self._lock:
             known = digest in self._letters
             self._letters.pop(digest, None)
@@ -189,30 +189,30 @@ class SqliteOutbox:
             return known
 
     def number(self, name: str) -> int:
-        """Return the number kept under a name; 0 at first."""
+        """Return the number stored under a name; 0 at first."""
         return self._counts[name]
 
     def set_number(self, name: str, number: int) -> None:
-        """Keep a number under a name."""
+        """Store a number under a name."""
         with self._lock:
             self._counts[name] = number
             self._unwritten["count", name] = Statement(COUNT, (name, number))
             self.flush()
 
     def set_value(self, name: str, value: bytes) -> None:
-        """Keep some bytes under a name."""
+        """Store bytes under a name."""
         with self._lock:
             self._notes[name] = value
             self._unwritten["note", name] = Statement(NOTE, (name, value))
             self.flush()
 
     def value(self, name: str) -> bytes | None:
-        """Return the bytes kept under a name."""
+        """Return the bytes stored under a name; None: there are none."""
         return self._notes.get(name)
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Write whatever is changed inside as one, at the end."""
+        """Write all changes of a `with` block in one transaction, at its end."""
         with self._lock:
             self._in_transaction = True
             try:
@@ -222,7 +222,10 @@ class SqliteOutbox:
                 self.flush()
 
     def flush(self) -> bool:
-        """Write what the disk does not have; False where some is left. Call it now and then: so the outbox recovers."""
+        """Write the changes that are not on the disk; False where some are left.
+
+        Call it periodically: the outbox recovers from a failure of the disk only here and at the next change.
+        """
         with self._lock:
             try:
                 if not self._in_transaction:
@@ -232,7 +235,7 @@ class SqliteOutbox:
             return self.flushed
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with self._lock:
             if self._connection is not None:
                 self._connection.close()
@@ -243,7 +246,7 @@ class SqliteOutbox:
             self._connection = connect(self._path)
             self._load(self._connection)
         if self._read_only:
-            self.close()  # first: connections of one process to one file share what they know of it
+            self.close()  # before connecting again: connections of one process to one file share its state
             self._connection = connect(self._path, check=False)
         if self._unwritten:
             self._connection.execute("BEGIN IMMEDIATE")
@@ -254,13 +257,13 @@ class SqliteOutbox:
         self.trouble = ""
 
     def _load(self, connection: sqlite3.Connection) -> None:
-        """Load the file's index, before what is to be written to it."""
+        """Load the file's index; changes in memory, which are newer, take precedence."""
         windows = connection.execute("SELECT boot, sequence, reason, length(body) FROM windows ORDER BY place")
-        found = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
+        stored = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
         self._index = {
-            **{key: entry for key, entry in found.items() if ("window", key) not in self._unwritten},
+            **{key: entry for key, entry in stored.items() if ("window", key) not in self._unwritten},
             **self._index,
         }
         self._letters = {**{each: None for each in letters if ("letter", each) not in self._unwritten}, **self._letters}
@@ -276,26 +279,26 @@ class SqliteOutbox:
         self.faults[UNWRITABLE] += 1
         self._read_only = was_read_only(error) and self._connection is not None
         if self._connection is not None and self._connection.in_transaction:
-            self._rolled_back(self._connection)
+            self._roll_back(self._connection)
         windows = [(key, statement) for key, statement in self._unwritten.items() if statement.text == INSERT]
         size = sum(len(statement.values[4]) for _, statement in windows)
-        while size > MOST_UNWRITTEN:
+        while size > MOST_UNWRITTEN:  # drop the oldest: a disk that stays full must not fill the memory
             key, statement = windows.pop(0)
             size -= len(statement.values[4])
             self._forget(key[1], UNWRITABLE)
 
-    def _rolled_back(self, connection: sqlite3.Connection) -> None:
+    def _roll_back(self, connection: sqlite3.Connection) -> None:
         try:
             connection.execute("ROLLBACK")
         except sqlite3.Error:
             self.close()
 
     def _begin_anew(self) -> None:
-        """Put the broken file aside; what is not in memory is lost, and counted."""
+        """Put the corrupt file aside and begin another; windows that are not in memory are lost, and counted."""
         self.close()
         self.faults[BROKEN] += 1
-        kept = {key for kind, key in self._unwritten if kind == "window"}
-        for key in [key for key in self._index if key not in kept]:
+        in_memory = {key for kind, key in self._unwritten if kind == "window"}
+        for key in [key for key in self._index if key not in in_memory]:
             del self._index[key]
             self._count(_DROPPED + BROKEN)
         self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._unwritten}
@@ -328,14 +331,14 @@ class SqliteOutbox:
 
 
 def _is_uninformative(reason: str) -> bool:
-    return reason.partition(" ")[0].rstrip(",:;") in UNINFORMATIVE
+    return reason.partition(" ")[0].rstrip(",:;") in _UNINFORMATIVE
 
 
 def _excess(index: Mapping[Key, _Entry], windows: int, size: int) -> list[Key]:
-    """Keys to drop so that at most so many windows and bytes are left; `index` is in order of age."""
+    """Choose keys to drop until at most `windows` windows and `size` bytes are left; `index` is in order of age."""
     over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
     dropped: list[Key] = []
-    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):
+    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):  # stable: by age within each
         if over <= 0 and heavy <= 0:
             break
         dropped.append(key)

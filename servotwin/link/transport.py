@@ -1,6 +1,7 @@
 """Transport of an edge's messages to the twin and back: the protocol, and its errors.
 
-A transport knows bytes only. It may lose, delay and repeat; it says "delivered" only when the twin has said so.
+A transport carries bytes. It may lose, delay and repeat them; `deliver` returns only after the twin's own
+acknowledgement.
 """
 
 import zlib
@@ -24,11 +25,11 @@ class Parcel(NamedTuple):
     ----------
     servo : str
     body : bytes
-        The encoded message, by `encoding`.
+        Encoded message, compressed as `encoding` says.
     encoding : str
         "" or "deflate".
     boot, sequence : str, int
-        Of a window; a letter (hello, receipt, fallback, answer) has no boot.
+        Key of a window; a letter (hello, receipt, fallback, answer) has no boot.
     """
 
     servo: str
@@ -39,25 +40,25 @@ class Parcel(NamedTuple):
 
     @property
     def is_window(self) -> bool:
-        """It is a window; otherwise it is a letter."""
+        """True for a window, False for a letter."""
         return self.boot != ""
 
 
 class Unreachable(Exception):
-    """The twin was not reached, or what answered is not the twin: whatever was to be sent is kept."""
+    """The twin was not reached, or something else answered in its place: the message stays in the outbox."""
 
 
 class Refused(Exception):
-    """The twin does not take a message.
+    """The twin refuses a message.
 
     Attributes
     ----------
     reason : Refusal
-        `reason.passing` tells whether the message is kept.
+        `reason.passing` is True where the message stays in the outbox.
     detail : str
         One sentence.
     after_s : float
-        It asks not to be sent anything before that time has gone by, s.
+        Time for which the twin asks not to be sent anything, s.
     """
 
     def __init__(self, reason: Refusal, detail: str, after_s: float = 0.0) -> None:
@@ -69,19 +70,19 @@ class Transport(Protocol):
     """Carries one servo's messages. `deliver` and `listen` are called from a thread each."""
 
     def deliver(self, parcel: Parcel) -> None:
-        """Return when the twin has the message safe, now or from before.
+        """Send a message; return when the twin has committed it, now or earlier.
 
         Raises
         ------
         Refused
         Unreachable
-            Whether the twin has it is not known.
+            It is not known whether the twin has it.
         """
 
     def listen(self, after: int) -> list[bytes]:
-        """Sealed messages of the twin with serials above `after`, rising; waits a while for the first one.
+        """Return the twin's sealed messages with serials above `after`, in rising order; wait for the first one.
 
-        What was returned is returned again until `after` is past it.
+        A message is returned again by each call until `after` has reached its serial.
 
         Raises
         ------
@@ -90,4 +91,4 @@ class Transport(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of connections, at once; `deliver` and `listen` under way raise `Unreachable`."""
+        """Close the connections at once; `deliver` and `listen` under way raise `Unreachable`."""

@@ -1,13 +1,19 @@
-"""Properties of a URL: local, encrypted, in clear."""
+"""Properties of a URL (local, encrypted, in clear), and the TLS context of an encrypted one."""
 
 from __future__ import annotations
 
 import ipaddress
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+
+from servotwin.errors import InvalidInput
+
+if TYPE_CHECKING:
+    import ssl
 
 
 def is_here(host: str) -> bool:
-    """True where a host's name or number means this machine."""
+    """True where a host's name or address means this machine."""
     if host == "localhost":
         return True
     try:
@@ -17,7 +23,7 @@ def is_here(host: str) -> bool:
 
 
 def is_encrypted(url: str) -> bool:
-    """True where the connection is encrypted, however the scheme is written."""
+    """True where the connection is encrypted; capitals in the scheme do not matter."""
     return urlsplit(url).scheme in ("https", "mqtts")
 
 
@@ -25,3 +31,20 @@ def in_clear(url: str) -> bool:
     """True where a network carries data unencrypted: everybody on it could read a token."""
     parts = urlsplit(url)
     return parts.scheme == "http" and not is_here(parts.hostname or "")
+
+
+def tls_context(ca_file: str | None) -> ssl.SSLContext:
+    """Make the context of a client that checks certificates against those of a file; None: the system's.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, or holds no certificates.
+    """
+    import ssl  # the edge's control process, which has no TLS, does without it
+
+    try:
+        return ssl.create_default_context(cafile=ca_file)
+    except OSError as error:  # ssl.SSLError is one
+        reason = error.strerror or error
+        raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({reason})") from None

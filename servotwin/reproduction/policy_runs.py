@@ -64,7 +64,7 @@ class PolicyJob:
     def run(self) -> PolicyOutcome:
         """Co-simulate and measure; the outcome of a policy that cannot design for this machine is its reason."""
         scenario = self.scenario_to_run()
-        reason = design_refusal(scenario)
+        reason = _design_refusal(scenario)
         if reason:
             return PolicyOutcome(self.policy, reason)
         run = run_twin(scenario)
@@ -135,7 +135,7 @@ class PolicyOutcome:
     total: PolicyTotal | None = None
 
 
-def design_refusal(scenario: st.Scenario) -> str:
+def _design_refusal(scenario: st.Scenario) -> str:
     """Reason for which the scenario's policy cannot design for its machine; empty where it can."""
     try:
         policy_of(scenario.model, scenario.twin)

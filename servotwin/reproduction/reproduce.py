@@ -175,7 +175,7 @@ def _with_progress(tasks: Sequence[ReproductionTask[TaskResult]], workers: int, 
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console
     ) as progress:
         bar = progress.add_task("reproducing", total=len(tasks))
-        for result in perform(tasks, workers):
+        for result in _perform(tasks, workers):
             results.append(result)
             progress.advance(bar)
     return results
@@ -190,7 +190,7 @@ def _sorted(outcomes: Iterable[TaskResult], selection: Selection) -> tuple[list[
     return drawn, [by_key[claim.id, preset] for claim in selection.claims for preset in PRESETS]
 
 
-def perform(tasks: Sequence[ReproductionTask[_R]], workers: int) -> Iterator[_R]:
+def _perform(tasks: Sequence[ReproductionTask[_R]], workers: int) -> Iterator[_R]:
     """Yield results in order of completion; with one worker, in this process.
 
     An interrupt ends the workers: unfinished tasks are lost, and no file is left half written.

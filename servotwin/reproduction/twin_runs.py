@@ -167,7 +167,7 @@ def run_twin(scenario: st.Scenario, exact: bool = False, progress: Progress | No
         message_bytes=_window_bytes(loop),
         quantisation=max((_half_step(window) for window in loop.windows), default=0.0),
         updates=loop.updates,
-        changes=setting_changes(loop),
+        changes=_setting_changes(loop),
     )
 
 
@@ -225,7 +225,7 @@ def _window_bytes(loop: Loop) -> tuple[int, ...]:
     return tuple(len(m.data) for m in up if isinstance(m.message, messages.WindowMessage))
 
 
-def setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
+def _setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
     """List every setting that was in force, in order; an update without gains leaves those in force before it."""
     start = loop.scenario.start
     changes = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]

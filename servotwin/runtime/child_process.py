@@ -1,8 +1,8 @@
-"""Child processes: started, watched, ended; and one that is kept running with its log.
+"""Child processes: start, watch and end one; keep one running, with its log.
 
 `python -m servotwin.runtime.child_process MODULE ARGUMENTS` runs a module that ends when its standard input does. The
-parent holds the other end of that pipe and never writes: when the parent is gone, however it went, the system closes
-the pipe. The module is then told to end as by SIGTERM, and its process group is killed where it does not.
+parent has the other end of that pipe and never writes to it: the system closes the pipe when the parent ends, even by
+SIGKILL. The child then sends itself SIGTERM, and kills its process group if the module has not ended after `GRACE_S`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from typing import IO
 from servotwin.errors import InvalidInput
 
 MOST_ENDS, WITHIN_S = 5, 60.0
-"""A process that ends by itself that often within that time is given up."""
+"""A child that ends by itself `MOST_ENDS` times within `WITHIN_S` is not restarted again."""
 GRACE_S = 15.0
-"""Time that a module has to end after its parent has gone."""
+"""Time that a module has to end after its parent has ended."""
 
 
 class ChildProcess:
@@ -46,7 +46,7 @@ class ChildProcess:
     Raises
     ------
     OSError
-        It cannot be started.
+        The process cannot be started.
     """
 
     def __init__(
@@ -73,17 +73,17 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """Its process id, and that of its group where it has one."""
+        """Process id; also the id of its group where it was started with `group`."""
         return self._process.pid
 
     @property
     def code(self) -> int | None:
-        """Its exit code; None: it runs."""
+        """Exit code; None: it runs."""
         return self._process.poll()
 
     @property
     def stdout(self) -> IO[bytes] | None:
-        """Its standard output, where that is a pipe."""
+        """Standard output, where that is a pipe."""
         return self._process.stdout
 
     def terminate(self) -> None:
@@ -93,7 +93,7 @@ class ChildProcess:
 
     def kill(self) -> None:
         """Send SIGKILL to it, and to its group; does not wait."""
-        if self._process.returncode is None:
+        if self._process.returncode is None:  # once reaped, the id may belong to another process
             with suppress(ProcessLookupError):
                 if self._group:
                     os.killpg(self.pid, signal.SIGKILL)
@@ -101,7 +101,7 @@ class ChildProcess:
                     self._process.kill()
 
     def wait(self, seconds: float) -> int:
-        """Wait until it has ended, kill it after that time, and return its exit code."""
+        """Wait until it has ended, kill it after so many seconds, and return its exit code."""
         try:
             return self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -121,20 +121,20 @@ class Child:
     Parameters
     ----------
     name : str
-        In messages for people.
+        Name in error messages.
     command : sequence of str
         A module and its arguments.
     log : Path
-        Its standard error is appended there.
+        File to which its standard error is appended.
     ready : str
         Beginning of the line that it prints when it is ready; empty: it prints none.
     lock : int
-        A descriptor that it inherits.
+        Descriptor that it inherits.
 
     Attributes
     ----------
     address : str or None
-        The rest of the line that says it is ready; None: that line has not come yet.
+        Rest of the line that it prints when it is ready; None: it has not printed that line yet.
     restarts : int
     """
 
@@ -149,12 +149,12 @@ class Child:
 
     @property
     def pid(self) -> int | None:
-        """Its process id, and that of its group; None: there is no process."""
+        """Process id, also that of its group; None: there is no process."""
         return None if self._process is None else self._process.pid
 
     @property
     def code(self) -> int | None:
-        """Its exit code; None: it runs, or was not started."""
+        """Exit code; None: it runs, or was not started."""
         return None if self._process is None else self._process.code
 
     def start(self) -> None:
@@ -167,7 +167,7 @@ class Child:
                 stderr=log,
                 group=True,
                 pass_fds=(self._lock,),
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # several children share the cores
             )
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
@@ -201,7 +201,7 @@ class Child:
         self.start()
 
     def failure(self, what: str) -> InvalidInput:
-        """Make the error to raise where it is of no use, with the last line of its log."""
+        """Make the error that reports a failure of it, with the last line of its log."""
         line = last_line(self.log)
         return InvalidInput(f"{self.name} {what}{f': {line}' if line else ''} (see {self.log})")
 
@@ -211,20 +211,20 @@ class Child:
             self._process.terminate()
 
     def kill(self) -> None:
-        """End it and all its group at once."""
+        """Kill it and its group, and wait for its end."""
         if self._process is not None:
             self._process.kill()
             self._process.wait(GRACE_S)
 
     def release(self) -> None:
-        """Close the pipes of one that has ended."""
+        """Close the pipes of the process, which has ended."""
         if self._process is not None:
             self._process.close()
             self._process = None
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of a file, cut to 300 characters; empty where there is none."""
+    """Return the last line of a file, cut to 300 characters; empty where there is no line or no file."""
     with suppress(OSError), log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - 4096))
         lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]

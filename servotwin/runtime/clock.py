@@ -1,4 +1,4 @@
-"""Time from one event queue: virtual, or the wall's.
+"""Clocks with an event queue: virtual time, or the wall clock's.
 
 Events are ordered by (time, priority, serial), so equal times resolve the same way in every run.
 """
@@ -11,7 +11,7 @@ Action = Callable[[], object]
 
 
 class Event(NamedTuple):
-    """Something to do at a time (s); lower priorities first at equal times, then the one scheduled first."""
+    """Action and its time (s); at equal times the lower priority goes first, then the event scheduled first."""
 
     time: float
     priority: int
@@ -25,7 +25,7 @@ class VirtualClock:
     Parameters
     ----------
     now : float
-        Where it starts, s.
+        Time at the start, s.
     """
 
     def __init__(self, now: float = 0.0) -> None:
@@ -35,7 +35,7 @@ class VirtualClock:
 
     @property
     def now(self) -> float:
-        """The time, s."""
+        """Present time, s."""
         return self._now
 
     @property
@@ -59,7 +59,7 @@ class VirtualClock:
         return event
 
     def cancel(self, event: Event) -> bool:
-        """Forget an event; False when it has happened already."""
+        """Remove an event from the queue; False when it has happened already."""
         if event not in self._queue:
             return False
         self._queue.remove(event)
@@ -67,25 +67,25 @@ class VirtualClock:
         return True
 
     def step(self) -> None:
-        """Go to the next event and do it."""
+        """Advance to the next event and perform it."""
         event = heapq.heappop(self._queue)
         self._now = event.time
         event.action()
 
     def run_until(self, time: float) -> None:
-        """Do everything that is due up to and including `time`, and arrive there."""
+        """Perform all events up to and including `time`, and advance to it."""
         while self._queue and self._queue[0].time <= time:
             self.step()
         self._now = max(self._now, time)
 
 
 class WallClock:
-    """The same queue in real time: it only sleeps.
+    """A clock that sleeps until each event of the same queue is due.
 
     Parameters
     ----------
     source : callable
-        Monotonic seconds; the clock's zero is its value now.
+        Returns monotonic seconds; the clock's zero is the value at construction.
     sleep : callable
         Called with the seconds to wait.
     """
@@ -106,15 +106,15 @@ class WallClock:
         return self._events.next_time
 
     def schedule(self, time: float, action: Action, priority: int = 0) -> Event:
-        """Call `action` at `time`, or as soon as possible when that has passed."""
+        """Call `action` at `time`, or as soon as possible when that time has passed."""
         return self._events.schedule(max(time, self._events.now), action, priority)
 
     def cancel(self, event: Event) -> bool:
-        """Forget an event; False when it has happened already."""
+        """Remove an event from the queue; False when it has happened already."""
         return self._events.cancel(event)
 
     def run_until(self, time: float) -> None:
-        """Do everything that is due up to and including `time`, each at its time or late, and arrive there."""
+        """Perform all events up to and including `time`, each at its time or late, and wait until `time`."""
         while (due := self.next_time) is not None and due <= time:
             self._wait(due)
             self._events.step()

@@ -1,4 +1,4 @@
-"""Optional dependencies: which extra installs each, and the one sentence where one is missing."""
+"""Optional dependencies: the extra that installs each, and the error where one is missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EXTRAS = {
     "uvicorn": ("uvicorn", "twin"),
     "zstandard": ("zstandard", "twin"),
 }
-"""Distribution and extra by the name that is imported."""
+"""Distribution and extra, by the name of the imported package."""
 
 
 def require(module: str, purpose: str) -> Any:
@@ -53,7 +53,7 @@ def require(module: str, purpose: str) -> Any:
 
 
 def check_extra(module: str, purpose: str) -> None:
-    """Refuse at once what would need an absent package later; nothing is imported.
+    """Check that an optional dependency is installed, without importing it.
 
     Raises
     ------
@@ -65,12 +65,12 @@ def check_extra(module: str, purpose: str) -> None:
 
 
 def missing_extra(module: str, purpose: str) -> InvalidInput:
-    """Error for a package of `EXTRAS` that is not installed; names the pip command.
+    """Make the error for a package of `EXTRAS` that is not installed; it names the pip command.
 
     Parameters
     ----------
     module : str
-        Dotted name of what could not be imported.
+        Dotted name of the module that could not be imported.
     purpose : str
         Feature that needs it.
     """

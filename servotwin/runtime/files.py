@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and the checks that can be made before anything is computed."""
+"""Atomic replacement of files, and checks of output paths before a long computation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from servotwin.errors import InvalidInput
 def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | None = None) -> None:
     """Write a file whole or not at all: a crash leaves the old one or the new one.
 
-    A neighbour with `.new` at its name's end is written first, so one process at a time writes a file.
+    The data go to a neighbour NAME.new first, which is renamed. Only one process at a time may replace a file.
 
     Parameters
     ----------
@@ -23,9 +23,9 @@ def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | 
         Its folder exists.
     data : bytes
     durable : bool
-        Return when the disk has it.
+        Return only when the data are on the disk.
     mode : int, optional
-        Its permissions; None: those of any new file.
+        Permissions of the file; None: those of any new file.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | 
     """
     beside = path.with_name(f"{path.name}.new")
     if mode is not None:
-        beside.unlink(missing_ok=True)  # whoever opened a neighbour that was readable would read the secret
+        beside.unlink(missing_ok=True)  # a process that has an old, readable NAME.new open would read the secret
     try:
         with open(beside, "wb", opener=partial(os.open, mode=0o666 if mode is None else mode)) as file:
             if mode is not None:
@@ -53,12 +53,12 @@ def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | 
 def atomic_output(path: Path, mode: int | None = None) -> Iterator[Path]:
     """Yield a temporary path beside `path`, renamed to it when the block ends well and removed when it does not.
 
-    It gets the permissions `mode`; None: those of any new file.
+    The file gets the permissions `mode`; None: those of any new file.
 
     Raises
     ------
     InvalidInput
-        The system does not let it be written: a full disk, for one.
+        The file cannot be written, for example on a full disk.
     """
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
@@ -82,7 +82,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def write_and_say(path: Path, text: str, say: Callable[..., None]) -> None:
-    """Write a text file atomically and say where it is; `say` prints as a rich console does."""
+    """Write a text file atomically and print its path; `say` is the `print` of a rich console."""
     write_text(path, text)
     say(f"written: {path}", soft_wrap=True, highlight=False)
 
@@ -106,12 +106,12 @@ def check_file(path: Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def make_directory(path: Path) -> Path:
-    """The directory `path`, made if it is missing.
+    """Make a directory, with its parents, if it is missing, and return its path.
 
     Raises
     ------
     InvalidInput
-        When it cannot be made or written to.
+        The directory cannot be made or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 _HEAD = Struct("<I")
 LONGEST = 64_000_000
-"""Bytes of one frame that `FrameSocket` takes; a window that a twin takes was a fifth of that as doubles."""
-PIECE = 65_536
-"""Bytes that one call of `FrameSocket` moves."""
+"""Bytes of the longest frame that `FrameSocket` accepts: five times the largest window as doubles."""
+_PIECE = 65_536
+"""Bytes that one call of `FrameSocket` moves at most."""
 
 
 class FrameError(Exception):
-    """The bytes are no frames."""
+    """The bytes received are not frames."""
 
 
 def frame(body: bytes) -> bytes:
@@ -42,19 +42,19 @@ async def receive_frame(reader: asyncio.StreamReader) -> bytes:
 
 
 class FrameSocket:
-    """Frames over a stream socket, of which no call waits.
+    """Frames over a stream socket; no call blocks.
 
-    Each call moves a bounded number of bytes, so that a control loop that makes one call per sample knows its cost.
+    Each call moves a bounded number of bytes, so that the cost of one call per sample is bounded in a control loop.
 
     Parameters
     ----------
     end : socket
-        Belongs to this object from now on.
+        This object owns it from now on.
 
     Attributes
     ----------
     broken : bool
-        The other end is gone.
+        The other end has closed the connection.
     backlog : int
         Bytes still to be sent.
     """
@@ -68,18 +68,18 @@ class FrameSocket:
         self.backlog = 0
 
     def post(self, body: bytes) -> None:
-        """Append a frame to what is to be sent."""
+        """Append a frame to the backlog."""
         self._out.append(memoryview(_HEAD.pack(len(body))))
         self._out.append(memoryview(body))
         self.backlog += len(body) + _HEAD.size
 
     def send(self) -> None:
-        """Send a piece of the backlog, as far as the other end takes it."""
+        """Send a piece of the backlog, as much as the socket accepts."""
         if not self._out:
             return
         piece = self._out.popleft()
         try:
-            sent = self._end.send(piece[:PIECE])
+            sent = self._end.send(piece[:_PIECE])
         except BlockingIOError:
             sent = 0
         except OSError:
@@ -90,7 +90,7 @@ class FrameSocket:
             self._out.appendleft(piece[sent:])
 
     def receive(self) -> list[bytes]:
-        """Return the bodies of the frames that have come meanwhile, after reading at most one piece.
+        """Read at most one piece, and return the bodies of the frames that are complete.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class FrameSocket:
             A frame is longer than `LONGEST`.
         """
         try:
-            data = self._end.recv(PIECE)
+            data = self._end.recv(_PIECE)
         except BlockingIOError:
             return []
         except OSError:

@@ -1,4 +1,4 @@
-"""Locks between processes: files locked by the system, which end with whoever holds them, however that ends."""
+"""Locks between processes: file locks, which the system releases when their process ends, even by SIGKILL."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 
 @contextmanager
 def locked(path: Path, *, wait: bool = False) -> Iterator[int]:
-    """Hold the exclusive lock on a file, which is made where it is missing and stays.
+    """Hold the exclusive lock on a file inside a `with` block; the file is made where it is missing, and stays.
 
-    Lock a file beside the one that is protected: that one may be replaced, and SQLite loses its own locks on a file
+    Lock a file beside the protected one: the protected one may be replaced, and SQLite loses its own locks on a file
     when another descriptor of it is closed.
 
     Parameters
@@ -21,19 +21,19 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[int]:
     path : Path
         Made with mode 0600.
     wait : bool
-        Wait for whoever holds it.
+        Wait until another process that holds the lock releases it.
 
     Yields
     ------
     int
-        Its descriptor; a child process that inherits it holds the lock too.
+        Descriptor of the lock file; a child process that inherits it holds the lock too.
 
     Raises
     ------
     BlockingIOError
-        Another process holds it.
+        Another process holds the lock.
     OSError
-        The file cannot be made, or its disk takes no locks.
+        The file cannot be made, or its file system has no locks.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
@@ -44,6 +44,6 @@ def locked(path: Path, *, wait: bool = False) -> Iterator[int]:
 
 
 def lock_beside(path: Path) -> Path:
-    """Return the path of the file whose lock protects `path`, links resolved."""
+    """Return the path of the lock file of `path`, links resolved."""
     whole = path.resolve()
     return whole.with_name(f"{whole.name}-lock")

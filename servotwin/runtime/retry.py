@@ -1,4 +1,4 @@
-"""Retries: when to try again, and pauses that grow from one failure to the next."""
+"""Retries with pauses that grow from one failure to the next (exponential backoff with jitter)."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -12,7 +12,7 @@ from servotwin.errors import InvalidInput
 class Retry:
     """Pauses between tries: `first_s`, then each `factor` times the last, up to `longest_s`.
 
-    Where an answer takes a while, `first_s` should exceed the round trip, or everything is sent twice.
+    `first_s` should exceed the round trip: otherwise each message is sent again before its answer can arrive.
     """
 
     first_s: Annotated[float, key(above=0.0, help="First pause, longer than a round trip.")] = 5.0
@@ -45,15 +45,15 @@ class Backoff:
         Parameters
         ----------
         chance : float
-            Uniform in 0 .. 1: the pause is cut to between half and the whole of its length, so that many clients do
-            not come back all at once.
+            Uniform in 0 .. 1: the pause is between half of its length (0) and the whole (1), so that many clients do
+            not return all at once.
         """
         pause = self.retry.first_s
-        for _ in range(min(self.failures, 64)):
+        for _ in range(min(self.failures, 64)):  # a power would overflow after days of failures
             pause = min(pause * self.retry.factor, self.retry.longest_s)
         self.failures += 1
         return pause * (0.5 + 0.5 * chance)
 
     def succeeded(self) -> None:
-        """Begin again with the first pause."""
+        """Reset: the next failure is followed by the first pause."""
         self.failures = 0

@@ -89,7 +89,7 @@ class MqttRequestHandler:
         return None if verifier is None else encode_response(key_of(verifier), request.servo, request.serial, response)
 
     async def _handle(self, request: ReceivedRequest) -> MqttResponse:
-        servo, question = request.servo, request.question
+        servo, question = request.servo, request.content
         if isinstance(question, PollRequest):
             self._gate.admit_authenticated(servo, limited=False)
             messages = await self._polls.messages(servo, question.after, question.wait)
@@ -163,7 +163,7 @@ class MqttServer:
 
     async def _serve(self, connection: Connection, servo: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         request = self._handler.decode(servo, payload)
-        polls = isinstance(request, ReceivedRequest) and isinstance(request.question, PollRequest)
+        polls = isinstance(request, ReceivedRequest) and isinstance(request.content, PollRequest)
         if polls:
             acknowledge()  # a long poll waits, and must not count as in flight meanwhile
         try:

@@ -201,7 +201,7 @@ def test_it_is_configured_in_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("size_mm = 0.2", "size_mm = 0.0"), r"edge.probe.*size = 0.0 m"),
+        (("size_mm = 0.2", "size_mm = 0.0"), r"edge.probe.size_mm = 0.0 is not allowed"),
         (("size_mm = 0.2", ""), "size_mm"),
         (("probe_mm = 0.15", "probe_mm = -1.0"), "probe_mm"),
         (("after = 3", "after = 0"), r"twin.excitation.*after = 0"),

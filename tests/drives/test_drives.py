@@ -218,8 +218,8 @@ def test_rubbish_from_a_client_ends_that_client_only(tmp_path: Path) -> None:
                 line.sendall(rubbish)
         with closing(SimulatedSupervised(address)) as drive:
             drive.connect()
-            drive._line.send(b"\xff" * wire.REQUEST.size)
-            assert wire.REPLY.unpack(drive._line.receive(wire.REPLY.size))[0] == wire.REFUSED
+            drive._connection.send(b"\xff" * wire.REQUEST.size)
+            assert wire.REPLY.unpack(drive._connection.receive(wire.REPLY.size))[0] == wire.REFUSED
             drive.close()
             drive.connect()
             assert len(drive.read(5).position) == 5

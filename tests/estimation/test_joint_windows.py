@@ -1,7 +1,7 @@
 """Several windows of one machine, the recorder's windows, what is left of a window, and the noise that a fit leaves."""
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
@@ -171,21 +171,21 @@ def test_the_noise_a_fit_leaves_is_not_taken_for_quieter_than_it_was():
 
 
 def _gain(noise: Autoregression) -> float:
-    """Of slow noise, per sample."""
+    """Gain of slow noise, per sample."""
     return float(noise.spread[-1] / abs(noise.predictors[-1].sum()))
 
 
 def test_the_bound_grows_with_what_is_unknown():
-    """By code of its own; an estimator below it would have been told the answer, one far above it wastes data."""
+    """By code of its own; an estimator below it would have known the answer, one far above it wastes data."""
     groups = bench.windows(bench.CONTINUOUS, "paper", 2, 3)
     cases = [case for group in groups for case in group]
     case, root = cases[0], noise_root(5000, RATE, FLOOR, None)
-    at = (SERVO, case.window.theta_m, RATE, case.gap, case.theta_d0, root)
-    plain, structure = bound(*at), bound(*at, free=("k", "c", "p"))
-    motor = bound(*at, angles=motor_unknowns(SERVO, case.window.voltage, RATE, zero_order_hold=False))
+    bound_in = partial(bound, SERVO, case.window.theta_m, RATE, case.gap, case.theta_d0)
+    plain, structure = bound_in(root), bound_in(root, free=("k", "c", "p"))
+    motor = bound_in(root, angles=motor_unknowns(SERVO, case.window.voltage, RATE, zero_order_hold=False))
     assert plain < structure < 5.0 * plain
     assert plain < motor < 2.0 * plain
-    assert bound(*at[:-1], 2.0 * root, free=("k", "c", "p")) == pytest.approx(2.0 * structure, rel=1e-6)
+    assert bound_in(2.0 * root, free=("k", "c", "p")) == pytest.approx(2.0 * structure, rel=1e-6)
     errors = bench.Errors.of(groups, [bench.estimates(group, bench.CONTINUOUS, False, False) for group in groups])
     ratio = math.sqrt(np.mean(errors.errors**2)) / bench.limit(cases, bench.CONTINUOUS, voltage=False)
     assert 0.4 < ratio < 1.6

@@ -209,5 +209,5 @@ def test_to_control_and_its_absence(monkeypatch: pytest.MonkeyPatch) -> None:
     assert systems.C(s) * systems.G1(s) * systems.G2(s) == pytest.approx(systems.loop(s), rel=1e-9)
     assert systems.closed_loop(s) == pytest.approx(systems.loop(s) / (1.0 + systems.loop(s)), rel=1e-9)
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(InvalidInput, match="python-control is not installed"):
+    with pytest.raises(InvalidInput, match=r"needs control, which is not installed.*servotwin\[interop\]"):
         servo.to_control()

@@ -39,8 +39,8 @@ def crossover(runs: Runs) -> Finding:
 def phase_margin(runs: Runs) -> Finding:
     """Smallest phase margin over all gain crossovers."""
     margins = runs.servo.margins()
-    smallest = smallest_margin_deg(margins)
-    filtered = smallest_margin_deg(runs.servo.margins(with_loop_filter(runs.servo)))
+    smallest = _smallest_margin_deg(margins)
+    filtered = _smallest_margin_deg(runs.servo.margins(_with_loop_filter(runs.servo)))
     count = len(margins.gain_crossovers)
     why = f"the smallest margin over {count} crossover{'s' if count > 1 else ''} is {smallest:.4g} deg"
     return decided(
@@ -55,13 +55,13 @@ def phase_margin(runs: Runs) -> Finding:
 @measures("loop-filter-stable")
 def loop_filter(runs: Runs) -> Finding:
     """The same with section 4.3's loop filter."""
-    controller = with_loop_filter(runs.servo)
+    controller = _with_loop_filter(runs.servo)
     margins = runs.servo.margins(controller)
-    smallest = smallest_margin_deg(margins)
+    smallest = _smallest_margin_deg(margins)
     reproduced = margins.stable and smallest >= MARGIN_DEG
     state = "stable" if margins.stable else "unstable"
     why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {MARGIN_DEG:g} deg asked for"
-    before = smallest_margin_deg(runs.servo.margins())
+    before = _smallest_margin_deg(runs.servo.margins())
     return decided(
         reproduced,
         why,
@@ -94,7 +94,7 @@ def steady_state(runs: Runs) -> Finding:
 @measures("pd-first-requirement")
 def pd_steady_state(runs: Runs) -> Finding:
     """The same without integral action."""
-    return _static(runs.servo.closed_loop(without_integral(runs.servo)), "Ki = 0")
+    return _static(runs.servo.closed_loop(_without_integral(runs.servo)), "Ki = 0")
 
 
 def _static(closed: LinearSystem, name: str) -> Finding:
@@ -107,7 +107,7 @@ def _static(closed: LinearSystem, name: str) -> Finding:
 @measures("pd-bandwidth")
 def pd_bandwidth(runs: Runs) -> Finding:
     """Search the filtered PDs that cross over at 10 rad/s for one with 10 deg of margin."""
-    first = runs.servo.margins(without_integral(runs.servo)).gain_crossovers[0].omega
+    first = runs.servo.margins(_without_integral(runs.servo)).gain_crossovers[0].omega
     laws = pd_family(runs.servo)
     stable = [law for law in laws if runs.servo.closed_loop(law).is_stable()]
     best, law = best_pd(runs.servo, stable)
@@ -128,7 +128,7 @@ def pd_bandwidth(runs: Runs) -> Finding:
 
 def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller]:
     """Largest margin (deg) among stabilising controllers, and its controller."""
-    return max(((pd_margin_deg(servo, law), law) for law in laws), key=lambda pair: pair[0])
+    return max(((_pd_margin_deg(servo, law), law) for law in laws), key=lambda pair: pair[0])
 
 
 def pd_family(servo: Servo) -> list[Controller]:
@@ -145,18 +145,20 @@ def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
     return servo.controller.replace(Kp=gain, Ki=0.0, Kd=gain * ratio, Tf=1.0 / pole)
 
 
-def pd_margin_deg(servo: Servo, law: Controller) -> float:
+def _pd_margin_deg(servo: Servo, law: Controller) -> float:
     """Smallest phase margin, deg; 0 when it crosses over below 10 rad/s too."""
     margins = servo.margins(law)
     early = margins.gain_crossovers[0].omega < 0.99 * CROSSOVER
-    return 0.0 if early else smallest_margin_deg(margins)
+    return 0.0 if early else _smallest_margin_deg(margins)
 
 
 @measures("pd-disturbances")
 def pd_disturbances(runs: Runs) -> Finding:
     """Static position error per volt of disturbance at the motor's input."""
-    with_integral, without = (_static_sensitivity(law) for law in (runs.servo.controller, without_integral(runs.servo)))
-    peaks = [runs.servo.margins(law).Ms for law in (runs.servo.controller, without_integral(runs.servo))]
+    with_integral, without = (
+        _static_sensitivity(law) for law in (runs.servo.controller, _without_integral(runs.servo))
+    )
+    peaks = [runs.servo.margins(law).Ms for law in (runs.servo.controller, _without_integral(runs.servo))]
     why = (
         f"a constant volt at the motor moves the position by {without * 1e3:.3g} mm without and"
         f" {with_integral * 1e3:.2g} mm with integral action; but the sensitivity peak Ms is {peaks[0]:.3g} with it and"
@@ -194,7 +196,7 @@ def two_resonances(runs: Runs) -> Finding:
 def overshoot(runs: Runs) -> Finding:
     """Overshoot of the step response and the least damped pole."""
     closed = runs.servo.closed_loop()
-    time, position = linear_step(runs)
+    time, position = _linear_step(runs)
     excess = 100.0 * (float(position.max()) - 1.0)
     poles = closed.poles()
     damping = float(np.min(-poles.real / np.abs(poles)))
@@ -223,7 +225,7 @@ def structure_stable(runs: Runs) -> Finding:
     )
 
 
-def linear_step(runs: Runs) -> tuple[measure.Array, measure.Array]:
+def _linear_step(runs: Runs) -> tuple[measure.Array, measure.Array]:
     """Time (s) and unit step response of the closed loop over 40 s."""
     time = np.linspace(0.0, PERIOD, 8001)
     return time, runs.servo.closed_loop().step(time)
@@ -231,19 +233,19 @@ def linear_step(runs: Runs) -> tuple[measure.Array, measure.Array]:
 
 def linear_settling_time(runs: Runs) -> float:
     """Time to stay within 2 % of 1, s."""
-    return measure.settling_time(*linear_step(runs), 1.0, measure.BAND)
+    return measure.settling_time(*_linear_step(runs), 1.0, measure.BAND)
 
 
-def smallest_margin_deg(margins: Margins) -> float:
+def _smallest_margin_deg(margins: Margins) -> float:
     """Smallest distance of a stable loop's phase from -180 deg, on either side, over all gain crossovers."""
     return float(np.degrees(min(abs(one.phase_margin) for one in margins.gain_crossovers)))
 
 
-def without_integral(servo: Servo) -> Controller:
+def _without_integral(servo: Servo) -> Controller:
     """The printed gains with Ki = 0."""
     return servo.controller.replace(Ki=0.0)
 
 
-def with_loop_filter(servo: Servo) -> Controller:
+def _with_loop_filter(servo: Servo) -> Controller:
     """The printed gains with the 20 Hz first-order filter of section 4.3."""
     return servo.controller.replace(loop_filter_hz=LOOP_FILTER_HZ)

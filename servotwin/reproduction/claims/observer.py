@@ -20,13 +20,13 @@ BAND = 0.02 * 1.5e-3  # m: 2 % of the initial error
 @measures("observer-quarter-second")
 def quarter_second(runs: Runs) -> Finding:
     """Time after which the error stays below 2 % of its start, from the matrix exponential."""
-    times = {alpha: forgetting_time(observer(runs.servo, alpha)) for alpha in ALPHAS}
+    times = {alpha: _forgetting_time(observer(runs.servo, alpha)) for alpha in ALPHAS}
     why = f"with α = 40 the error stays below 2 % of the initial 1.5 mm after {times[ALPHA]:.3g} s"
     values = [(f"time for α = {alpha:g} 1/s", time, "s") for alpha, time in times.items()]
     return decided(times[ALPHA] <= 0.25, why, *values)
 
 
-def forgetting_time(one: Observer) -> float:
+def _forgetting_time(one: Observer) -> float:
     """Time after which the error from the paper's initial state stays below 2 % of 1.5 mm, s."""
     time = np.linspace(0.0, 1.0, 1001)
     return measure.settling_time(time, one.error(one.initial_state(INITIAL), time), 0.0, BAND)

@@ -33,7 +33,7 @@ from servotwin.reproduction.runs import AMPLITUDE, DURATION, Runs
 from servotwin.reproduction.twin_runs import SettingChange, TwinRun
 
 
-class LineStyle(NamedTuple):
+class _LineStyle(NamedTuple):
     """Colour, line width and marker; widths differ so that equal lines show through."""
 
     color: str
@@ -42,11 +42,11 @@ class LineStyle(NamedTuple):
 
 
 LINE_STYLES = {
-    "paper": LineStyle(style.ORANGE, 3.4, "s"),
-    "margin": LineStyle(style.GREEN, 2.6, "^"),
-    "hysteresis": LineStyle(style.PINK, 1.8, "D"),
-    "certified": LineStyle(style.BLUE, 1.0, "o"),
-    ALONE: LineStyle(style.SKY, 4.2, "v"),
+    "paper": _LineStyle(style.ORANGE, 3.4, "s"),
+    "margin": _LineStyle(style.GREEN, 2.6, "^"),
+    "hysteresis": _LineStyle(style.PINK, 1.8, "D"),
+    "certified": _LineStyle(style.BLUE, 1.0, "o"),
+    ALONE: _LineStyle(style.SKY, 4.2, "v"),
 }
 APART = 1.5  # s, between markers that would hide one another
 LEAST = 2e-5  # m: the errors' axis never shows less
