@@ -1,4 +1,4 @@
-"""`servotwin bench tick`: how fast and regularly the gateway's control loop ticks, and what keeps it from better."""
+"""`servotwin bench tick`: speed and regularity of the edge's control loop, and the limits of this system."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, 
 
 
 def measured(case: Case, seconds: float) -> dict[str, Any]:
-    """One run, in a process that imports what a gateway does."""
+    """Run one case in a process that imports only what an edge does."""
     rate, busy, hurried = case
     priority = PRIORITY if hurried else 0
     with tempfile.TemporaryDirectory() as folder:
@@ -72,7 +72,7 @@ def measured(case: Case, seconds: float) -> dict[str, Any]:
 
 def shown(runs: Sequence[dict[str, Any]]) -> Table:
     """A row for each run and kind of time, in microseconds."""
-    result = Table(title="tick: the gateway's control loop, µs", title_justify="left", box=None, pad_edge=False)
+    result = Table(title="tick: the edge's control loop, µs", title_justify="left", box=None, pad_edge=False)
     for head in ("kHz", "priority", "windows", "time", "median", "p99", "p99.9", "max", "overruns", "missed"):
         result.add_column(head, justify="left" if head in ("priority", "time") else "right")
     for run in runs:

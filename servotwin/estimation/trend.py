@@ -83,7 +83,7 @@ def process_noise(step: float, settings: TrendSettings) -> Array:
     return noise
 
 
-def bound_std(estimate: GapEstimate) -> float:
+def _bound_std(estimate: GapEstimate) -> float:
     """Spread (rad) of a lower bound, from the lower end of its 95 % interval."""
     return max(0.0, estimate.gap - estimate.interval[0]) / NORMAL_95
 
@@ -267,7 +267,7 @@ class Trend:
     def _bounded(self, estimate: GapEstimate) -> Trend:
         """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
         column = self.covariance[:, GAP]
-        spread = math.hypot(math.sqrt(column[GAP]), bound_std(estimate))
+        spread = math.hypot(math.sqrt(column[GAP]), _bound_std(estimate))
         margin = (self.mean[GAP] - estimate.gap) / spread if spread > 0.0 else math.inf
         pull, cut = truncation(margin)
         gain = column / spread if spread > 0.0 else np.zeros(3)

@@ -32,7 +32,7 @@ from servotwin.plant.signals import Array
 
 # Judged samples per period of the structure's fastest mode: the load moves no faster, and noise above is left out. With
 # 36 the spread is the same and an autoregression of it needs four times the order.
-PER_PERIOD = 9.0
+_PER_PERIOD = 9.0
 _LINEARISATIONS = 8  # at most
 _WHITENED_FITS = 2  # fits in the noise that the one before has left
 _CLOSE = 2e-3  # rad: nearer than that one more linearisation changes nothing that matters
@@ -90,7 +90,7 @@ def model_of(servo: Servo, sample_rate: float) -> NoveltyModel:
         ResponseMode(complex(*decay), complex(*gain))
         for decay, gain in zip(known.decay.tolist(), known.position.gain.tolist(), strict=True)
     )
-    factor = max(1, round(sample_rate / (PER_PERIOD * fastest)))
+    factor = max(1, round(sample_rate / (_PER_PERIOD * fastest)))
     return NoveltyModel(sample_rate, modes, known.position.direct, known.static_gain, known.unseen, factor)
 
 

@@ -20,7 +20,7 @@ from servotwin.twin.settings import TwinSettings
 POLICIES = ("paper", "margin", "hysteresis", "certified")
 ALONE = "fallback set alone"  # the certified loop's first setting, never updated
 CONTESTANTS = (*POLICIES, ALONE)
-TURN = 2.0 * math.pi
+_TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ def measured_total(run: TwinRun) -> PolicyTotal:
     return PolicyTotal(
         voltage=_rms(trace.voltage),
         voltage_at_rest=_rms(np.concatenate(rests)) if rests else math.nan,
-        travel=float(np.abs(np.diff(trace.theta_m)).sum()) / TURN,
+        travel=float(np.abs(np.diff(trace.theta_m)).sum()) / _TURN,
         estimates=sum(one.ok for one in run.estimates),
         windows=len(run.estimates),
         updates=origins.count(SettingOrigin.UPDATE),

@@ -48,7 +48,7 @@ class ReproductionTask(Protocol[_R]):
 
 
 @lru_cache(maxsize=1)
-def runs_of(preset: str) -> Runs:
+def _runs_of(preset: str) -> Runs:
     """Return this process's runs of a preset; successive tasks of one preset share them."""
     return Runs(preset)
 
@@ -62,7 +62,7 @@ class ClaimsTask:
 
     def run(self) -> tuple[ClaimResult, ...]:
         """Measure the claims."""
-        return tuple(claims.measure(claim, runs_of(self.preset)) for claim in self.claims)
+        return tuple(claims.measure(claim, _runs_of(self.preset)) for claim in self.claims)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class FigureTask:
 
     def run(self) -> DrawnFigure:
         """Draw; the vector image is also in NAME.svg, beside NAME.png."""
-        runs, spec = runs_of(self.preset), figure_spec(self.name)
+        runs, spec = _runs_of(self.preset), figure_spec(self.name)
         path = style.save(spec.draw(runs), self.directory, self.name)
         outcomes = tuple(replace(one, run=None) for one in spec.measure(runs))
         return DrawnFigure(self.name, spec.title, spec.caption, path.read_bytes(), outcomes)

@@ -244,7 +244,7 @@ def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, m
         yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.setting.tolerance, fallback.setting.gains
 
 
-WINDOW_GAPS_DEG, WINDOW_STEPS = (3.0, 10.0, 18.0), 6
+_WINDOW_GAPS_DEG, _WINDOW_STEPS = (3.0, 10.0, 18.0), 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,7 @@ class WindowJob:
     def run(self) -> Mapping[float, float]:
         """Mean error for each gap."""
         servo = st.Servo.preset(self.preset)
-        return {gap: float(np.mean(_window_errors(servo, gap, self.settle))) for gap in WINDOW_GAPS_DEG}
+        return {gap: float(np.mean(_window_errors(servo, gap, self.settle))) for gap in _WINDOW_GAPS_DEG}
 
 
 def _window_errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float]:
@@ -268,13 +268,13 @@ def _window_errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float
     gap = math.radians(gap_deg)
     run = st.simulate(
         servo,
-        WINDOW_STEPS * PERIOD / 2.0,
+        _WINDOW_STEPS * PERIOD / 2.0,
         reference=BIPOLAR.signal,
         gap=gap,
         tolerance=servo.tolerance_for(gap),
         sample_rate=RATE,
     )
-    starts = np.arange(WINDOW_STEPS) * PERIOD / 2.0
+    starts = np.arange(_WINDOW_STEPS) * PERIOD / 2.0
     windows = [st.Window.from_run(run, float(start), 1.0) for start in starts]
     settings = paper.PaperSettings(settle_s=settle)
     estimates = [

@@ -116,7 +116,7 @@ def test_updates_are_applied_once_and_answered() -> None:
 
 
 class Spoken:
-    """A line that answers at once, as told."""
+    """A line that answers at once, from a list of answers."""
 
     def __init__(self, *answers) -> None:
         self.answers, self.asked = list(answers), []
@@ -195,7 +195,7 @@ def test_shares_are_the_median_the_99_percent_and_the_largest() -> None:
     assert shares([]) == (0.0, 0.0, 0.0)
 
 
-# --- what is seen
+# --- measurements
 
 
 def test_the_usage_of_a_process_is_measured_until_it_ends() -> None:

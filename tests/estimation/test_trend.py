@@ -268,7 +268,7 @@ def test_how_many_must_agree_is_a_setting():
 
 
 def test_a_gap_read_by_the_carried_offset_is_one_equation():
-    """gap - 2 offset was seen: the same as least squares with that row; a hundred such windows teach no more of it."""
+    """Measuring gap - 2 offset equals least squares with that row; a hundred such windows add no more information."""
     known = Trend.start(0.0, SETTINGS).update(seen(0.0, 0.3, 0.02), OffsetReading(0.1, 0.01))
     std = math.hypot(2.0 * known.prior.offset_std, 1e-3)
     lean = CarriedOffset(known.prior.offset, known.prior.offset_std, 2.0)

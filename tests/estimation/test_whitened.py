@@ -80,7 +80,7 @@ def test_random_windows_are_refused_or_right():
 
 
 def test_in_white_noise_it_reaches_the_bound():
-    """Two-sided: an estimator below the Cramer-Rao bound would have been told the answer."""
+    """Two-sided: an estimator below the Cramer-Rao bound would have known the answer."""
     assert failures(bench.in_white_noise(5, 3)) == []
 
 
@@ -401,7 +401,7 @@ def evidence(case: WindowCase) -> FitEvidence:
 @pytest.mark.parametrize(("deviations", "status"), [(2.0, GapStatus.OK), (5.0, GapStatus.MODEL_MISMATCH)])
 @pytest.mark.parametrize("view", ["free model", "observer form", "lost motion"])
 def test_another_view_counts_from_three_standard_deviations_on(view: str, deviations: float, status: GapStatus):
-    """Noise moves every view of a window; only what it cannot explain is held against the model."""
+    """Noise moves every view of a window; only what noise cannot explain counts against the model."""
     seen, given = evidence(clean()[1]), WhitenedSettings()
     std = math.radians(0.1)
     most = 1.05 * seen.aligned.whitened.point.gap + given.contact_travel

@@ -49,7 +49,7 @@ from servotwin.plant.signals import Array
 
 __all__ = ["JointEstimate", "JointSettings", "SharedFit", "estimate_jointly"]
 
-SHARED = ("k/m", "c/m", "pitch", "k_B")
+_SHARED = ("k/m", "c/m", "pitch", "k_B")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class SharedFit:
     def of(cls, fits: Sequence[WindowMinima]) -> SharedFit:
         """Lay out the parameters of all windows."""
         names = fits[0].model.names
-        shared = {name: i for i, name in enumerate(name for name in names if name in SHARED)}
+        shared = {name: i for i, name in enumerate(name for name in names if name in _SHARED)}
         places, end = [], len(shared)
         for fit in fits:
             own = [name for name in fit.model.names if name not in shared]
@@ -137,7 +137,7 @@ def _apart(gap: float, other: float) -> bool:
     return abs(gap - other) > APART
 
 
-WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
+_WITH_ANGLE, _FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 SHORTEST = 200  # samples beside the margins, as before the decimation; after it a window has MINIMUM_SAMPLES at least
 _SIGMAS = 4.0  # by how many standard deviations a gap may move when its window is fitted with others
 
@@ -204,7 +204,7 @@ def _start_of(prior: AnyPrior) -> AnyPrior:
 def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
     """Names of the free parameters, checked."""
     measured = window.theta_m is not None
-    names = (WITH_ANGLE if measured else FROM_VOLTAGE) if free is None else tuple(free)
+    names = (_WITH_ANGLE if measured else _FROM_VOLTAGE) if free is None else tuple(free)
     for name in names:
         if name not in SPREADS:
             raise InvalidInput(f"free parameter {name!r} does not exist: allowed are {', '.join(SPREADS)}")

@@ -74,7 +74,7 @@ class FitPoint:
 Evaluate: TypeAlias = Callable[[Array], FitPoint]
 
 
-def evaluate_at(model: JointModel, point: Array, known: ParameterPrior, reduce: Reduce) -> FitPoint:
+def _evaluate_at(model: JointModel, point: Array, known: ParameterPrior, reduce: Reduce) -> FitPoint:
     """Evaluate residual and derivatives at a point."""
     slopes = model.slopes(dict(zip(model.names, point.tolist(), strict=True)), reduce)
     prior = (point - known.mean) / known.spread
@@ -125,7 +125,7 @@ def scan(model: JointModel, values: Mapping[str, float], gaps: Array, keep: int,
 AnyPrior = float | GapEstimate | Prior | None
 
 
-def known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
+def _known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
     """Bounds and priors of the model's parameters."""
     rows = {"gap": (0.0, settings.largest_gap_rad, 0.0, math.inf), "place": (-1.0, 1.0, 0.0, math.inf)}
     rows["delay"] = (-settings.largest_delay_s, settings.largest_delay_s, 0.0, math.inf)
@@ -204,10 +204,10 @@ def likeliest(series: Array, table: Array, most: int) -> Autoregression:
     spreads = np.sqrt(np.maximum(power, _LEAST))
     orders = [Autoregression(predictors[:n, :n].copy(), spreads[:n]) for n in range(1, power.size + 1)]
     rows = np.vstack([table[:1], orthonormal(table[1:])])
-    return min(orders, key=lambda noise: restricted(noise, rows))
+    return min(orders, key=lambda noise: _restricted(noise, rows))
 
 
-def restricted(noise: Autoregression, rows: Array) -> float:
+def _restricted(noise: Autoregression, rows: Array) -> float:
     """Minus twice the restricted log-likelihood of rows[0] off rows[1:], and the corrected Akaike penalty.
 
     The level of the noise is free.
@@ -266,7 +266,7 @@ class WindowMinima:
 
     def evaluated(self, known: ParameterPrior) -> Evaluate:
         """Whitened residual and derivatives as a function of the point."""
-        return lambda point: evaluate_at(self.model, point, known, self.whitened)
+        return lambda point: _evaluate_at(self.model, point, known, self.whitened)
 
     def whitened(self, rows: Array) -> Array:
         """(k, m) reduced and whitened rows (k, n)."""
@@ -275,9 +275,9 @@ class WindowMinima:
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
     """Make the fit from which a search begins."""
-    known, noise = known_of(model, prior, settings), Autoregression.white(1.0)
+    known, noise = _known_of(model, prior, settings), Autoregression.white(1.0)
     reduce = decimation(decimation_factor(model.rate))
-    here = evaluate_at(model, start_of(model, prior), known, reduce.rows)
+    here = _evaluate_at(model, start_of(model, prior), known, reduce.rows)
     return WindowMinima(model, known, reduce, noise, (here,), here.evaluations, blocked)
 
 
@@ -302,7 +302,7 @@ def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
     bounds, tolerance = fit.known.vague(~fine), 30.0 * tolerance_of(model)
     starts = scan(model, values, gaps, _STARTS, fit.reduce.rows)
     coarse = [descend(fit.evaluated(bounds), begin, bounds, tolerance) for begin in starts]
-    searched_fit = replace(fit, minima=distinct(coarse), evaluations=sum(one.evaluations for one in coarse))
+    searched_fit = replace(fit, minima=_distinct(coarse), evaluations=sum(one.evaluations for one in coarse))
     return _descended(searched_fit, fit.known.vague(fine | True), searched_fit.minima) if fine.any() else searched_fit
 
 
@@ -311,7 +311,7 @@ def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoi
     tolerance = tolerance_of(fit.model)
     ends = [descend(fit.evaluated(known), one.point, known, tolerance) for one in starts]
     near = min(one.cost for one in ends) + 100.0 * RIVAL
-    minima = tuple(one for one in distinct(ends) if one.cost <= near)
+    minima = tuple(one for one in _distinct(ends) if one.cost <= near)
     return replace(fit, minima=minima, evaluations=fit.evaluations + sum(one.evaluations for one in ends))
 
 
@@ -320,7 +320,7 @@ def decimation_factor(rate: float) -> int:
     return max(1, int(rate / _SAMPLES_HZ))
 
 
-def distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
+def _distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
     """The lowest of each group with the same gap, the lowest of all first."""
     different: list[FitPoint] = []
     for one in sorted(stands, key=lambda one: one.cost):

@@ -67,7 +67,7 @@ def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: st
     return ""
 
 
-def encoder_noise(theta_m: Array) -> float:
+def _encoder_noise(theta_m: Array) -> float:
     """Standard deviation (rad) of the noise on an angle that moves smoothly: third differences leave little else.
 
     The median over blocks counts, because an angle is not smooth where the voltage jumps. Blocks at rest, where
@@ -95,7 +95,7 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -
     assert window.theta_m is not None
     cutoff, rate = settings.prefilter_hz, window.sample_rate
     if cutoff is None:
-        noise = encoder_noise(window.theta_m)
+        noise = _encoder_noise(window.theta_m)
         if max(noise, resolution / math.sqrt(12.0)) <= _QUIET:
             return window.theta_m
         share = math.log(max(noise, _QUIET) / _QUIET) / math.log(_LOUD / _QUIET)

@@ -121,7 +121,9 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
     return [fit.point for fit in different[:count]]
 
 
-def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60) -> SearchResult:
+def _best_of(
+    misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60
+) -> SearchResult:
     """Find the lowest of the minima that at most `steps` steps from some points lead to."""
     fits = [descend(misfit, point, largest, tolerance, steps, gain=_ROUGH) for point in points]
     best = min(fits, key=lambda fit: fit.slopes.cost)
@@ -136,7 +138,7 @@ def refine(
     The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
     """
     white = reduction.coarse()
-    fit = continued(white, best_of(white, points, largest, tolerance), largest, tolerance)
+    fit = continued(white, _best_of(white, points, largest, tolerance), largest, tolerance)
     fit = off_the_plain(white, fit, largest, tolerance)
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
@@ -145,9 +147,9 @@ def refine(
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
         starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
-        fit = best_of(misfit, starts, largest, tolerance)
+        fit = _best_of(misfit, starts, largest, tolerance)
         if reduction.growth and number == _EARLY:
-            others = best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
+            others = _best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
             fit = min(fit, others, key=lambda one: one.slopes.cost)
         evaluations += fit.evaluations
     fit = off_the_plain(misfit, fit, largest, tolerance)
@@ -183,7 +185,7 @@ def estimate_noise(reduction: Reduction, point: Point, noise: Autoregression, or
     return burg(with_noise_put_back(left, table[GAP:], root), order).at_least(reduction.rounding)
 
 
-PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
+_PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
 _ALIGNMENTS, _NARROWEST = 3, 0.01
 _FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
 
@@ -216,7 +218,7 @@ class AlignedFit:
     @property
     def tolerance(self) -> float:
         """Accuracy of the search, rad."""
-        return PRECISION * self.span
+        return _PRECISION * self.span
 
 
 def align_and_fit(
@@ -263,7 +265,7 @@ def _fit(
     growth = NuisancePrior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
     offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
     reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
-    result = refine(reduction, points, _FREE * span, PRECISION * span, settings.passes, settings.order)
+    result = refine(reduction, points, _FREE * span, _PRECISION * span, settings.passes, settings.order)
     return AlignedFit(result, 0.0, span, float(theta_m[0]))
 
 
@@ -286,9 +288,6 @@ def _delay(result: WhitenedFit) -> float:
     fixed = len(result.reduction.fixed())
     moving = nuisances[fixed:]
     return -float(moving[-1])
-
-
-_PRECISION = 1e-9  # of the motor's range
 
 
 def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:
@@ -329,7 +328,7 @@ def profile_interval(result: WhitenedFit, std: float, calibration: float, larges
     def rise(gap: float) -> float:
         """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
         near = abs(gap - result.point.gap) < min(3.0 * std, _NEAR * result.point.gap)
-        places = (result.point.place,) if near else (*same_way(result.point, gap), *PLACES)
+        places = (result.point.place,) if near else (*_same_way(result.point, gap), *PLACES)
         lowest = math.inf
         for place in dict.fromkeys(places):
             fit = descend(result.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
@@ -342,7 +341,7 @@ def profile_interval(result: WhitenedFit, std: float, calibration: float, larges
     return _end(rise, result.point.gap, -first, 0.0), _end(rise, result.point.gap, first, largest)
 
 
-def same_way(point: Point, gap: float) -> tuple[float, float, float]:
+def _same_way(point: Point, gap: float) -> tuple[float, float, float]:
     """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
 
     A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact

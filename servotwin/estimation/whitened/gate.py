@@ -41,24 +41,24 @@ def slow_share(result: WhitenedFit) -> float:
     variation = float(np.std(slow(result.reduction.position, interval)))
     left = result.left
     remains = _rms(slow(left, interval))
-    if remains <= _CHANCE * averaged_noise(left, interval) and _rms(left) <= loudest(result):
+    if remains <= _CHANCE * _averaged_noise(left, interval) and _rms(left) <= _loudest(result):
         return 0.0
     return remains / variation if variation > 0.0 else math.inf
 
 
-def averaged_noise(values: Array, interval: float) -> float:
+def _averaged_noise(values: Array, interval: float) -> float:
     """rms of the slow part of white noise that has a signal's (m,) differences from sample to sample."""
-    weights = np.convolve(averaging(interval), averaging(interval))
+    weights = np.convolve(_averaging(interval), _averaging(interval))
     return _rms(np.diff(values)) * math.sqrt(0.5 * float(weights @ weights))
 
 
-def loudest(result: WhitenedFit) -> float:
+def _loudest(result: WhitenedFit) -> float:
     """Largest residual (m rms) that can be noise: as large as the motor's whole motion, or one turn of it."""
     reduction = result.reduction
     return abs(reduction.response.static_gain) * max(float(np.ptp(reduction.theta_m)), 2.0 * math.pi)
 
 
-def averaging(interval: float) -> Array:
+def _averaging(interval: float) -> Array:
     """Weights (w,) of one average."""
     size = max(1, round(_SLOW_S / interval))
     return np.full(size, 1.0 / size)
@@ -66,7 +66,7 @@ def averaging(interval: float) -> Array:
 
 def slow(values: Array, interval: float) -> Array:
     """A signal (m,) averaged twice."""
-    window = averaging(interval)
+    window = _averaging(interval)
     return np.convolve(np.convolve(values, window, "valid"), window, "valid")
 
 
@@ -104,7 +104,7 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
 
 _STEP = 1e-3  # relative
 _STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
-TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
+_TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
 GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
 _ALPHA = 40.0  # rad/s, the paper's observer
 
@@ -122,7 +122,7 @@ class ModelShift(NamedTuple):
 
 
 def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
-    """Move of the gap when the model is free within `TOLERANCES`, in the noise that is then left.
+    """Move of the gap when the model is free within `_TOLERANCES`, in the noise that is then left.
 
     Whitening takes the error of a wrong model for noise; a free model takes it up itself.
     """
@@ -132,7 +132,7 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
     here = model.respond(screw)
     motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
     motions.insert(2, here)
-    sizes = list(TOLERANCES.values())
+    sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
         motions.append(model.respond(polygons[BY_RATE:]))
         sizes.append(GROWTH * model.interval)
@@ -162,10 +162,10 @@ def _within_tolerance(rows: Array, free: int) -> LeastSquares:
 def _words(shares: Array, deviations: Array) -> str:
     """Describe the direction that is needed most, and its size."""
     index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
-    if index == len(TOLERANCES):
+    if index == len(_TOLERANCES):
         return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
-    name = list(TOLERANCES)[index]
-    return f"a {name} off by {100.0 * TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
+    name = list(_TOLERANCES)[index]
+    return f"a {name} off by {100.0 * _TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
 
 
 @lru_cache(maxsize=32)

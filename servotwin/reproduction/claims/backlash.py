@@ -14,8 +14,8 @@ from servotwin.reproduction.measures import MeasuredCycle, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, ESTIMATE_DEG, STRESS_DEG, FixedFamilyJob, Runs, Square, Trace
 
 GAPS_DEG = (5.0, 10.0, 15.0)  # Fig 9's, as far as the text tells
-OVER_DEG = np.arange(0.0, ESTIMATE_DEG, 0.5)
-UNDER_DEG = np.arange(ESTIMATE_DEG, STRESS_DEG + 0.25, 0.5)
+_OVER_DEG = np.arange(0.0, ESTIMATE_DEG, 0.5)
+_UNDER_DEG = np.arange(ESTIMATE_DEG, STRESS_DEG + 0.25, 0.5)
 MM = 1e3
 
 
@@ -84,7 +84,7 @@ def settle(runs: Runs) -> Finding:
 @measures("over-estimate-stable")
 def over_estimate(runs: Runs) -> Finding:
     """Gaps below the estimate; the share over an ensemble beside it."""
-    steps = runs.sweep(OVER_DEG)
+    steps = runs.sweep(_OVER_DEG)
     members = [step for gap in (2.0, 5.0, 8.0) for step in runs.ensemble(gap, ESTIMATE_DEG)]
     share = _share(members)
     why = (
@@ -99,7 +99,7 @@ def over_estimate(runs: Runs) -> Finding:
 @measures("over-estimate-bias")
 def over_estimate_bias(runs: Runs) -> Finding:
     """Spread of the biases over the gaps."""
-    biases = [step.bias for step in runs.sweep(OVER_DEG) if step.settled]
+    biases = [step.bias for step in runs.sweep(_OVER_DEG) if step.settled]
     spread = float(np.ptp(biases)) if biases else math.nan
     why = f"over gaps of 0 to 9.5 deg the bias varies from {min(biases) * MM:.3g} to {max(biases) * MM:.3g} mm"
     return decided(spread > 0.01 * AMPLITUDE, why, ("spread of the bias", spread * MM, "mm"))
@@ -108,7 +108,7 @@ def over_estimate_bias(runs: Runs) -> Finding:
 @measures("bias-not-transparent")
 def bias_not_transparent(runs: Runs) -> Finding:
     """Turns of the bias as a function of the gap."""
-    biases = [step.bias for step in runs.sweep(OVER_DEG) if step.settled]
+    biases = [step.bias for step in runs.sweep(_OVER_DEG) if step.settled]
     turns = int(np.count_nonzero(np.diff(np.sign(np.diff(biases)))))
     why = f"over {len(biases)} gaps in steps of 0.5 deg the bias changes its direction {turns} times"
     return decided(not measure.is_monotone(biases), why, ("changes of direction", turns))
@@ -117,12 +117,12 @@ def bias_not_transparent(runs: Runs) -> Finding:
 @measures("under-estimate-limit")
 def under_estimate(runs: Runs) -> Finding:
     """Largest gap up to which all settle, and largest gap that settles."""
-    steps = runs.sweep(UNDER_DEG)
+    steps = runs.sweep(_UNDER_DEG)
     settled = [step.settled for step in steps]
     first = settled.index(False) if False in settled else len(settled)
     last = max((i for i, yes in enumerate(settled) if yes), default=-1)
     reproduced = 0 < first < len(settled) and last < first
-    limit, latest = (float(UNDER_DEG[i]) if i >= 0 else math.nan for i in (first - 1, last))
+    limit, latest = (float(_UNDER_DEG[i]) if i >= 0 else math.nan for i in (first - 1, last))
     why = f"every gap settles up to {limit:g} deg, and the largest that settles is {latest:g} deg"
     return decided(reproduced, why, ("all settle up to", limit, "deg"), ("largest that settles", latest, "deg"))
 

@@ -15,8 +15,8 @@ from servotwin.reproduction import measures as measure
 from servotwin.reproduction.claims.registry import Finding, Verdict, decided, listed, measures
 from servotwin.reproduction.runs import PERIOD, Runs
 
-CROSSOVER, MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
-LOOP_FILTER_HZ = 20.0  # section 4.3
+_CROSSOVER, _MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
+_LOOP_FILTER_HZ = 20.0  # section 4.3
 
 
 @measures("crossover")
@@ -31,7 +31,7 @@ def crossover(runs: Runs) -> Finding:
     )
     values = [(f"gain crossover {i + 1}", omega, "rad/s") for i, omega in enumerate(crossovers)]
     return decided(
-        abs(first - CROSSOVER) < 0.01 * CROSSOVER, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s")
+        abs(first - _CROSSOVER) < 0.01 * _CROSSOVER, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s")
     )
 
 
@@ -44,7 +44,7 @@ def phase_margin(runs: Runs) -> Finding:
     count = len(margins.gain_crossovers)
     why = f"the smallest margin over {count} crossover{'s' if count > 1 else ''} is {smallest:.4g} deg"
     return decided(
-        margins.stable and smallest >= MARGIN_DEG,
+        margins.stable and smallest >= _MARGIN_DEG,
         why,
         ("smallest phase margin", smallest, "deg"),
         ("with the 20 Hz loop filter", filtered, "deg"),
@@ -58,9 +58,9 @@ def loop_filter(runs: Runs) -> Finding:
     controller = _with_loop_filter(runs.servo)
     margins = runs.servo.margins(controller)
     smallest = _smallest_margin_deg(margins)
-    reproduced = margins.stable and smallest >= MARGIN_DEG
+    reproduced = margins.stable and smallest >= _MARGIN_DEG
     state = "stable" if margins.stable else "unstable"
-    why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {MARGIN_DEG:g} deg asked for"
+    why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {_MARGIN_DEG:g} deg asked for"
     before = _smallest_margin_deg(runs.servo.margins())
     return decided(
         reproduced,
@@ -117,7 +117,7 @@ def pd_bandwidth(runs: Runs) -> Finding:
         f" Tf = {law.Tf:.3g} s: in effect a lag)"
     )
     return decided(
-        best < MARGIN_DEG,
+        best < _MARGIN_DEG,
         why,
         ("crossover of the printed PD", first, "rad/s"),
         ("best margin of a PD at 10 rad/s", best, "deg"),
@@ -133,14 +133,14 @@ def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller
 
 def pd_family(servo: Servo) -> list[Controller]:
     """Kp (1 + ratio s / (s/pole + 1)) with a gain of 1 at 10 rad/s: leads, lags and right-half-plane zeros."""
-    plant = complex(servo.plant().response(CROSSOVER))
+    plant = complex(servo.plant().response(_CROSSOVER))
     steps = np.geomspace(1e-3, 10.0, 17)
     pairs = [(float(ratio), float(pole)) for ratio in (0.0, *steps, *-steps) for pole in np.geomspace(1.0, 1e3, 25)]
     return [_pd(servo, plant, ratio, pole) for ratio, pole in pairs]
 
 
 def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
-    shape = 1.0 + ratio * 1j * CROSSOVER / (1j * CROSSOVER / pole + 1.0)
+    shape = 1.0 + ratio * 1j * _CROSSOVER / (1j * _CROSSOVER / pole + 1.0)
     gain = 1.0 / abs(shape * plant)
     return servo.controller.replace(Kp=gain, Ki=0.0, Kd=gain * ratio, Tf=1.0 / pole)
 
@@ -148,7 +148,7 @@ def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
 def _pd_margin_deg(servo: Servo, law: Controller) -> float:
     """Smallest phase margin, deg; 0 when it crosses over below 10 rad/s too."""
     margins = servo.margins(law)
-    early = margins.gain_crossovers[0].omega < 0.99 * CROSSOVER
+    early = margins.gain_crossovers[0].omega < 0.99 * _CROSSOVER
     return 0.0 if early else _smallest_margin_deg(margins)
 
 
@@ -248,4 +248,4 @@ def _without_integral(servo: Servo) -> Controller:
 
 def _with_loop_filter(servo: Servo) -> Controller:
     """The printed gains with the 20 Hz first-order filter of section 4.3."""
-    return servo.controller.replace(loop_filter_hz=LOOP_FILTER_HZ)
+    return servo.controller.replace(loop_filter_hz=_LOOP_FILTER_HZ)

@@ -14,8 +14,8 @@ from servotwin.reproduction.measures import Array, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, BIPOLAR, FixedFamilyJob, Runs, Square
 from servotwin.reproduction.twin_runs import CONTINUOUS, SAMPLED, TwinFamilyJob, TwinJob, TwinRun, WindowJob
 
-RATE_BITS = 100e6  # bit/s, section 4
-UNBIASED_DEG = 0.05
+_RATE_BITS = 100e6  # bit/s, section 4
+_UNBIASED_DEG = 0.05
 MM = 1e3
 Family = Sequence[Sequence[MeasuredStep]]
 
@@ -146,7 +146,7 @@ def samples(runs: Runs) -> Finding:
 def transmission(runs: Runs) -> Finding:
     """Time for the two channels, and for the whole message, at 100 Mbit/s."""
     record = fig15(runs)
-    two, whole = (8e3 * max(count) / RATE_BITS for count in (record.channel_bytes, record.message_bytes))
+    two, whole = (8e3 * max(count) / _RATE_BITS for count in (record.channel_bytes, record.message_bytes))
     why = (
         f"two channels of int16 take {two:.4g} ms; our whole message, which also carries voltage and reference, takes"
         f" {whole:.4g} ms; int16 rounds the position by at most {record.quantisation * 1e6:.2g} µm"
@@ -202,7 +202,7 @@ def unbiased(runs: Runs) -> Finding:
     )
     each = [(f"mean error, gap {gap:g} deg", error, "deg") for gap, error in errors[0.25].items()]
     values = [(f"mean error, {settle:g} s left out", mean, "deg") for settle, mean in means.items()]
-    return decided(abs(means[0.25]) < UNBIASED_DEG, why, *values, *each)
+    return decided(abs(means[0.25]) < _UNBIASED_DEG, why, *values, *each)
 
 
 def _settled_counts(runs_steps: Family) -> list[int]:
