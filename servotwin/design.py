@@ -55,7 +55,7 @@ def tune(
     Raises
     ------
     InvalidInput
-        A value is out of its range, or no such controller exists; the sentence says what can be reached.
+        A value is out of its range, or no such controller exists; the message says what can be reached.
     """
     if phase_margin > math.pi:
         raise InvalidInput(
@@ -89,7 +89,7 @@ def stability_map(
     still: float = 1e-6,
     threads: int | None = None,
 ) -> StabilityMap:
-    """Simulate every cell of a grid from many initial states and say which of them settle.
+    """Simulate every cell of a grid from many initial states and measure which of them settle.
 
     Give either `tolerance` (a map in ratios, which serves every gap) or `gap`.
 

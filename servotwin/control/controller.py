@@ -166,6 +166,7 @@ class Controller:
         if self.sample_rate is None:
             raise InvalidInput("controller sample_rate = None: the sampled law needs a rate in Hz")
         step = 1.0 / self.sample_rate
+        # expm1: with a fast tick 1 - exp(-step / Tf) would lose the digits that decide the filter's pole.
         enter, leave = self.thresholds(tolerance)
         return LawParameters(
             Kp=float(self.Kp),
@@ -177,6 +178,7 @@ class Controller:
             voltage_limit=inf if self.voltage_limit is None else float(self.voltage_limit),
             rate_step=inf if self.rate_limit is None else self.rate_limit / self.sample_rate,
             loop_step=1.0 if self.loop_filter_hz is None else -expm1(-2.0 * pi * self.loop_filter_hz * step),
+            # At most 1: a tracking time below one tick would overcorrect the integral.
             tracking_step=step / max(step, self.tracking),
             feedforward=float(self.feedforward),
             release_step=-expm1(-step / self.release_time),

@@ -108,6 +108,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     """
     filtered = measurement + (1.0 - parameters.loop_step) * (state.filtered - measurement)
     error = reference - filtered
+    # Two thresholds: noise about one of them does not open and close the loop.
     size = abs(error)
     active = state.active
     if active > 0.5:
@@ -124,10 +125,12 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
         voltage = parameters.voltage_limit
     elif voltage < -parameters.voltage_limit:
         voltage = -parameters.voltage_limit
+    # The rate limit comes last: it counts from the voltage applied before.
     if voltage > state.voltage + parameters.rate_step:
         voltage = state.voltage + parameters.rate_step
     elif voltage < state.voltage - parameters.rate_step:
         voltage = state.voltage - parameters.rate_step
+    # Back-calculation (anti-windup); inside the dead zone the integral must hold.
     correction = parameters.tracking_step * (voltage - wanted) * active
     integral = state.integral + parameters.integral_step * driven + correction
     derivative = state.derivative + parameters.filter_step * slope
@@ -155,11 +158,12 @@ def transfer(old: LawParameters, new: LawParameters, state: LawState, reference:
 
     Notes
     -----
-    The integral is kept in volts. A law without integral action neither changes nor corrects it, so there it would stay
-    as a bias for ever: its part goes into the offset too.
+    The integral is stored in volts. A law without integral action never changes it, so it would remain as a bias: it
+    becomes a part of the offset.
     """
-    kept = tick(old, state, reference, measurement).voltage
+    # With the old law's limits, so that a voltage that never reached the motor does not come back.
+    voltage = tick(old, state, reference, measurement).voltage
     integral = state.integral if new.integral_step != 0.0 else 0.0
     moved = state._replace(integral=integral, offset=0.0)
     unlimited = new._replace(voltage_limit=inf, rate_step=inf)
-    return moved._replace(offset=kept - tick(unlimited, moved, reference, measurement).voltage)
+    return moved._replace(offset=voltage - tick(unlimited, moved, reference, measurement).voltage)

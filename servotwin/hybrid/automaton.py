@@ -96,7 +96,7 @@ class Automaton:
 
     @cached_property
     def fastest_lasting(self) -> float:
-        """The same among motions that last: those damped by less than 1 / sqrt(2), 1/s."""
+        """Largest magnitude among the eigenvalues of lasting motions, with a damping ratio below 1 / sqrt(2), 1/s."""
         return float(self._speeds[1])
 
     @cached_property
@@ -109,9 +109,9 @@ class Automaton:
 
 
 def speeds(flows: Array) -> tuple[Array, Array]:
-    """Largest eigenvalue magnitudes (1/s) of the modes of automata, flows (..., M, n, n): of all, and of those damped
-    by less than 1 / sqrt(2)."""
-    # What never moves has eigenvalue zero, and equal flows have equal ones.
+    """Largest eigenvalue magnitudes (1/s) for flows (..., M, n, n): of all eigenvalues, and of those with a damping
+    ratio below 1 / sqrt(2)."""
+    # Constant states only add eigenvalues of zero, and equal flows have equal eigenvalues.
     moving = np.flatnonzero(flows.any(axis=(*range(flows.ndim - 2), flows.ndim - 1)))
     different = np.unique(shared_flows(flows), return_index=True)[1]
     if moving.size == 0:
@@ -123,7 +123,7 @@ def speeds(flows: Array) -> tuple[Array, Array]:
 
 
 def shared_flows(flows: Array) -> NDArray[np.int64]:
-    """(M,) which of the different flows each of the (..., M, n, n) is, counted in the order in which they appear."""
+    """(M,) index of each mode's flow among the different ones of (..., M, n, n), in the order of appearance."""
     result: list[int] = []
     for m in range(flows.shape[-3]):
         same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))

@@ -1,4 +1,4 @@
-"""Filling the tables of an automaton: compiled, without the GIL, into memory that the next automaton can use again."""
+"""Fill the tables of an automaton: compiled, without the GIL, into memory that the next automaton reuses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from servotwin.hybrid.tables import (
 
 
 class Numbers(NamedTuple):
-    """Numbers in which automata of one structure differ, flat; their tables are built of these."""
+    """Numbers in which automata of one structure differ, flat: the input of `fill_tables`."""
 
     flows: Array  # M * n * n
     rows: Array  # M * G * n: guards
@@ -49,7 +49,7 @@ def new_workspace(tables: Tables) -> Workspace:
 
 
 def numbers_of(automaton: Automaton, guards: int) -> Numbers:
-    """The numbers of one automaton, padded to so many guards a mode."""
+    """Numbers of one automaton, padded to `guards` guards in every mode."""
     n, modes = len(automaton.names), automaton.modes
     rows, resets = np.zeros((len(modes), guards, n)), np.zeros((len(modes), guards, n, n))
     for m, mode in enumerate(modes):

@@ -1,8 +1,8 @@
-"""Progress of the first call's compilation, for whoever sits in front of it.
+"""Progress of the compilation in the first call, shown to the person at the terminal.
 
-numba compiles a kernel when it is first called and keeps it on disk. Without a word that is half a minute of silence.
-The words go to the standard error of the main process, and only where that is a terminal or a notebook: pipes, logs,
-services and ``--json`` stay as they are.
+numba compiles a kernel at its first call and caches it on disk: half a minute that would otherwise pass in silence.
+Progress goes to the standard error of the main process, and only if that is a terminal or a notebook: pipes, logs,
+services and ``--json`` are unchanged.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ class CompileProgress(Listener):
 
 
 def _is_watched() -> bool:
-    """Somebody reads what this process writes to its standard error: a person at a terminal or in a notebook."""
+    """True when a person at a terminal or in a notebook reads the standard error of this process."""
     if multiprocessing.current_process().name != "MainProcess" or sys.stderr is None:
         return False
     return sys.stderr.isatty() or "ipykernel" in sys.modules
 
 
 def _is_terminal() -> bool:
-    """One line of it can be written over and over: the terminal is not shared with a progress bar."""
+    """True when one line can be overwritten in place: a terminal that is not shared with a progress bar."""
     return _is_watched() and sys.stderr is sys.__stderr__ and "ipykernel" not in sys.modules
 
 

@@ -29,24 +29,24 @@ def compiled(function: _Function) -> _Function:
 
 
 def bare(function: _Function) -> _Function:
-    """The same without reference counting, half the time of a hot loop: the function allocates nothing and returns no
-    array."""
+    """Compile without reference counting, which is half the time of a hot loop: the function allocates nothing and
+    returns no array."""
     return _compile(function, fastmath={"contract"}, _nrt=False)
 
 
 def inlined(function: _Function) -> _Function:
-    """A bare helper of a hot loop: a call would copy every array header of its arguments."""
+    """Compile inline, for helpers of a hot loop: a call would copy the array header of every argument."""
     return _compile(function, fastmath={"contract"}, _nrt=False, forceinline=True)
 
 
 def summed(function: _Function) -> _Function:
-    """Inlined, for sums in any order: one vector of partial sums instead of a chain of additions."""
+    """Compile inline, additions in any order: one vector of partial sums instead of a chain of additions."""
     return _compile(function, fastmath={"contract", "reassoc"}, _nrt=False, forceinline=True)
 
 
 def verbatim(function: _Function) -> _Function:
-    """Inlined, but every operation rounded as written: the same bits as the interpreter's."""
-    # Left unset, it would be the caller's: numba compiles a callee with what its caller asked for.
+    """Compile inline, every operation rounded as written: the same bits as the interpreter's."""
+    # Explicit, because numba compiles a callee with its caller's fastmath where the callee sets none.
     return _compile(function, fastmath=False, _nrt=False, forceinline=True)
 
 
@@ -55,12 +55,12 @@ def _compile(function: _Function, **options: Any) -> _Function:
         # Nothing calls these through a C function pointer: without that wrapper they compile 8 % faster.
         given: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True, **options}
         dispatcher: Any = njit(cache=True, nogil=True, **given)(function)
-    except RuntimeError:  # it compiles when it is first called: nothing but the cache can be amiss here
+    except RuntimeError:  # only the cache can fail here: compilation comes with the first call
         raise InvalidInput(
-            "compiled code cannot be kept: neither the folder of servotwin nor the user's home may be written; name "
-            "one that may in the environment variable NUMBA_CACHE_DIR"
+            "compiled code cannot be cached: neither the folder of servotwin nor the user's home is writable; set the "
+            "environment variable NUMBA_CACHE_DIR to a folder that is"
         ) from None
-    # A set of strings is written in another order by every process.
+    # Every process prints a set of strings in another order.
     sorted_options = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
     dispatcher.options_key = repr(sorted(sorted_options.items()))
     dispatcher.stamp = stamp(function, dispatcher.options_key)
@@ -72,7 +72,7 @@ def _compile(function: _Function, **options: Any) -> _Function:
 
 
 def _load_index(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
-    """Load numba's index of compiled versions; empty where it names a type that this version of servotwin has not.
+    """Load numba's index of compiled versions; empty where it names a type that this version of servotwin lacks.
 
     The index is a pickle of argument types, so that renaming a tuple of arguments made an old cache unreadable.
     """
@@ -83,7 +83,7 @@ def _load_index(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
 
 
 def stamp(function: Any, options: str) -> str:
-    """Digest of a function, of the options it is compiled with, and of all that it names, compiled or constant."""
+    """Digest of a function, its compile options, and the compiled functions and constants that it names."""
     code = function.__code__
     parts = [options, _fingerprint(code)]
     for name in code.co_names:

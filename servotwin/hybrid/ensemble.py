@@ -66,7 +66,7 @@ def run_ensemble(
     ----------
     automaton : Automaton
     states : (K, n) array
-        MemberStarts at time 0.
+        States at time 0.
     modes : (K,) array
         Modes at time 0.
     sample_step : float
@@ -124,7 +124,7 @@ def run_family(
     Raises
     ------
     InvalidInput
-        Automata of different structure, or members that begin nowhere.
+        The automata differ in structure, or a member's start, mode or automaton does not exist.
     ZenoError
         Naming the member.
     """
@@ -183,7 +183,7 @@ def _run(
     options: FigureOptions | None,
     threads: int | None,
 ) -> None:
-    """Fill `results`; every worker takes the next part when it is done with one."""
+    """Fill `results`; each worker takes the next part when it has finished one."""
     starts = _checked_starts(structure, len(family.step), members, results, options)
     count = len(starts.order)
     workers = max(1, min(threads or os.cpu_count() or 1, count))
@@ -196,9 +196,9 @@ def _run(
         return _run_parts(family, structure, starts, results, parts, tail)
 
     with ThreadPoolExecutor(workers) as pool:
-        lost = [member for some in pool.map(work, range(workers)) for member in some]
-    if lost:
-        raise ZenoError(f"member {min(lost)} changes mode without end: the automaton is Zeno or slides")
+        zeno = [member for part in pool.map(work, range(workers)) for member in part]
+    if zeno:
+        raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
 
 
 def _run_parts(
@@ -209,16 +209,17 @@ def _run_parts(
     parts: Iterator[tuple[int, int]],
     tail: int,
 ) -> list[int]:
-    """One worker: run parts while there are any; return the members that cannot go on."""
+    """Run parts as one worker while there are any; return the members with Zeno behaviour."""
     memory, record = _new_memory(family, structure), new_record(starts.state.shape[1])
     if len(results.figures):
+        # Figures need the samples of one member at a time: every worker has its own buffer for them.
         results = results._replace(traces=np.empty_like(results.traces))
-    lost = []
+    zeno = []
     for first, last in parts:
         status, record = _run_part(family, starts, results, first, last, tail, memory, record)
         if status >= 0:
-            lost.append(int(starts.order[status]))
-    return lost
+            zeno.append(int(starts.order[status]))
+    return zeno
 
 
 def _run_part(
@@ -231,7 +232,7 @@ def _run_part(
     memory: WorkerMemory,
     record: RunRecord,
 ) -> tuple[int, RunRecord]:
-    """Run the members of a part; return the place of the one that cannot go on, -1 when all are done."""
+    """Run the members of a part; return the place of the one with Zeno behaviour, -1 when there is none."""
     while first < last:
         status, first = run_members(family, starts, results, first, last, tail, memory, record)
         if status == ZENO:

@@ -1,4 +1,4 @@
-"""Matrix exponentials kept as ``exp(A t) - I``, each entry a double and what rounding left of it.
+"""Matrix exponentials stored as ``exp(A t) - I``, each entry a double and the remainder of its rounding.
 
 A step is applied as ``x += P @ x``: the rounding of a stored ``exp(A t)`` would be the same in every step and
 accumulate; that of ``P`` is smaller by the size of the step. Sums carry their remainders along; products of two

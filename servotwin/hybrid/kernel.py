@@ -1,9 +1,9 @@
 """The compiled kernel: exact flow, events located to rounding, none missed.
 
 A *place* is a search step and a fraction of it in [0, 1); time is ``(step + fraction) * h``. Between events the state
-is advanced by tables of ``exp(A t) - I``; a guard is looked at as in `tables`, coarse first, and wherever it might
-become positive again at the next finer scale, down to its Taylor polynomial inside one step, whose first root is the
-event.
+is advanced by tables of ``exp(A t) - I``; guards are checked as in `tables`, on the coarse scale first, and
+wherever one might become positive again on the next finer scale, down to its Taylor polynomial inside one step, whose
+first root is the event.
 """
 
 from __future__ import annotations

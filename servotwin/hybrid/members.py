@@ -18,7 +18,7 @@ from servotwin.hybrid.tables import Tables
 
 
 class Figures(NamedTuple):
-    """Figures of outputs whose samples are not kept; arrays of one shape, ``[..., output]``.
+    """Figures of outputs whose samples are not stored; arrays of one shape, ``[..., output]``.
 
     Attributes
     ----------
@@ -71,13 +71,13 @@ class MemberStarts(NamedTuple):
 class MemberResults(NamedTuple):
     """Results of the members."""
 
-    traces: Array  # (K, O, samples), or (1, O, samples) when only figures are asked for
+    traces: Array  # (K, O, samples), or (1, O, samples) when only figures are computed
     figures: Array  # (K, O, number of figures), or (0, O, number of figures)
     events: NDArray[np.int64]  # (K,)
 
 
 class WorkerMemory(NamedTuple):
-    """Memory of one worker, filled again for each automaton and each member."""
+    """Memory of one worker, reused for every automaton and member."""
 
     tables: Tables
     outputs: Outputs

@@ -1,7 +1,7 @@
 """The numbers that the kernel needs for one automaton and one search step, in flat arrays.
 
-Three scales, each a table: a *coarse* block of 128 steps looked at every 8, a *fine* block of 8 steps looked at every
-step, and a single step as a Taylor polynomial. Between two looks a guard is the cubic with its values and slopes; its
+Three scales, each a table: a *coarse* block of 128 steps checked every 8, a *fine* block of 8 steps checked every
+step, and a single step as a Taylor polynomial. Between two checks a guard is the cubic with its values and slopes; its
 Bernstein coefficients are the values and the values plus or minus a third of the slopes, so "no coefficient above zero"
 means "the cubic does not leave the mode", and one product decides a whole block.
 """
@@ -25,8 +25,8 @@ VECTOR = 16
 TERMS = 24
 PART_TERMS = 8
 SPECTRAL_STEP = 2.0
-# What has not died out when the coarse search begins must turn slowly enough for a cubic over 8 steps: of 100 random
-# pairs of undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
+# A motion that lasts into the coarse search must turn slowly enough for a cubic over 8 steps: of 100 random pairs of
+# undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
 LASTING_STEP = 0.25
 
 

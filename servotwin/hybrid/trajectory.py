@@ -37,20 +37,20 @@ class Jump:
 
 @lru_cache(maxsize=64)
 def tables_for(automaton: Automaton, step: float) -> Tables:
-    """Tables of an automaton at one search step; kept for the automata used last."""
+    """Tables of an automaton at one search step, cached for the automata used last."""
     return build_tables(automaton, step)
 
 
 @lru_cache(maxsize=256)
 def outputs_for(automaton: Automaton, step: float, stride: int, rows: bytes) -> Outputs:
-    """The table of one output, its rows (M, n) as bytes; kept for the outputs used last."""
+    """The table of one output, its rows (M, n) as bytes, cached for the outputs used last."""
     full = np.frombuffer(rows).reshape(automaton.flows.shape[:2])
     return output_table(tables_for(automaton, step), full, stride)
 
 
 @dataclass
 class Trajectory:
-    """A run of an automaton on a grid of samples, resumable: `advance` goes on from where it stands.
+    """A resumable run of an automaton on a grid of samples: `advance` continues from the time reached.
 
     Parameters
     ----------
@@ -104,14 +104,15 @@ class Trajectory:
         return int(self._at[0] // self.divisor) + 1
 
     def advance(self, sample: int, jumps: Sequence[Jump] = ()) -> None:
-        """Go on to a sample index through time-ordered `jumps`, none of them before now or after that sample.
+        """Advance to a sample index through time-ordered `jumps`, all of them between now and that sample.
 
         Raises
         ------
         InvalidInput
-            For a sample already passed, or a jump out of its place or to what does not exist.
+            The sample has passed, or a jump is out of order, out of range or names a state or mode that does not exist.
         ZenoError
-            With the time and the mode at which no flow is admitted; the run cannot go on, its past can be read.
+            No mode admits flow: the message names the time and the last mode. The run cannot continue; its past stays
+        readable.
         """
         if not sample >= self.samples - 1:
             raise InvalidInput(f"sample {sample} is before sample {self.samples - 1}, which was reached already")
@@ -124,8 +125,8 @@ class Trajectory:
             place = jump.time / self.step
             if not last - ON_GRID <= place <= sample * self.divisor + ON_GRID:
                 raise InvalidInput(
-                    f"jump at {jump.time} s: must be in time order, from {self.time:.9g} s, where the run stands, to "
-                    f"{sample * self.sample_step:.9g} s, where it is to go"
+                    f"jump at {jump.time} s: must be in time order, from {self.time:.9g} s, the time reached, to "
+                    f"{sample * self.sample_step:.9g} s, the end of this advance"
                 )
             last = max(last, place)
 
@@ -198,7 +199,7 @@ class Trajectory:
         return result
 
     def at(self, times: ArrayLike, rows: ArrayLike) -> Array:
-        """The same output at any times within the run, right-continuous; ``(len(times),)``."""
+        """One linear output at any times (s) within the run, right-continuous; ``(len(times),)``."""
         places = np.asarray(times, dtype=float) / self.step
         begin = self.first * self.divisor
         if not np.all((places >= begin) & (places <= self._at[0] + self._place[0] + ON_GRID)):

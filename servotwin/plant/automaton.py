@@ -3,8 +3,8 @@
 Inputs are exosystem states.
 
 With a continuous controller the zones are dead zone {-, inside, +} times optional saturation {low, linear, high}; with
-a sampled one there is a single zone and the voltage is a state that the tick sets. Friction modes, and the states of
-what is constant, exist only where they are asked for.
+a sampled one there is a single zone and the voltage is a state that the tick sets. Friction modes and the states of
+constant disturbances exist only where the `Shape` requests them.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ class ServoAutomaton:
     frictions : int
         Number of stick-slip modes, the first at rest; mode = (contact mode * frictions + stick-slip mode) * len(zones)
         + zone.
+    opened : tuple of int
+        For each mode the open mode with the same stick-slip mode and zone.
     """
 
     automaton: Automaton
@@ -105,7 +107,7 @@ def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Servo
 
 
 def without_feedforward(controller: Controller) -> Controller:
-    """The same controller as far as the automaton's numbers go: the feedforward is a state."""
+    """Controller without its feedforward, which the automaton holds as a state: equal ones share an automaton."""
     return controller.replace(feedforward=0.0) if controller.feedforward else controller
 
 
@@ -117,7 +119,7 @@ def _continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Serv
     error = basis.row("reference") - measured
     system = _System(servo, basis, _controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
-    for contact, stick_slip, zone in system.places:
+    for contact, stick_slip, zone in system.combinations:
         flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
         flow[basis["integral"]], flow[basis["derivative"]] = zone.integral, zone.derivative
         if controller.loop_filter_hz:
@@ -131,7 +133,7 @@ def _continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> Serv
 
 @lru_cache(maxsize=64)
 def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: bool = False) -> ServoAutomaton:
-    """The plant between two ticks: the voltage is held."""
+    """The plant between two ticks, under a constant voltage (zero-order hold)."""
     names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(bias, friction)]
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
@@ -139,7 +141,7 @@ def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: b
     return system.assembled(
         [
             mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
-            for contact, stick_slip, zone in system.places
+            for contact, stick_slip, zone in system.combinations
         ]
     )
 
@@ -147,7 +149,7 @@ def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: b
 def mechanical_flow(
     servo: Servo, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
 ) -> Array:
-    """(N, N) flow of motor, screw, chain and input chains in one mode; other rows are zero."""
+    """(N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero."""
     flow = np.zeros((len(basis.names), len(basis.names)))
     chain, (A, B, E) = servo.chain(), servo.motor()
     size, first, screw = chain.A.shape[0], basis["chain0"], basis["theta_d"]
@@ -160,6 +162,7 @@ def mechanical_flow(
         np.outer(chain.B_position, basis.row("theta_d")) + np.outer(chain.B_velocity, flow[screw])
     )
     if contact.resting:
+        # The motor moves with its flank, whose half gap changes at its own rate.
         flow[basis["speed"]] = 0.5 * contact.side * basis.row("gap''")
     elif contact.side:
         force = chain.reaction_position * servo.p * basis.row("theta_d")
@@ -167,6 +170,7 @@ def mechanical_flow(
         flow[:3] -= servo.p * np.outer(E, force)
     if stick_slip.stuck:
         flow[basis["speed"]] = 0.0
+    # A polynomial input is a chain of integrators: every derivative drives the one before it.
     for name in basis.names:
         if name + "'" in basis:
             flow[basis[name]] = basis.row(name + "'")
@@ -186,10 +190,12 @@ class Zone:
 
 def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
     """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added."""
+    # The feedforward and the offset act inside the dead zone too.
     always = basis.row("feedforward") + basis.row("offset")
     slope = error - basis.row("derivative")
     unlimited = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
     tolerance = basis.row("tolerance")
+    # Pure integral action has a tracking time of zero: a thousandth of the filter's stands for it in the flow.
     back_calculation = 1.0 / max(controller.tracking, controller.Tf * 1e-3)
     zones: list[Zone] = []
     for side in (-1, 1) if dead_zone else (0,):
@@ -208,7 +214,7 @@ def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, err
 
 
 def _saturated(zone: Zone, basis: Basis, rate: float) -> list[Zone]:
-    """A linear zone, and with a voltage limit its two saturated ones with back-calculation at a rate (1/s)."""
+    """The zone itself and, with a voltage limit, its two saturated zones, with back-calculation at a rate (1/s)."""
     if "voltage limit" not in basis:
         return [zone]
     limit, unlimited = basis.row("voltage limit"), zone.voltage
@@ -238,21 +244,21 @@ def _constants(bias: bool, friction: bool) -> list[str]:
 
 
 class _System:
-    """Every combination of contact mode, stick-slip mode and zone, in the order of the modes."""
+    """All combinations of contact mode, stick-slip mode and zone, in the order of the automaton's modes."""
 
     def __init__(self, servo: Servo, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
         self.servo, self.basis, self.zones = servo, basis, zones
         self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
-        self.places = [
+        self.combinations = [
             (contact, stick_slip, zone) for contact in self.contacts for stick_slip in self.frictions for zone in zones
         ]
-        self.names = [(contact.name, stick_slip.name, zone.name) for contact, stick_slip, zone in self.places]
+        self.names = [(contact.name, stick_slip.name, zone.name) for contact, stick_slip, zone in self.combinations]
 
     def assembled(self, flows: list[Array], **rows: Array) -> ServoAutomaton:
         """The automaton with these flows, and `rows` among its outputs."""
         modes = tuple(
             Mode(flow, self._guards(contact, stick_slip, zone), "/".join(filter(None, names)))
-            for flow, (contact, stick_slip, zone), names in zip(flows, self.places, self.names, strict=True)
+            for flow, (contact, stick_slip, zone), names in zip(flows, self.combinations, self.names, strict=True)
         )
         outputs = self._outputs() | {name: np.tile(row, (len(modes), 1)) for name, row in rows.items()}
         names = tuple(zone.name for zone in self.zones)
@@ -285,6 +291,6 @@ class _System:
         rows = {f"q{i + 1}": row for i, row in enumerate(self.basis.positions(self.servo))}
         rows |= {"position": rows[f"q{self.servo.n}"]}
         rows |= {name: self.basis.row(name) for name in ("theta_m", "theta_d", "reference", "gap", "tolerance")}
-        full = {name: np.tile(row, (len(self.places), 1)) for name, row in rows.items()}
-        full["voltage"] = np.array([zone.voltage for _, _, zone in self.places])
+        full = {name: np.tile(row, (len(self.combinations), 1)) for name, row in rows.items()}
+        full["voltage"] = np.array([zone.voltage for _, _, zone in self.combinations])
         return full

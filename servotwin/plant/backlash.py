@@ -30,7 +30,7 @@ def play_step(theta_d: float, theta_m: float, half_gap: float) -> float:
 
 @compiled
 def play_samples(theta_m: Array, half_gap: Array, theta_d0: float) -> Array:
-    """As `play`, unchecked and with half gaps: (n,) and either (n,) or (1,) arrays."""
+    """Play without checks: (n,) motor angles and half gaps, (n,) or (1,)."""
     theta_d = np.empty_like(theta_m)
     now = theta_d0
     stride = 0 if half_gap.size == 1 else 1
@@ -80,8 +80,8 @@ def play(theta_m: ArrayLike, gap: ArrayLike, theta_d0: float = 0.0) -> Array:
 
 @dataclass(frozen=True)
 class ContactMode:
-    """A mode of the backlash: pressed against the flank of a side, resting there under part of the load, or open (side
-    0)."""
+    """A mode of the backlash: in contact with the flank of a side, resting on it under part of the load, or open
+    (side 0)."""
 
     name: str
     side: int
@@ -103,7 +103,7 @@ def contact_modes(servo: Servo) -> tuple[ContactMode, ...]:
 
 def screw_rate(basis: Basis, contact: ContactMode) -> Array:
     """theta_d' of the play operator: in contact with the motor, less the half gap's own rate; zero in the gap and at
-    rest on a flank (facts E3, E4)."""
+    rest on a flank (errata E3, E4)."""
     if contact.side == 0 or contact.resting:
         return np.zeros(len(basis.names))
     return basis.row("speed") - 0.5 * contact.side * basis.row("gap'")
@@ -119,7 +119,7 @@ def contact_guards(
     stopping : (N,) row or 0.0
         Speed at which a sliding motor has stopped.
     accelerations : sequence of (N,) rows
-        Of the motor free of the load, and under all of it; needed at rest on a flank only.
+        Acceleration of the motor free of the load, and under all of it; used only where the motor rests on a flank.
     """
     side = contact.side
     if side == 0:
@@ -132,7 +132,7 @@ def contact_guards(
         ]
     flank = "+" if side > 0 else "-"
     if contact.resting:
-        # Away from the flank's own acceleration.
+        # Relative to the flank, which accelerates with the half gap.
         free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
         return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
     reset = _contact_reset(servo, basis, side)

@@ -94,7 +94,7 @@ class LinearSystem:
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex, Complex]:
-        """A balanced and made triangular, with B and C in its states."""
+        """Schur form of the balanced A, with B and C in its states."""
         from scipy.linalg import matrix_balance, schur, solve
 
         balanced, scaling = matrix_balance(self.A)
@@ -105,20 +105,21 @@ class LinearSystem:
         """(K,) zeros, 1/s, the roots of the numerator; none where it overflows."""
         if not self._has_polynomials:
             return np.zeros(0, dtype=complex)
-        kept = np.flatnonzero(self.numerator)
-        return np.asarray(poly.polyroots(self.numerator[: kept[-1] + 1] if kept.size else [1.0]), dtype=complex)
+        # polyroots divides by the leading coefficient, which must not be zero.
+        nonzero = np.flatnonzero(self.numerator)
+        return np.asarray(poly.polyroots(self.numerator[: nonzero[-1] + 1] if nonzero.size else [1.0]), dtype=complex)
 
     def asymptotic_crossovers(self) -> Array:
         """(K,) rad/s at which the asymptotes of abs(G) at low and at high frequency are one."""
         if not self._has_polynomials:
             return np.zeros(0)
         above, below = np.flatnonzero(self.numerator), np.flatnonzero(self.denominator)
-        found = []
+        crossovers = []
         for end in (0, -1) if above.size else ():
             order = int(below[end] - above[end])
             if order != 0:
-                found.append(abs(self.numerator[above[end]] / self.denominator[below[end]]) ** (1.0 / order))
-        return np.array([each for each in found if 0.0 < each < np.inf])
+                crossovers.append(abs(self.numerator[above[end]] / self.denominator[below[end]]) ** (1.0 / order))
+        return np.array([omega for omega in crossovers if 0.0 < omega < np.inf])
 
     def poles(self) -> Complex:
         """(N,) eigenvalues of A, 1/s."""
@@ -161,7 +162,7 @@ def zero_order_hold(A: Array, B: Array, step: float) -> tuple[Array, Array]:
 
 
 def gain(value: float) -> LinearSystem:
-    """A constant."""
+    """A constant gain."""
     return LinearSystem(np.zeros((0, 0)), np.zeros(0), np.zeros(0), value, np.array([value]), np.array([1.0]))
 
 

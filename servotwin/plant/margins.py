@@ -21,8 +21,8 @@ _PER_DECADE = 60
 _ABOUT_RESONANCE = np.array([-8.0, -4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0, 8.0])
 # Least half width of a pole or zero as a part of its modulus: an undamped one has none of its own.
 _NARROWEST = 1e-6
-# Distance from zero, in the units of the searched function, within which an extreme between two frequencies may cross
-# it unseen: the frequencies resolve every resonance, so extremes are off by far less.
+# An extreme between two frequencies may cross zero unnoticed if the samples come this close to it, in the units of the
+# searched function: the frequencies resolve every resonance, so extremes are off by far less.
 _NEAR = 0.2
 _DISTINCT = 1e-8
 _ROUNDING = 4.0 * float(np.finfo(float).eps)
@@ -143,8 +143,8 @@ def bandwidth(closed_loop: LinearSystem) -> float:
 
 def peak(system: LinearSystem) -> tuple[float, float]:
     """(omega, value) of the largest abs(G) on the imaginary axis; omega = inf where it is only approached."""
-    found = _peak(lambda w: np.abs(system.response(w)), search_frequencies(system))
-    return max(found, (math.inf, abs(system.D)), key=lambda p: p[1])
+    largest = _peak(lambda w: np.abs(system.response(w)), search_frequencies(system))
+    return max(largest, (math.inf, abs(system.D)), key=lambda p: p[1])
 
 
 def search_frequencies(*systems: LinearSystem) -> Array:
@@ -158,7 +158,7 @@ def search_frequencies(*systems: LinearSystem) -> Array:
     width = np.maximum(np.abs(corners.real), _NARROWEST * np.abs(corners))
     about = (np.abs(corners.imag) + width * _ABOUT_RESONANCE[:, None]).ravel()
     omega = np.unique(np.concatenate([grid, sizes, about[(about > low) & (about < high)]]))
-    # Between frequencies that are equal but for rounding a slope has no sign.
+    # A slope between two frequencies that differ by rounding only has no sign.
     return np.asarray(omega[np.append(True, np.diff(omega) > _DISTINCT * omega[1:])])
 
 
@@ -209,17 +209,17 @@ def _extreme(value: Callable[[Array], Array], sign: float, low: float, high: flo
     """(omega, value) of the largest sign * value between two frequencies."""
     from scipy.optimize import minimize_scalar
 
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         lambda w: -sign * float(value(np.array([w]))[0]),
         bounds=(low, high),
         method="bounded",
         options={"xatol": 1e-9 * (high - low)},
     )
-    return float(found.x), -sign * float(found.fun)
+    return float(optimum.x), -sign * float(optimum.fun)
 
 
 def _peak(value: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
-    """(omega, value) of the largest value: of all local peaks that are close to the highest seen, refined."""
+    """(omega, value) of the largest value: the local peaks close to the highest sample are refined first."""
     values = value(omega)
     best = int(np.argmax(values))
     peaks = [(float(omega[best]), float(values[best]))]
@@ -231,15 +231,16 @@ def _peak(value: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
 
 
 def _gain_crossovers(loop: Callable[[Array], Complex], omega: Array) -> tuple[GainCrossover, ...]:
-    found = crossings(lambda w: _log_modulus(loop(w)), omega)
-    values = [complex(loop(np.array([w]))[0]) for w in found]
-    return tuple(GainCrossover(w, math.atan2(-v.imag, -v.real)) for w, v in zip(found, values, strict=True))
+    frequencies = crossings(lambda w: _log_modulus(loop(w)), omega)
+    values = [complex(loop(np.array([w]))[0]) for w in frequencies]
+    # The angle of -L: pi plus the phase of L, within (-pi, pi].
+    return tuple(GainCrossover(w, math.atan2(-v.imag, -v.real)) for w, v in zip(frequencies, values, strict=True))
 
 
 def _phase_crossovers(loop: Callable[[Array], Complex], omega: Array) -> tuple[PhaseCrossover, ...]:
-    found = crossings(lambda w: direction(loop(w)).imag, omega)
-    values = [complex(loop(np.array([w]))[0]) for w in found]
-    return tuple(PhaseCrossover(w, 1.0 / abs(v)) for w, v in zip(found, values, strict=True) if v.real < 0.0)
+    frequencies = crossings(lambda w: direction(loop(w)).imag, omega)
+    values = [complex(loop(np.array([w]))[0]) for w in frequencies]
+    return tuple(PhaseCrossover(w, 1.0 / abs(v)) for w, v in zip(frequencies, values, strict=True) if v.real < 0.0)
 
 
 def direction(values: Complex) -> Complex:

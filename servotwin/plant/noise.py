@@ -67,7 +67,7 @@ class Noise:
         return sections
 
     def source(self, rate: float, rng: np.random.Generator) -> NoiseSource:
-        """A source that goes on from block to block, stationary from its first sample."""
+        """A source of consecutive blocks, stationary from its first sample."""
         sections = self.filter(rate)
         A, B, _, _ = state_space(sections)
         start = _square_root(_covariance(A, B)) @ rng.standard_normal(B.size)
@@ -89,7 +89,7 @@ class Noise:
 
 @dataclass
 class NoiseSource:
-    """Filter, state and generator of a noise that is drawn in blocks; how it is cut into blocks changes nothing."""
+    """Filter, state and generator of noise drawn in blocks; the block sizes do not change its values."""
 
     std: float
     sections: Array
@@ -138,6 +138,7 @@ def _covariance(A: Array, B: Array) -> Array:
 
 
 def _square_root(covariance: Array) -> Array:
-    """A root of a symmetric positive semidefinite matrix (white noise has none to take a Cholesky factor of)."""
+    """A square root of a symmetric positive semidefinite matrix."""
+    # Not Cholesky's: white noise has the covariance zero, which is not definite.
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -174,8 +174,9 @@ class Servo:
     def resolve(cls, name_or_path: str, folder: str | os.PathLike[str] = ".") -> Servo:
         """A preset's name, or the path of a servo's TOML relative to `folder`."""
         path = Path(folder) / name_or_path
-        named = name_or_path in PRESETS or not (path.suffix or path.exists())
-        return cls.preset(name_or_path) if named else cls.load(path)
+        # A bare word that is no file is a misspelt preset, of which `preset` says more than `load` could.
+        is_preset = name_or_path in PRESETS or not (path.suffix or path.exists())
+        return cls.preset(name_or_path) if is_preset else cls.load(path)
 
     @classmethod
     def _from_table(cls, table: Table) -> Servo:
@@ -295,7 +296,7 @@ class Servo:
         return margins(self.loop(controller), self.closed_loop(controller))
 
     def check_loop(self, controller: Controller | None = None) -> None:
-        """Refuse a controller that does not even stabilise the servo without a gap, at its sample rate if it has one.
+        """Refuse a controller that does not stabilise the servo even without a gap, at its sample rate if it has one.
 
         Raises
         ------
@@ -314,8 +315,13 @@ class Servo:
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
-        systems = (self.G1(), self.G2(), loop.pidf(self.controller), self.loop(), self.closed_loop())
-        return Control(*(system.to_control() for system in systems))
+        return Control(
+            G1=self.G1().to_control(),
+            G2=self.G2().to_control(),
+            C=loop.pidf(self.controller).to_control(),
+            loop=self.loop().to_control(),
+            closed_loop=self.closed_loop().to_control(),
+        )
 
 
 @cache

@@ -223,7 +223,7 @@ class SquareWave:
         return self.between(0.0, max(duration, 0.0))
 
     def between(self, begin: float, end: float) -> PiecewiseCubic:
-        """The same from a time on (s, at least 0), whatever it was before: for a run without an end."""
+        """The wave from `begin` (at least 0) to `end` (s), for a run without an end; earlier values are arbitrary."""
         count = 2.0 * (end - begin) / self.period
         if not count <= _MOST_PIECES:
             shown = f"SquareWave period = {self.period!r} s: gives {count:.3g} half periods in {end - begin!r} s"
@@ -290,7 +290,7 @@ def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit:
     Raises
     ------
     InvalidInput
-        With the time and the value of the lowest point; a number that is not finite, by its name.
+        The message names the lowest point's time and value, or the number that is not finite.
     """
     if isinstance(signal, int | float) and not math.isfinite(signal):
         raise InvalidInput(f"{name} = {signal} {unit}: must be finite and 0 or more")
@@ -307,7 +307,7 @@ def as_gap(signal: SignalLike, duration: float) -> PiecewiseCubic:
     Raises
     ------
     InvalidInput
-        Also for a gap above 2 pi rad, which is nearly always one in degrees.
+        As `as_nonnegative`; also for a gap above 2 pi rad, nearly always an angle in degrees.
     """
     pieces = as_nonnegative(signal, duration)
     check_gap(-pieces.scaled(-1.0).minimum(duration)[1])
@@ -320,7 +320,7 @@ def check_gap(gap: float, name: str = "gap") -> None:
     Raises
     ------
     InvalidInput
-        With the angle in degrees, and what was probably meant.
+        The message shows the angle in degrees and suggests math.radians.
     """
     if gap > LARGEST_GAP:
         raise InvalidInput(

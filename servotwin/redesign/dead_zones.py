@@ -1,4 +1,4 @@
-"""Policies that set the dead zone only: with the paper's own remarks made a rule, and with hysteresis."""
+"""Policies that set the dead zone only: by the paper's remarks on noise and step sizes, and with hysteresis."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from servotwin.redesign.settling import settling_map
 
 
 def gap_range(estimate: GapEstimate) -> Range:
-    """The gaps (rad) to reckon with: the estimate's interval, and what `std_total` adds to it."""
+    """Range of possible gaps (rad): the estimate's interval, widened by its `std_total`."""
     spread = NORMAL_95 * estimate.std_total
     low, high = min(estimate.interval[0], estimate.gap - spread), max(estimate.interval[1], estimate.gap + spread)
     return max(low, 0.0), high
@@ -28,8 +28,8 @@ def gap_range(estimate: GapEstimate) -> Range:
 class MarginPolicy:
     """tolerance = max(k_DZ p gap, k_noise noise) for the widest gap of the interval.
 
-    k_DZ is the least that settles for every step of the stated size, read from the map of `settling`: what the paper
-    says of its k_DZ and of noise (sections 4.2 and 4.3), as a rule.
+    k_DZ is the least one that settles for every step of the stated size, read from the map of `settling`. The rule
+    follows the paper's remarks on k_DZ and on noise (sections 4.2 and 4.3).
 
     Parameters
     ----------
@@ -64,6 +64,7 @@ class MarginPolicy:
         high = gap_range(estimate)[1]
         noise = evidence.disturbance.noise
         least = self.k_noise * noise if math.isfinite(noise) else 0.0
+        # Without lost motion the map, which is in units of it, does not apply.
         if high == 0.0:
             return Redesign(Setting(least), estimate.gap, "")
         lost = self.servo.p * high
@@ -75,7 +76,7 @@ class MarginPolicy:
 
 @dataclass(frozen=True)
 class HysteresisPolicy:
-    """A dead zone of p gap that is entered well inside and left well outside.
+    """A dead zone of p gap with hysteresis: entered well inside of it, left well outside.
 
     Parameters
     ----------

@@ -29,16 +29,16 @@ class Design:
     tolerance: float = 0.0
 
     def setting(self, band: Band | None = None) -> Setting:
-        """Part of it that an update sets, with the band that is predicted for it."""
+        """Setting of an update: tolerance and gains, with the band predicted for them."""
         return Setting(self.tolerance, gains_of(self.controller), band)
 
     @property
     def continuous(self) -> Design:
-        """The same law in continuous time, in which candidates are simulated."""
+        """The same design in continuous time, in which candidates are simulated."""
         return Design(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
 
     def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
-        """Voltage, V rms, that white measurement noise of `noise` (m rms) within `band` (Hz) causes by itself.
+        """Voltage (V rms) caused by white measurement noise of `noise` (m rms) within `band` (Hz).
 
         The loop is left out: it does not answer at frequencies far above its crossover. Gains as in Eq 14, behind the
         loop filter.

@@ -1,4 +1,4 @@
-"""Evidence on which a policy decides."""
+"""Evidence for the decision of a policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOT_OBSERVED = nothing_known(float("nan"), "not observed")
 
 @dataclass(frozen=True)
 class Evidence:
-    """Estimate of one window, and what is known beside it.
+    """Estimate of one window, with the disturbance, the trend and the setting in force.
 
     Attributes
     ----------
@@ -23,13 +23,13 @@ class Evidence:
     disturbance : Disturbance
         Input bias and noise in the same window.
     trend : Trend or None
-        Gap and wear from all windows that counted, this one included.
+        Gap and wear from all accepted windows, this one included.
     setting : Setting or None
-        In force at the edge, as it last said; None: not known. Gains None: set by somebody else than this twin.
+        In force at the edge by its last report; None: not known. Gains None: not set by this twin.
     tuned_for : float or None
         rad, gap of the last redesign; None before the first.
     why_not : str
-        Why nothing may stand on the estimate: its status, or that it does not fit the trend; empty where it may.
+        Reason against using the estimate, such as that it does not fit the trend; empty where it may be used.
     """
 
     estimate: GapEstimate
@@ -46,7 +46,7 @@ class Evidence:
 
     @property
     def unusable(self) -> str:
-        """Reason why nothing may stand on the estimate; empty where it may."""
+        """Reason against using the estimate; empty where it may be used."""
         if self.why_not or self.estimate.ok:
             return self.why_not
         reasons = "; ".join(self.estimate.reasons)

@@ -1,8 +1,8 @@
-"""Excitation: where windows tell too little of the gap, longer ones are requested, and only then a probing move.
+"""Excitation: requests for longer windows where windows tell too little of the gap, and only then for a probing move.
 
-The calmer a loop, the less its windows tell (dual control). A window with a pre-trigger costs nothing but bytes; a move
-of the reference costs the machine's rest, and is asked for only where the configuration allows it, no larger than
-needed, and rarely. State goes in and comes out; every decision says why.
+The calmer a loop, the less its windows tell (dual control). A longer window costs only bytes; a move of the reference
+disturbs the machine, so the policy requests it only where the configuration allows it, no larger than needed, and
+rarely. The policy is a pure function of its state and one window; every decision carries its reason.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 
-_ROUNDING = 1e-6  # s: windows are whole numbers of samples
+_ROUNDING = 1e-6  # s: a window is cut to whole samples, so it may be a little shorter than requested
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 
 
 @settings("excitation")
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """What may be asked of the edge when windows tell too little of the gap, and when.
+    """Requests that the twin may make of the edge when windows tell too little of the gap, and when.
 
     Raises
     ------
@@ -34,17 +34,22 @@ class ExcitationSettings:
 
     after: Annotated[
         int,
-        key(minimum=1, help="Windows in a row without an estimate, for want of information, until the twin asks."),
+        key(minimum=1, help="Windows in a row that tell too little for an estimate, until the twin makes a request."),
     ] = 2
-    window: Annotated[float, key("window_s", above=0.0, help="Length of the windows asked for.")] = 2.0
+    window: Annotated[float, key("window_s", above=0.0, help="Length of the requested windows.")] = 2.0
     pre_trigger: Annotated[
         float,
         key("pre_trigger_s", minimum=0.0, help="Part of them before the reference changes, below window_s."),
     ] = 0.3
-    probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is asked for.")] = 0.0
+    probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is requested.")] = 0.0
     interval: Annotated[float, key("interval_s", above=0.0, help="Time from one probing move to the next.")] = 60.0
     hold: Annotated[
-        float, key("hold_s", above=0.0, help="Time that a probing move stays away, and is watched after it came back.")
+        float,
+        key(
+            "hold_s",
+            above=0.0,
+            help="Time that a probing move stays away, and that the window goes on after its return.",
+        ),
     ] = 0.85
     strokes: Annotated[int, key(minimum=1, help="Number of times that it goes there and back.")] = 1
     margin: Annotated[
@@ -67,15 +72,16 @@ class ExcitationSettings:
 class Stage(StrEnum):
     """Stage of a request."""
 
+    # The values are part of the twin's stored state.
     OPEN = "not asked for"
-    ASKED = "asked for"
+    REQUESTED = "asked for"
     TAKEN = "taken"
     REFUSED = "refused"
 
 
 @dataclass(frozen=True)
 class WindowSummary:
-    """Information in one window, and what is known with it.
+    """Information in one window, and the bounds known with it.
 
     Attributes
     ----------
@@ -83,11 +89,11 @@ class WindowSummary:
         s, on any steady clock.
     status : GapStatus
     long : bool
-        True where it has the length and pre-trigger that would be requested, or was cut for a probing move.
+        True for a window of the length and pre-trigger that would be requested, or cut for a probing move.
     upper : float
-        rad: the gap is at most this.
+        rad, upper bound of the gap.
     slack : float
-        m that the reference may move without an answer of the loop: both thresholds of the dead zone together; NaN: not
+        m, motion of the reference to which the loop does not react: both thresholds of the dead zone together; NaN: not
         known.
     """
 
@@ -105,10 +111,10 @@ class ExcitationState:
     Attributes
     ----------
     misses : int
-        Windows in a row that told too little, since the last one that did not or the last thing asked for.
+        Windows in a row that told too little, since the last informative one or the last request.
     window, probing : Stage
     probed : float
-        s, when the last probing move was asked for.
+        s, time of the last request for a probing move.
     """
 
     misses: int = 0
@@ -117,7 +123,7 @@ class ExcitationState:
     probed: float = -math.inf
 
     def rebooted(self) -> ExcitationState:
-        """State after a boot of the edge: its windows are as configured again."""
+        """State after a boot of the edge, which cuts windows as configured again."""
         return ExcitationState(probed=self.probed)
 
     def answered(self, ask: Ask, outcome: RequestOutcome | None) -> ExcitationState:
@@ -132,7 +138,7 @@ class ExcitationState:
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision to request something, with the reason, or the reason why not."""
+    """Decision on a request (None: no request), with its reason."""
 
     state: ExcitationState
     ask: Ask | None
@@ -141,7 +147,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class ExcitationPolicy:
-    """Asks for what would make the gap known.
+    """Policy for requests that would make the gap known.
 
     Parameters
     ----------
@@ -169,26 +175,26 @@ class ExcitationPolicy:
     def needed(self, window: WindowSummary) -> float:
         """Size of a probing move, m: across the widest gap that is possible, and the margin beyond it.
 
-        Settled, the screw follows the reference but for the dead zone, whatever the gap; that the loop crosses the gap
-        within the hold takes an error of the gap's size.
+        In the steady state the screw follows the reference but for the dead zone, whatever the gap; crossing the gap
+        within the hold time takes an error of the gap's size.
         """
         return window.slack + self.pitch * (window.upper + self.settings.margin)
 
     def _missed(self, state: ExcitationState) -> str:
         several = f"{state.misses} windows in a row tell" if state.misses > 1 else "1 window tells"
-        enough = "" if state.misses >= self.settings.after else f", {self.settings.after} are waited for"
+        enough = "" if state.misses >= self.settings.after else f", a request follows after {self.settings.after}"
         refused = ", longer ones are refused" if state.window is Stage.REFUSED else ""
         return f"{several} too little of the gap{enough}{refused}"
 
     def _window(self, state: ExcitationState) -> Decision:
-        """Request longer windows: shorter ones count until then, and not against the longer ones."""
+        """Request longer windows; misses of shorter ones do not count against the longer ones."""
         s = self.settings
         if state.window is not Stage.OPEN:
             return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
         if state.misses < s.after:
             return Decision(state, None, self._missed(state))
         why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
-        after = replace(state, misses=0, window=Stage.ASKED)
+        after = replace(state, misses=0, window=Stage.REQUESTED)
         return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 
     def _probe(self, state: ExcitationState, window: WindowSummary) -> Decision:
@@ -196,7 +202,7 @@ class ExcitationPolicy:
         why_not = self._why_not(state, window, needed)
         if why_not:
             return Decision(state, None, f"{self._missed(state)}, and {why_not}")
-        after = replace(state, misses=0, probing=Stage.ASKED, probed=window.time)
+        after = replace(state, misses=0, probing=Stage.REQUESTED, probed=window.time)
         why = f"{self._missed(state)}: a move of {_mm(needed)} crosses a gap of {math.degrees(window.upper):.3g} deg"
         return Decision(after, Probe(needed, s.hold, s.strokes), why)
 
@@ -208,11 +214,11 @@ class ExcitationPolicy:
         if state.probing is Stage.REFUSED:
             return "this edge refuses probing moves"
         if since < s.interval:
-            return f"the last probing move was asked for {since:.3g} s ago, where {s.interval:g} s must lie between two"
+            return f"the last probing move was requested {since:.3g} s ago, and {s.interval:g} s must lie between two"
         if not math.isfinite(needed):
-            return "neither gap nor dead zone are bounded well enough to say how large a probing move must be"
+            return "gap and dead zone are not bounded well enough to size a probing move"
         if needed > s.probe:
-            return f"a probing move must be {_mm(needed)}, where {_mm(s.probe)} are allowed"
+            return f"a probing move must be {_mm(needed)}, and at most {_mm(s.probe)} are allowed"
         return ""
 
 

@@ -1,4 +1,4 @@
-"""Policies: their protocol, and the paper's, a dead zone as wide as the estimated gap (Eq 21)."""
+"""Protocol of the policies, and the paper's policy: a dead zone as wide as the estimated gap (Eq 21)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Redesign:
     gap : float
         Total gap, rad, that the setting was made for; NaN without one.
     reason : str
-        Why the controller is left as it is; empty otherwise.
+        Reason to leave the controller as it is, or to send the fallback set; empty otherwise.
     certificate : Certificate, optional
         Results of the setting in simulation.
     to_verify : Region, optional
-        Region for which the setting is still to be verified exactly, its certificate being of a wider one; None: none.
+        Region for which the setting is still to be verified, since its certificate is that of a wider one; None: none.
     """
 
     setting: Setting | None
@@ -40,12 +40,12 @@ class Redesign:
 
 
 class Policy(Protocol):
-    """Makes a setting of evidence.
+    """Rule that makes a setting from evidence.
 
     Attributes
     ----------
     needs_estimate : bool
-        True where it is consulted only if something may stand on the estimate.
+        True when the policy decides only on usable estimates.
     """
 
     @property
@@ -58,7 +58,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class PaperPolicy:
-    """tolerance = k_dz p gap, from estimates that are OK only.
+    """tolerance = k_dz p gap, from usable estimates only.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class PaperPolicy:
     k_dz : float
         Tolerances per gap (the paper's is one).
     smoothing : float
-        Share of the previous gap that is kept at each update, 0 (none: Eq 21 as printed) up to, but not including, 1.
+        Share of the previous gap in each update, 0 (none: Eq 21 as printed) up to, but not including, 1.
         The paper's "l = 1/10" may mean this; it is not explained there (erratum E14).
 
     Raises
@@ -88,7 +88,7 @@ class PaperPolicy:
             raise InvalidInput(f"policy smoothing = {self.smoothing!r}: must be at least 0 and below 1")
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """The tolerance for an estimate; smoothed only where there was a gap to tune for before."""
+        """Set the tolerance for an estimate; smoothed only where an earlier redesign had a gap."""
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
         share = self.smoothing if evidence.tuned_for is not None else 0.0

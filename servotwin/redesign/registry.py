@@ -1,4 +1,4 @@
-"""All policies by name. A new one is a module in this package and one entry here."""
+"""All policies by name. A new policy is a module in this package and one entry here."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def policy_of(servo: Servo, options: PolicyOptions) -> Policy:
 
 
 def certified_policy(servo: Servo, options: PolicyOptions) -> CertifiedPolicy:
-    """Make the certified policy; it feeds no more forward than cancels the largest input bias that is stated."""
+    """Make the certified policy; its largest feedforward cancels the largest stated input bias."""
     low, high = options.uncertainty.input_bias
     return CertifiedPolicy(servo, options.uncertainty, options.demands, feedforward_limit=max(abs(low), abs(high)))
 
 
 def _certified(servo: Servo, options: PolicyOptions) -> Policy:
-    """Verify before every update, or look up."""
+    """Make the policy that verifies before every update or, with a table, looks settings up."""
     policy = certified_policy(servo, options)
     return policy if options.table is None else TablePolicy(policy, load(Path(options.table), policy))
 

@@ -1,4 +1,4 @@
-"""Map of the dead zones for which the loop settles, behind the policy `margin`.
+"""Map of the dead zones for which the loop settles; the policy `margin` reads it.
 
 Settling is not monotone in the tolerance; the map therefore gives the least tolerance from which on every wider one
 settled too.
@@ -19,7 +19,7 @@ from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
 
-# In units of p gap, the screw's lost motion: two of the map's own.
+# In units of p gap, the screw's lost motion; the map's own unit p b is half of it.
 _K_DZ, _STEPS = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)
 _UNITS = 2.0
 # The scale of a map is free; settled means as still as 1 um where the lost motion is 1 mm.
@@ -38,7 +38,7 @@ class SettlingMap:
     steps : (S,) array
         Steps of the reference in units of p gap, ascending.
     settled : (K, S) array of bool
-        Whether every start of the screw settled.
+        True where the loop settled from every start of the screw.
     """
 
     k_dz: Array
@@ -65,10 +65,10 @@ def settling_map(servo: Servo) -> SettlingMap:
     Raises
     ------
     InvalidInput
-        The controller is sampled, or does not even stabilise the servo without a gap.
+        The controller is sampled, or does not stabilise the servo even without a gap.
     """
     axes = RatioAxes(tuple((_UNITS * _K_DZ).tolist()), tuple((_UNITS * _STEPS).tolist()), _GAP)
     still = _STILL * servo.p * _GAP
     settings = MapSettings(servo, axes, members=_STARTS, motion=0.0, duration=_DURATION, window=_LAST, still=still)
-    found = compute_cells(settings)
-    return SettlingMap(_K_DZ, _STEPS, (found.settled == 1.0).reshape(axes.shape))
+    measures = compute_cells(settings)
+    return SettlingMap(_K_DZ, _STEPS, (measures.settled == 1.0).reshape(axes.shape))

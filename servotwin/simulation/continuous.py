@@ -22,7 +22,7 @@ _NOISE_BLOCK = 4096
 
 @dataclass
 class ContinuousEngine:
-    """Engine of a `Simulation` whose controller has no sample rate; noise is held from sample to sample."""
+    """Engine of a `Simulation` whose controller has no sample rate; noise is constant between samples."""
 
     servo: Servo
     controller: Controller
@@ -75,7 +75,8 @@ class ContinuousEngine:
         return self.trajectory.samples - 1
 
     def advance(self, index: int) -> None:
-        """Go on to a sample through the inputs' knots."""
+        """Advance to a sample through the knots of the inputs."""
+        # Every noise sample is a jump of its own: blocks bound the memory of their schedule.
         while self.noise is not None and index - self.index > _NOISE_BLOCK:
             self._advance(self.index + _NOISE_BLOCK)
         self._advance(index)
@@ -101,18 +102,18 @@ class ContinuousEngine:
         self.trajectory.advance(index, jumps)
 
     def set_tolerance(self, tolerance: float) -> None:
-        """A constant tolerance from now on."""
+        """Set a constant tolerance from now on."""
         self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
 
     def set_reference(self, reference: PiecewiseCubic) -> None:
-        """Another reference from now on, which the inputs hold already; a higher degree needs another automaton."""
+        """Follow another reference from now on, already part of the inputs; a higher degree needs another automaton."""
         now = about(reference, self.index / self.inputs.sample_rate)
         if len(self.loop.input_values("reference", now)) <= degree(reference):
             self.set_controller(self.controller, None)
         self.trajectory.set(self.loop.input_values("reference", now))
 
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
-        """Another controller from now on, the voltage going on where it is; a constant tolerance unless None."""
+        """Change the controller from now on without a jump of the voltage; a constant tolerance unless None."""
         _refuse_rate_limit(controller)
         values = controller_constants(controller)
         if tolerance is not None:
@@ -124,6 +125,7 @@ class ContinuousEngine:
         self.controller, self.loop = controller, place.loop
         step = 1.0 / self.inputs.sample_rate
         self.trajectory = Trajectory(place.loop.automaton, place.state, place.mode, step, self.refine, index)
+        # Guards that the change made positive are followed now, so that the present sample shows the new zone.
         self.trajectory.advance(index)
 
     def channel(self, name: str, first: int, last: int) -> Array:
@@ -141,8 +143,11 @@ class ContinuousEngine:
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Time, kind, side, and whether the state (not a jump) triggered it."""
         trajectories = [*(trajectory for _, trajectory in self.past), self.trajectory]
-        found = [event for trajectory in trajectories for event in trajectory.events()]
-        return [(time, kind, side, not forced) for time, kind, side, forced in found]
+        return [
+            (time, kind, side, not forced)
+            for trajectory in trajectories
+            for time, kind, side, forced in trajectory.events()
+        ]
 
 
 def _refuse_rate_limit(controller: Controller) -> None:
@@ -158,13 +163,13 @@ def start_zone(error: float, enter: float) -> str:
 
 
 def controller_constants(controller: Controller) -> dict[str, float]:
-    """States that hold numbers of the controller."""
+    """States of the automaton that are constants of the controller, by name."""
     limit = {} if controller.voltage_limit is None else {"voltage limit": controller.voltage_limit}
     return {"feedforward": controller.feedforward, **limit}
 
 
 def set_states(loop: ServoAutomaton, state: Array, values: Mapping[str, float]) -> None:
-    """Set those of the named states that the automaton has."""
+    """Set the named states; names that the automaton lacks are ignored."""
     for name, value in values.items():
         if name in loop.automaton.names:
             state[loop.automaton.index(name)] = value
@@ -216,7 +221,7 @@ def change_controller(
     """Replace the controller in the running loop: common states go on, the voltage does not jump.
 
     As `control.law.transfer` does for the sampled law: the difference to the old controller's voltage at this instant
-    becomes an offset that fades exponentially. Voltage beyond the old controller's limit is forgotten.
+    becomes an offset that fades exponentially. Voltage beyond the old controller's limit is dropped.
 
     Parameters
     ----------
@@ -238,15 +243,18 @@ def change_controller(
 def _with_states(
     now: LoopState, controller: Controller, loop: ServoAutomaton, values: Mapping[str, float]
 ) -> LoopState:
-    """States by name. Without integral action nothing would ever correct the integral: it goes into the offset."""
-    kept = {name: now.value(name) for name in now.loop.automaton.names if name != "offset"}
-    kept |= {"integral": 0.0} if controller.Ki == 0.0 else {}
-    kept = {"filtered": now.output("measured_position")} | kept | dict(values)
-    state = np.array([kept.get(name, 0.0) for name in loop.automaton.names])
+    """Carry the states over by name. Without integral action nothing would correct the integral: its part goes into the
+    offset."""
+    common = {name: now.value(name) for name in now.loop.automaton.names if name != "offset"}
+    common |= {"integral": 0.0} if controller.Ki == 0.0 else {}
+    # A loop filter that is new starts at the measurement: at zero it would show a jump of the position.
+    common = {"filtered": now.output("measured_position")} | common | dict(values)
+    state = np.array([common.get(name, 0.0) for name in loop.automaton.names])
     zone = now.zone.split()[0]
     if zone != "on":
-        error, tolerance = float(loop.rows["error"][0] @ state), kept["tolerance"]
+        error, tolerance = float(loop.rows["error"][0] @ state), common["tolerance"]
         zone = _zone_after(zone, error, controller.enter * tolerance, controller.leave * tolerance)
+    # Contact and stick-slip modes stay: both automata number them alike.
     mechanics = now.mode // len(now.loop.zones)
     return LoopState(loop, state, mechanics * len(loop.zones) + loop.zones.index(zone))
 

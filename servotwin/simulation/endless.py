@@ -1,6 +1,6 @@
-"""A sampled simulation without an end: inputs are laid out stretch by stretch, and only recent samples remembered.
+"""A sampled simulation without an end: inputs are laid out stretch by stretch, and only recent samples are stored.
 
-Sample by sample it is the `Simulation` with an end, bit for bit.
+Its samples equal those of a bounded `Simulation` bit for bit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STRETCH, MARGIN = 3600.0, 1.0  # s: length of reference laid out at a time, and 
 
 
 def first_stretch(reference: SignalLike) -> PiecewiseCubic:
-    """First stretch of an unbounded simulation's reference."""
+    """First stretch of the reference of an unbounded simulation."""
     return _between(reference, 0.0, STRETCH + MARGIN)
 
 
@@ -37,7 +37,7 @@ class UnboundedSimulation:
     simulation : Simulation
         Sampled, with `keep`, over `FOREVER`; its reference begins as `first_stretch` of `reference`.
     reference : number or signal
-        m, the machine's own reference, without the offsets of `move`.
+        m, the machine's reference without the offset of `move`.
     """
 
     def __init__(self, simulation: Simulation, reference: SignalLike) -> None:
@@ -53,7 +53,7 @@ class UnboundedSimulation:
         return self.engine.index
 
     def advance(self, index: int) -> None:
-        """Go on to a sample."""
+        """Advance to a sample."""
         while self._until is not None and self._until < index:
             self.simulation.advance(self._until)
             self.lay_out()
@@ -65,39 +65,40 @@ class UnboundedSimulation:
         return self._until
 
     def lay_out(self) -> None:
-        """The reference's next stretch, from the present sample on."""
+        """Lay out the next stretch of the reference, from the present sample on."""
         time = self.simulation.time
         if self._until is not None:
             self._until = self.index + int(STRETCH * self.rate)
-        wanted = _between(self._reference_signal, time, time + STRETCH + MARGIN)
-        self._set_reference(wanted if self._offset == 0.0 else _raised(wanted, self._offset))
+        stretch = _between(self._reference_signal, time, time + STRETCH + MARGIN)
+        # Without an offset the stretch stays as it is, bit for bit.
+        self._set_reference(stretch if self._offset == 0.0 else _raised(stretch, self._offset))
 
     def move(self, offset: float) -> None:
-        """Add this (m) to the wanted reference from the present sample on."""
+        """Offset the reference (m) from the present sample on; replaces an earlier offset."""
         self._offset = offset
         self.lay_out()
 
     def set_tolerance(self, tolerance: float) -> None:
-        """A new dead zone (m) from the present sample on."""
+        """Set the dead-zone half-width (m) from the present sample on."""
         self.simulation.set_tolerance(tolerance)
         self._forget()
 
     def set_controller(self, controller: Controller, tolerance: float) -> None:
-        """Another controller and dead zone (m) from the present sample on, without a jump of the voltage."""
+        """Change controller and dead zone (m) from the present sample on, without a jump of the voltage."""
         self.simulation.set_controller(controller, tolerance)
         self._forget()
 
     def measured(self, name: str, first: int, last: int) -> Array:
-        """As `Simulation.measured` says, of the samples remembered."""
+        """Output of a sensor or of the law at stored samples, as `Simulation.measured`."""
         return self.simulation.measured(name, first, last)
 
     @property
     def _oldest(self) -> float:
-        """Time of the oldest sample remembered, s."""
+        """Time of the oldest stored sample, s."""
         return self.engine.oldest / self.rate
 
     def _forget(self) -> None:
-        """Forget the dead zone before the oldest sample remembered."""
+        """Drop the dead zone before the oldest stored sample."""
         inputs = self.simulation.inputs
         assert inputs.tolerance is not None
         inputs.tolerance = recent(inputs.tolerance, self._oldest)
@@ -163,12 +164,13 @@ class OpenLoopPlant:
         return self._reference[here], _rounded(angle, self._finest[0]), _rounded(position, self._finest[1])
 
     def hold(self, voltage: float) -> None:
-        """Let the plant flow to the next sample under a voltage (V)."""
+        """Advance the plant to the next sample under a voltage (V)."""
         engine = self._engine
         base = engine.base
         engine.parameters = _VOLTAGE_ONLY._replace(feedforward=voltage)
         engine.make_room(base + 1)
         if base in self._changes:
+            # The gap's cubic changes within this sample: the engine takes that step, and draws the same noise again.
             engine.draws.put_back(self._tick_inputs.noise[base - self._first :])
             engine.advance(base + 1)
             self._lay_out()
@@ -178,7 +180,7 @@ class OpenLoopPlant:
             self._lay_out()
 
     def _lay_out(self) -> None:
-        """RunInputs of the samples to come."""
+        """Lay out the inputs of the samples to come."""
         first, until = self._engine.base, self._machine.laid_out
         if until is not None and until <= first:
             self._machine.lay_out()

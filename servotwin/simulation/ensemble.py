@@ -1,4 +1,4 @@
-"""Many continuous runs at once, on all threads: of one servo, or each of a servo and with a controller of its own."""
+"""Many continuous runs at once, on all threads: of one servo, or each with its own servo and controller."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Group:
     Attributes
     ----------
     which : (k,) array
-        Their places among all members.
+        Their indices among all members.
     automata : list of Automaton
-        Each different one once.
+        The different automata, each once.
     rows : (A, O, M, n) array
         Outputs of each automaton.
     members : Members
@@ -69,7 +69,7 @@ class EnsembleMembers:
     Attributes
     ----------
     shape : tuple of int
-        What servos, controllers and constants broadcast to.
+        Shape that servos, controllers and constants broadcast to.
     """
 
     shape: tuple[int, ...]
@@ -78,12 +78,14 @@ class EnsembleMembers:
     constants: dict[str, Array]
 
     def groups(self, outputs: Sequence[str], dead_zone: bool | None = None) -> list[Group]:
-        """Members by structure; with `dead_zone` given all of them have one, or none."""
-        found: dict[object, list[int]] = {}
+        """Members by structure; `dead_zone` gives all of them a dead zone, or none; None: by their tolerance."""
+        # One group shares states, modes and guards, so one call of the compiled kernel runs it on all threads.
+        by_structure: dict[object, list[int]] = {}
         shapes = [self._shape_of(member, dead_zone) for member in range(len(self.servos))]
         for member, shape in enumerate(shapes):
-            found.setdefault((shape, *_sort_of(self.servos[member], self.controllers[member])), []).append(member)
-        return [self._group(np.array(which), shapes[which[0]], outputs) for which in found.values()]
+            key = (shape, *_structure_of(self.servos[member], self.controllers[member]))
+            by_structure.setdefault(key, []).append(member)
+        return [self._group(np.array(which), shapes[which[0]], outputs) for which in by_structure.values()]
 
     def _shape_of(self, member: int, dead_zone: bool | None) -> Shape:
         return Shape(
@@ -103,11 +105,11 @@ class EnsembleMembers:
         states = np.zeros((len(which), len(loops[0].automaton.names)))
         modes = np.zeros(len(which), dtype=np.int64)
         for k, (loop, (servo, _)) in enumerate(zip(loops, places, strict=True)):
-            mine = np.flatnonzero(automaton == k)
-            own = {name: values[mine] for name, values in constants.items()}
-            own |= _constants_of([laws[member] for member in mine])
-            states[mine] = _starts(servo, loop, own)
-            modes[mine] = start_modes(loop, states[mine], laws[mine[0]].enter)
+            members = np.flatnonzero(automaton == k)
+            chosen = {name: values[members] for name, values in constants.items()}
+            chosen |= _constants_of([laws[member] for member in members])
+            states[members] = _starts(servo, loop, chosen)
+            modes[members] = start_modes(loop, states[members], laws[members[0]].enter)
         rows = np.array([[_row(loop, name) for name in outputs] for loop in loops])
         return Group(which, [loop.automaton for loop in loops], rows, Members(automaton, modes, states))
 
@@ -210,18 +212,18 @@ def summarise_members(
     sample_rate: float = 100.0,
     threads: int | None = None,
 ) -> dict[str, Figures]:
-    """The same runs without their samples: what each output comes to.
+    """Run as `simulate_members` does, and reduce the samples of each output to figures.
 
     Parameters
     ----------
     servos, controllers, duration, outputs, sample_rate, threads
         As for `simulate_members`.
     cases : Cases
-        Its constants.
+        Constants of each run.
     last : float
-        s, the end of a run that has figures of its own.
+        s, length of the last part of a run, which has figures of its own.
     limits : dict of array_like, optional
-        By output, what it is outside beyond; infinite for those not named.
+        By output, the absolute value beyond which a sample is outside; infinite for outputs not named.
 
     Returns
     -------
@@ -231,17 +233,17 @@ def summarise_members(
     Raises
     ------
     InvalidInput
-        As `simulate_members`; also for limits of what is not asked for, or a `last` longer than the run.
+        As `simulate_members`; also for limits of an output that is not listed, or a `last` longer than the run.
     """
-    members, judged = members_of(servos, controllers, cases), round(last * sample_rate)
+    members, last_samples = members_of(servos, controllers, cases), round(last * sample_rate)
     bounds = np.full((len(members.servos), len(outputs)), np.inf)
     for name, limit in (limits or {}).items():
         if name not in outputs:
             raise InvalidInput(f"limits name {name!r}, which is none of the outputs {', '.join(outputs)}")
         bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
-    found = np.empty((len(bounds), len(outputs), len(Figures._fields)))
+    values = np.empty((len(bounds), len(outputs), len(Figures._fields)))
     for group in members.groups(outputs):
-        options = FigureOptions(bounds[group.which], judged)
+        options = FigureOptions(bounds[group.which], last_samples)
         figures = figures_of_family(
             group.automata,
             group.rows,
@@ -251,8 +253,8 @@ def summarise_members(
             options,
             threads,
         )
-        found[group.which] = np.stack(figures, axis=2)
-    by_output = np.moveaxis(found, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
+        values[group.which] = np.stack(figures, axis=2)
+    by_output = np.moveaxis(values, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
     return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
 
 
@@ -278,14 +280,14 @@ def _traces(
     ]
     if len(runs) == 1:
         return runs[0]
-    found = np.empty((len(members.servos), len(outputs), samples))
+    traces = np.empty((len(members.servos), len(outputs), samples))
     for group, run in zip(groups, runs, strict=True):
-        found[group.which] = run
-    return found
+        traces[group.which] = run
+    return traces
 
 
 def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
-    """Members from what broadcasts to them.
+    """Broadcast servos, controllers and constants to members.
 
     Raises
     ------
@@ -300,6 +302,7 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
     every_law = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
+    # Thousands of members share a few controllers: each is checked once.
     for law in {id(law): law for law in every_law}.values():
         if law.sample_rate is not None or law.rate_limit is not None:
             raise InvalidInput("an ensemble needs continuous controllers: without sample_rate and rate_limit")
@@ -314,7 +317,7 @@ def _check(constants: dict[str, Array]) -> None:
     check_gap(float(constants["gap"].max(initial=0.0)))
 
 
-def _sort_of(servo: Servo, law: Controller) -> tuple[object, ...]:
+def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
     return servo.n, servo.rigid, law.voltage_limit is None, law.loop_filter_hz is None
 
 
@@ -325,13 +328,13 @@ def _row(loop: ServoAutomaton, name: str) -> Array:
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:
-    """(k,) states that hold numbers of the controllers."""
+    """(k,) states that are constants of the controllers, by name."""
     names = controller_constants(laws[0])
     return {name: np.array([controller_constants(law)[name] for law in laws]) for name in names}
 
 
 def _starts(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> Array:
-    """(k, n) states at rest: as `plant_start` says of one."""
+    """(k, n) states at rest: `plant_start` for many members."""
     names, index = loop.automaton.names, loop.automaton.index
     states = np.zeros((len(constants["gap"]), len(names)))
     for name, values in constants.items():
@@ -349,7 +352,7 @@ def _starts(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> 
 
 
 def start_modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np.int64]:
-    """(k,) modes: as `start_zone` says of one."""
+    """(k,) modes: `start_zone` for many members."""
     if "inside" not in loop.zones:
         return np.full(len(states), loop.mode("on"))
     error = states @ loop.rows["error"][0]

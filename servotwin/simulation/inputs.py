@@ -1,4 +1,4 @@
-"""RunInputs of a run as piecewise cubics, and how they become others while it runs."""
+"""Inputs of a run as piecewise cubics, and changes of them while it runs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from servotwin.plant.signals import PiecewiseCubic
 
 @dataclass
 class RunInputs:
-    """The inputs of a run as piecewise cubics, the rate of its samples, and what disturbs the plant all along (V
-    behind the controller, N m on the motor's shaft)."""
+    """Inputs of a run as piecewise cubics, its sample rate (Hz), and constant disturbances of the plant: input bias (V,
+    behind the controller) and friction (N m, on the motor's shaft)."""
 
     reference: PiecewiseCubic
     gap: PiecewiseCubic
@@ -27,7 +27,7 @@ class RunInputs:
         return np.arange(first, last) / self.sample_rate
 
     def retune(self, time: float, tolerance: float) -> None:
-        """From `time` on the tolerance is a constant."""
+        """Make the tolerance a constant (m) from `time` (s) on."""
         assert self.tolerance is not None
         keep = self.tolerance.times < time
         times, coeffs = self.tolerance.times[keep], self.tolerance.coeffs[keep]
@@ -35,14 +35,14 @@ class RunInputs:
 
     def jumps(self, until: float) -> list[tuple[float, str]]:
         """Times and kinds (reference, parameter) of the inputs' jumps in (0, until]."""
-        found = [(float(t), "reference") for t in self.reference.jumps]
-        found += [(float(t), "parameter") for t in self.gap.jumps]
-        found += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
-        return sorted((time, kind) for time, kind in found if 0.0 < time <= until)
+        jumps = [(float(t), "reference") for t in self.reference.jumps]
+        jumps += [(float(t), "parameter") for t in self.gap.jumps]
+        jumps += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
+        return sorted((time, kind) for time, kind in jumps if 0.0 < time <= until)
 
 
 def quantised(values: Array, resolution: float) -> Array:
-    """The nearest whole counts; resolution 0 is an ideal sensor."""
+    """Round to whole counts; resolution 0 is an ideal sensor."""
     return values if resolution == 0.0 else np.round(values / resolution) * resolution
 
 
@@ -61,14 +61,14 @@ def about(pieces: PiecewiseCubic, time: float) -> Array:
 
 
 def spliced(before: PiecewiseCubic, after: PiecewiseCubic, time: float) -> PiecewiseCubic:
-    """One signal up to a time (s), another from then on."""
+    """Join `before` up to a time (s) and `after` from then on."""
     past, future = before.times < time, after.times > time
     times = np.concatenate([before.times[past], [time], after.times[future]])
     return PiecewiseCubic(times, np.vstack([before.coeffs[past], about(after, time), after.coeffs[future]]))
 
 
 def recent(pieces: PiecewiseCubic, time: float) -> PiecewiseCubic:
-    """The same from a time (s) on; of what was before, only a constant is left."""
+    """Drop the pieces before a time (s); one constant stands for them."""
     first = int(np.searchsorted(pieces.times, time, side="right")) - 1
     if first <= 0:
         return pieces
@@ -77,6 +77,6 @@ def recent(pieces: PiecewiseCubic, time: float) -> PiecewiseCubic:
 
 
 def shifted(pieces: PiecewiseCubic, offset: PiecewiseCubic) -> PiecewiseCubic:
-    """A signal plus another."""
+    """Sum of two signals."""
     times = np.union1d(pieces.times, offset.times)
     return PiecewiseCubic(times, [about(pieces, time) + about(offset, time) for time in times.tolist()])

@@ -1,4 +1,4 @@
-"""Result of a simulation: channels at the samples, evaluated when asked for, and the table of events."""
+"""Result of a simulation: channels at the samples, evaluated on demand, and the table of events."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ EVENT_TYPE = np.dtype([("time", float), ("kind", "U10"), ("side", np.int8), ("st
 
 @dataclass(repr=False)
 class Run:
-    """A simulated run, N samples from time 0; arrays are ``(N,)`` unless said otherwise, right-continuous at jumps.
+    """A simulated run, N samples from time 0; arrays are ``(N,)`` unless stated otherwise, right-continuous at jumps.
 
-    Channels are evaluated when first asked for.
+    Channels are evaluated at first access and cached.
     """
 
     servo: Servo
@@ -32,12 +32,12 @@ class Run:
     samples: int
     channel: Callable[[str, int, int], Array] = field(repr=False)
     list_events: Callable[[], list[tuple[float, str, int, bool]]] = field(repr=False)
-    _kept: dict[str, Array] = field(default_factory=dict, repr=False)
+    _cache: dict[str, Array] = field(default_factory=dict, repr=False)
 
     def _get(self, name: str, make: Callable[[], Array]) -> Array:
-        if name not in self._kept:
-            self._kept[name] = make()
-        return self._kept[name]
+        if name not in self._cache:
+            self._cache[name] = make()
+        return self._cache[name]
 
     @property
     def sample_rate(self) -> float:
@@ -81,7 +81,7 @@ class Run:
 
     @property
     def reference(self) -> Array:
-        """Wanted position, m."""
+        """Reference of the position, m."""
         return self._get("reference", lambda: self.inputs.reference.on(self.time))
 
     @property
@@ -115,7 +115,7 @@ class Run:
         return np.array(rows, dtype=EVENT_TYPE).view(np.recarray)
 
     def measured(self, name: str) -> Array:
-        """A channel as its sensor gave it: theta_m, position, voltage or reference."""
+        """A channel as its sensor measures it: theta_m, position, voltage or reference."""
         if name == "theta_m":
             return quantised(self.theta_m, self.servo.encoder_resolution)
         return {"position": self.measured_position, "voltage": self.voltage, "reference": self.reference}[name]
@@ -165,13 +165,11 @@ class Run:
         """
         errors = {"error": 1e3 * (self.reference - self.position)}
         if self.tolerance.any():
+            # matplotlib leaves labels that begin with an underscore out of the legend.
             errors |= {"dead zone": 1e3 * self.tolerance, "_": -1e3 * self.tolerance}
         panels = (
             Panel("position, mm", {"reference": 1e3 * self.reference, "position": 1e3 * self.position}),
-            Panel(
-                "error, mm",
-                errors,
-            ),
+            Panel("error, mm", errors),
             Panel("total gap, deg", {"gap": np.degrees(self.gap)}),
             Panel("voltage, V", {"voltage": self.voltage}),
         )

@@ -39,7 +39,7 @@ _RECORDED = ("theta_m", "theta_d", "voltage")
 
 @dataclass
 class SampledEngine:
-    """Engine of a `Simulation` whose controller has a sample rate; with `keep` it remembers at least so many samples,
+    """Engine of a `Simulation` whose controller has a sample rate; with `keep` it stores at least that many samples,
     and no events."""
 
     servo: Servo
@@ -96,11 +96,11 @@ class SampledEngine:
 
     @property
     def oldest(self) -> int:
-        """The first sample remembered."""
+        """The oldest stored sample."""
         return self.output.first_sample
 
     def advance(self, index: int) -> None:
-        """Go on to a sample; at the last one of the horizon the tick is taken too."""
+        """Advance to a sample; at the last one of the horizon the tick is taken too."""
         while self.keep is not None and index - self.index > self.keep:
             self._advance(self.index + self.keep)
         self._advance(index)
@@ -120,30 +120,32 @@ class SampledEngine:
             self.finished = True
 
     def make_room(self, index: int) -> None:
-        """Forget what is too old, where samples up to `index` would not fit."""
+        """Drop the oldest samples if samples up to `index` would not fit."""
         if self.keep is not None and index - self.oldest > 2 * self.keep:
             self.output = _shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
             self.record.size[1] = 0
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
         """Base steps during or at the end of which the gap's cubic changes, with those changes."""
-        found = dict[int, list[Jump]]()
+        changes = dict[int, list[Jump]]()
+        # A knot on a base step belongs to the step that ends there; rounding must not move it to the next one.
         bases = np.ceil(self.inputs.gap.times * self.rate - 1e-9).astype(np.int64) - 1
         for piece in np.flatnonzero((self.base <= bases) & (bases < end)).tolist():
             time, coefficients = float(self.inputs.gap.times[piece]), self.inputs.gap.coeffs[piece]
             opened = self.plant.opened if time in self.inputs.gap.jumps else None
             jump = Jump(time, self.plant.input_values("gap", coefficients), opened)
-            found.setdefault(int(bases[piece]), []).append(jump)
-        return sorted(found.items())
+            changes.setdefault(int(bases[piece]), []).append(jump)
+        return sorted(changes.items())
 
     def tick_inputs(self, first: int, last: int) -> TickInputs:
-        """RunInputs of ticks first .. last - 1."""
+        """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
         times = np.arange(first, first + count) / self.tick_rate
         if self.inputs.tolerance is None:
             enter = leave = np.full(count, -1.0)
         else:
             tolerance = self.inputs.tolerance.on(times)
+            # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
             zero = tolerance == 0.0
             enter = np.where(zero, -1.0, self.controller.enter * tolerance)
             leave = np.where(zero, -1.0, self.controller.leave * tolerance)
@@ -155,7 +157,7 @@ class SampledEngine:
             self.flow(stop, self.tick_inputs(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
 
     def flow(self, end: int, tick_inputs: TickInputs) -> None:
-        """Go on to a base step; `tick_inputs` covers the ticks on the way, on which the gap's cubic does not change."""
+        """Advance to a base step; `tick_inputs` covers the ticks on the way, while the gap's cubic stays the same."""
         while self.base < end:
             status, self.base, self.mode, self.law_state = run_ticks(
                 self.tables,
@@ -180,10 +182,13 @@ class SampledEngine:
             base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
         )
         at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
-        schedule = schedule_of(jumps, self.step, self.plant.automaton, (base + 1) * self.port.searches)
+        end = (base + 1) * self.port.searches
+        steps, fractions, values, modes = schedule_of(jumps, self.step, self.plant.automaton, end)
         place, status = np.zeros(1), FULL
         while status == FULL:
-            status = follow_schedule(self.tables, self.state, place, at, *schedule, self.record, self.scratch)
+            status = follow_schedule(
+                self.tables, self.state, place, at, steps, fractions, values, modes, self.record, self.scratch
+            )
             self.record.size[0] = 0
             self._check(status)
         self.mode, self.base = int(at[1]), base + 1
@@ -197,17 +202,18 @@ class SampledEngine:
             self.port = self.port._replace(room=room)
 
     def set_tolerance(self, _tolerance: float) -> None:
-        """Nothing to do: the ticks to come read the inputs."""
+        """Do nothing: the ticks to come read the inputs."""
 
     def set_reference(self, _reference: PiecewiseCubic) -> None:
-        """Nothing to do either."""
+        """Do nothing: the ticks to come read the inputs."""
 
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
-        """Another controller from the tick that is due on, its voltage at that tick the same; a constant tolerance
+        """Change the controller from the tick that is due on, without a jump of its voltage; a constant tolerance
         unless None."""
         tick = -(-self.base // self.tick_every)
         time = tick / self.tick_rate
         planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
+        # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
         noise = self.draws.take(1)
         self.draws.put_back(noise)
         measured = float(self.plant.rows["position"][0] @ self.state + noise[0])
@@ -243,15 +249,15 @@ class SampledEngine:
         return out
 
     def events(self) -> list[tuple[float, str, int, bool]]:
-        """Contacts and releases, and what the ticks did, in time order."""
+        """Events of the plant and of the ticks, in time order."""
         r, size = self.record, int(self.record.size[1])
         times = (r.event_step[:size] + r.event_fraction[:size]) * self.step
         modes = self.plant.automaton.modes
-        found = []
+        events = []
         for k in range(size):
             guard = modes[r.event_mode[k]].guards[r.event_guard[k]]
-            found.append((float(times[k]), guard.label, guard.side, not r.event_forced[k]))
-        return sorted(found + self._tick_events(), key=lambda event: event[0])
+            events.append((float(times[k]), guard.label, guard.side, not r.event_forced[k]))
+        return sorted(events + self._tick_events(), key=lambda event: event[0])
 
     def _tick_events(self) -> list[tuple[float, str, int, bool]]:
         """Dead-zone events, at the ticks that decided them; forced where the reference jumped since the tick before."""
@@ -261,12 +267,12 @@ class SampledEngine:
         changed = np.flatnonzero(np.diff(active, prepend=active[:1]))
         jumps = self.inputs.reference.jumps
         error = self.inputs.reference.value(times[changed]) - self.output.measured[changed]
-        found = []
+        events = []
         for k, e in zip(changed.tolist(), error.tolist(), strict=True):
             ticks_ago = (times[k] - jumps) * self.tick_rate
             forced = bool(np.any((ticks_ago > -ON_GRID) & (ticks_ago < 1.0 - ON_GRID)))
-            found.append((float(times[k]), "leave" if active[k] else "enter", 1 if e > 0 else -1, not forced))
-        return found
+            events.append((float(times[k]), "leave" if active[k] else "enter", 1 if e > 0 else -1, not forced))
+        return events
 
     @property
     def tick_rate(self) -> float:
@@ -294,13 +300,14 @@ def _new_output(rows: int, samples: int, tick_every: int, record_every: int) -> 
 
 
 def _shifted_output(output: Output, sample: int, tick_every: int, record_every: int) -> Output:
-    """Shift the buffers to begin at `sample`; older samples are forgotten."""
+    """Shift the buffers to begin at `sample`; older samples are dropped."""
     tick = sample * record_every // tick_every
     for values, by in (
         (output.states, sample - output.first_sample),
         (output.measured, tick - output.first_tick),
         (output.active, tick - output.first_tick),
     ):
+        # Source and destination overlap: the copy is needed.
         values[..., : values.shape[-1] - by] = values[..., by:].copy()
     return output._replace(first_sample=sample, first_tick=tick)
 

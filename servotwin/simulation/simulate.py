@@ -1,4 +1,4 @@
-"""Simulating a servo exactly: continuous (plant and law in one automaton) or sampled (the edge's own tick, compiled, on
+"""Exact simulation of a servo: continuous (plant and law in one automaton) or sampled (the edge's tick, compiled, on
 the exact plant)."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Engine(Protocol):
 
 
 class Simulation:
-    """A run that can be stopped at any sample, looked at, changed and continued.
+    """A run that can be stopped at any sample, inspected, changed and continued.
 
     Parameters
     ----------
@@ -55,15 +55,15 @@ class Simulation:
     sample_rate : float
         Hz, of what is recorded.
     noise : Noise, optional
-        On the measured position; a continuous controller sees it held from sample to sample.
+        On the measured position; a continuous controller sees it constant between samples.
     seed : int
-        Of the noise.
+        Seed of the noise.
     input_bias : float
         V, added to the voltage behind the controller and its limits.
     friction : float
         N m, Coulomb's on the motor's shaft, which sticks and slips; needs a rigid screw.
     keep : int, optional
-        Samples that are remembered, at least one; needs a sampled controller. None: all of them, and the events.
+        Number of samples to store, at least one; needs a sampled controller. None: all samples, and the events.
 
     Raises
     ------
@@ -121,7 +121,7 @@ class Simulation:
         return self.engine.index / self.inputs.sample_rate
 
     def advance(self, index: int) -> None:
-        """Go on to a sample index, at most the last one of the horizon."""
+        """Advance to a sample index, at most the last one of the horizon."""
         if not self.index <= index < self.samples:
             raise InvalidInput(
                 f"sample {index} is outside {self.index} .. {self.samples - 1}, where this simulation can go"
@@ -130,7 +130,7 @@ class Simulation:
             self.engine.advance(index)
 
     def set_tolerance(self, tolerance: float) -> None:
-        """Set the dead-zone half-width (m) from the present sample on; it replaces whatever was planned."""
+        """Set the dead-zone half-width (m) from the present sample on; replaces the planned tolerance."""
         self._check_tolerance(tolerance)
         self.inputs.retune(self.time, tolerance)
         self.engine.set_tolerance(tolerance)
@@ -138,7 +138,7 @@ class Simulation:
     def set_reference(self, reference: SignalLike) -> None:
         """Set the reference (m, number or signal on the run's own time) from the present sample on.
 
-        It replaces whatever was planned; its values before the present sample do not matter.
+        It replaces the planned reference; its values before the present sample do not matter.
         """
         horizon = (self.samples - 1) / self.inputs.sample_rate
         self.inputs.reference = spliced(self.inputs.reference, as_pieces(reference, horizon), self.time)
@@ -150,15 +150,15 @@ class Simulation:
         Parameters
         ----------
         controller : Controller
-            As continuous or sampled as the one before, at the same rate. Its difference to the voltage at this instant
+            Continuous or sampled as the one before, at the same rate. Its difference to the voltage at this instant
             becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
         tolerance : float, optional
-            m, a new dead-zone half-width, which replaces whatever was planned; None keeps that.
+            m, a new dead-zone half-width, which replaces the planned one; None keeps the planned one.
 
         Raises
         ------
         InvalidInput
-            For another sample rate, or a tolerance that is negative or that this simulation cannot have.
+            The sample rate differs, the tolerance is negative, or the simulation has no dead zone.
         """
         if controller.sample_rate != self.controller.sample_rate:
             rates = (_described(law.sample_rate) for law in (self.controller, controller))
@@ -199,8 +199,8 @@ class Simulation:
         oldest = 0 if self.keep is None else max(0, self.index - self.keep)
         if not oldest <= first <= last <= self.index + 1:
             raise InvalidInput(
-                f"samples {first} .. {last} are outside {oldest} .. {self.index + 1}, what was simulated so far"
-                + ("" if self.keep is None else " and is remembered")
+                f"samples {first} .. {last} are outside {oldest} .. {self.index + 1}, the samples simulated so far"
+                + ("" if self.keep is None else " and still stored")
             )
         if name == "reference":
             return self.inputs.reference.on(self.inputs.times(first, last))
@@ -213,10 +213,10 @@ class Simulation:
         Raises
         ------
         InvalidInput
-            Not everything is remembered.
+            The simulation stores its last samples only (`keep`).
         """
         if self.keep is not None:
-            raise InvalidInput(f"keep = {self.keep} samples: a simulation that forgets has no run to give")
+            raise InvalidInput(f"keep = {self.keep} samples: a simulation that stores only its last samples has no run")
         return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
 
 
@@ -245,7 +245,7 @@ def simulate(
     controller : Controller, optional
         The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
     reference : number or signal
-        Wanted position, m: a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic.
+        Reference of the position, m: a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic.
     gap : number or signal
         Total gap, rad, 0 to 2 pi.
     tolerance : number, signal or None
@@ -274,18 +274,7 @@ def simulate(
         A gap above one turn, a negative gap, tolerance or friction, or rates that do not divide one another.
     """
     simulation = Simulation(
-        servo,
-        duration,
-        controller=controller,
-        reference=reference,
-        gap=gap,
-        tolerance=tolerance,
-        theta_d0=theta_d0,
-        sample_rate=sample_rate,
-        noise=noise,
-        seed=seed,
-        input_bias=input_bias,
-        friction=friction,
+        servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
     simulation.advance(simulation.samples - 1)
     return simulation.run()

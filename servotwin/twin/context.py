@@ -24,7 +24,7 @@ import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import METHODS
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.lookup_file import spelled
+from servotwin.redesign.certified.lookup_file import flattened
 from servotwin.twin.settings import TwinSettings
 
 SOURCES = ("control", "estimation", "hybrid", "messages", "plant", "redesign", "simulation", "twin")
@@ -41,7 +41,7 @@ def context_of(servo: Servo, settings: TwinSettings) -> tuple[str, str]:
 
     The JSON is one object of texts: what each thing is called, and the value in full.
     """
-    parts = {**surroundings(), **dict(spelled(_MODEL, servo)), **dict(spelled(_SETTINGS, settings))}
+    parts = {**surroundings(), **dict(flattened(_MODEL, servo)), **dict(flattened(_SETTINGS, settings))}
     text = json.dumps(parts, sort_keys=True, indent=0)
     return hashlib.sha256(text.encode()).hexdigest()[:32], text
 

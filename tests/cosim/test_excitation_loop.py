@@ -94,7 +94,7 @@ def test_what_a_probing_move_showed_spares_the_next_one() -> None:
     [
         (ExcitationSettings(), PROBED, "a probing move is not allowed", 0),
         (MAY_PROBE, Recording(), "this edge refuses probing moves", 1),
-        (ExcitationSettings(probe=1e-4), PROBED, "a probing move must be 0.167 mm, where 0.1 mm are allowed", 0),
+        (ExcitationSettings(probe=1e-4), PROBED, "a probing move must be 0.167 mm, and at most 0.1 mm are allowed", 0),
         (MAY_PROBE, Recording(probe=ProbeLimits(1e-4)), "this edge refuses probing moves", 1),
     ],
 )

@@ -86,7 +86,7 @@ def test_a_cache_that_has_no_place_is_a_sentence(monkeypatch):
         raise RuntimeError(f"cannot cache function {py_func.__name__!r}: no locator available for file 'x.py'")
 
     monkeypatch.setattr("numba.core.caching.FunctionCache.__init__", refused)
-    with pytest.raises(InvalidInput, match="name one that may in the environment variable NUMBA_CACHE_DIR"):
+    with pytest.raises(InvalidInput, match="set the environment variable NUMBA_CACHE_DIR to a folder that is"):
         compiled(lambda x: x)
 
 

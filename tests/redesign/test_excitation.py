@@ -88,7 +88,7 @@ def test_without_permission_there_is_no_probe_and_the_reason_says_so() -> None:
 def test_a_limit_that_is_too_small_is_said_instead_of_probing_in_vain() -> None:
     found = run(ExcitationSettings(probe=1e-4), [LONG] * 2)[-1]
     assert found.ask is None
-    assert found.reason.endswith("a probing move must be 0.139 mm, where 0.1 mm are allowed")
+    assert found.reason.endswith("a probing move must be 0.139 mm, and at most 0.1 mm are allowed")
 
 
 def test_probes_keep_their_distance() -> None:
@@ -96,7 +96,7 @@ def test_probes_keep_their_distance() -> None:
     times = [each.time for each, ask in zip(seen, asks(ALLOWED, seen), strict=True) if ask]
     assert times == [10.0, 70.0, 130.0, 190.0]
     why = run(ALLOWED, seen)[4].reason
-    assert why.endswith("the last probing move was asked for 30 s ago, where 60 s must lie between two")
+    assert why.endswith("the last probing move was requested 30 s ago, and 60 s must lie between two")
 
 
 @pytest.mark.parametrize("change", [{"upper": math.inf}, {"slack": math.nan}])

@@ -92,7 +92,7 @@ def test_what_is_forgotten_is_not_given() -> None:
     machine.advance(5000)
     with pytest.raises(InvalidInput, match=r"samples 4800 \.\. 4810 are outside 4900 \.\. 5001"):
         machine.measured("position", 4800, 4810)
-    with pytest.raises(InvalidInput, match="a simulation that forgets has no run to give"):
+    with pytest.raises(InvalidInput, match="a simulation that stores only its last samples has no run"):
         machine.simulation.run()
     with pytest.raises(InvalidInput, match=r"keep = 0 samples"):
         endless(worn(20.0), keep=0)

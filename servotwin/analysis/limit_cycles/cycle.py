@@ -24,16 +24,16 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
 from servotwin.plant.servo import Servo
 
-# The first look takes so many of the loop's own times, every further one twice as many, since with little integral
-# action a cycle is that slow.
-_FIRST_LOOK, _LOOKS = 32, 8
+# The first part of the run is 32 characteristic times of the loop long, each of the others twice as long as the one
+# before: with little integral action a cycle is that slow.
+_FIRST_PART, _PARTS = 32, 8
 # Motion below this part of the gap (or of the tolerance) is rest; above this part it runs away.
 _REST, _AWAY = 1e-9, 1e9
 # Without integral action the motor crosses the gap ever more slowly, and never rests. It counts as settling when the
-# position moves by less than this part of p gap in the later half of all looks, and by less than a quarter of before.
+# position moves by less than this part of p gap in the later half of all parts, and by less than a quarter of before.
 _CREEP = 1e-3
-# Distance, in parts of each state's size, from which a stable orbit is taken for where the tail goes; and at which the
-# tail is on an orbit that does not attract.
+# Distance, in parts of each state's size, within which the run is taken to converge to a stable orbit; and within which
+# it is on an orbit that does not attract.
 _NEAR, _ON_IT = 0.1, 1e-6
 
 
@@ -126,33 +126,34 @@ def _searched(loop: ScaledLoop) -> CycleResult:
         if swing <= _REST * loop.extent:
             return CycleResult(CycleStatus.SETTLES, None, f"motor and position rest after at most {elapsed:.4g} s")
         try:
-            found = _followed(loop, run)
+            closed = _followed(loop, run)
         except LostOrbit as error:
             reason = str(error)
             continue
-        if (found.orbit.stable and found.distance < _NEAR) or found.distance < _ON_IT:
-            return CycleResult(CycleStatus.CYCLE, found.orbit, "")
-        kind = "a stable" if found.orbit.stable else "an unstable"
-        reason = f"{kind} orbit at {found.orbit.frequency:.6g} Hz is {found.distance:.2g} of its size away"
-    late = max(moved[_LOOKS // 2 :])
-    if late < _CREEP * loop.extent and late < 0.25 * max(moved[1 : _LOOKS // 2]):
+        if (closed.orbit.stable and closed.distance < _NEAR) or closed.distance < _ON_IT:
+            return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
+        kind = "a stable" if closed.orbit.stable else "an unstable"
+        reason = f"{kind} orbit at {closed.orbit.frequency:.6g} Hz is {closed.distance:.2g} of its size away"
+    late = max(moved[_PARTS // 2 :])
+    if late < _CREEP * loop.extent and late < 0.25 * max(moved[1 : _PARTS // 2]):
         reason = f"the motor still creeps across the gap, but the position moves by {late * loop.unit:.2g} m at last"
         return CycleResult(CycleStatus.SETTLES, None, reason)
     return CycleResult(CycleStatus.IRREGULAR, None, f"no orbit is reached within {elapsed:.4g} s: {reason}")
 
 
 def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
-    """Parts of one run, each twice as long, with two half peak-to-peaks of the second half of each.
+    """Parts of one run, each twice as long as the one before, with two half peak-to-peaks of its second half.
 
-    The first is the larger of the position's and the motor's travel: while the motor crosses the gap the position
-    rests, but not for good. The second is the position's.
+    The first is the larger of the position's and the motor's travel, since the position rests while the motor crosses
+    the gap. The second is the position's.
     """
     state, mode = loop.state, loop.mode
-    for look in range(_LOOKS):
+    for number in range(_PARTS):
         run = Trajectory(loop.loop.automaton, state, mode, loop.sample_step)
-        samples = _FIRST_LOOK * 2**look * LOOKS
-        for part in range(1, _FIRST_LOOK + 1):
-            run.advance(samples // _FIRST_LOOK * part)
+        samples = _FIRST_PART * 2**number * LOOKS
+        # Checked 32 times on the way, so that a diverging run stops before it overflows.
+        for check in range(1, _FIRST_PART + 1):
+            run.advance(samples // _FIRST_PART * check)
             if not float(np.max(np.abs(run.state))) <= _AWAY * float(np.max(np.abs(loop.state))):
                 yield run, np.inf, np.inf
                 return
@@ -163,7 +164,7 @@ def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
 
 
 def _followed(loop: ScaledLoop, run: Trajectory) -> ClosedOrbit:
-    """The orbit that the events of a tail suggest."""
+    """Find the orbit that the events at the end of a run suggest."""
     times, guards = guard_events(run)
     length = _repeating(guards)
     last, last_times = guards[-length - 1 :], times[-length - 1 :]
@@ -178,9 +179,9 @@ def _followed(loop: ScaledLoop, run: Trajectory) -> ClosedOrbit:
     scale[scale == 0.0] = 1.0
     half = loop.mirror is not None and _mirrored(last[1:], loop.mirror.guards)
     try:
-        found = closed_orbit(loop, section, start, scale, half)
-        if found.orbit.stable or not half:
-            return found
+        closed = closed_orbit(loop, section, start, scale, half)
+        if closed.orbit.stable or not half:
+            return closed
     except LostOrbit:
         if not half:
             raise

@@ -23,8 +23,8 @@ from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
 from servotwin.plant.servo import Servo
 
-# Looks within each band of frequencies in which a prediction is possible.
-_LOOKS = 500
+# Grid intervals within each band of frequencies in which a prediction is possible.
+_GRID = 500
 # From an amplitude of 1e12 gaps to one that exceeds half the gap by 2.5e-9 of it, where N is 3e-9.
 _ANGLES = (1e-6, math.pi - 1e-4)
 
@@ -82,14 +82,14 @@ def predictions(servo: Servo, gap: float, controller: Controller | None = None) 
     law = servo.controller if controller is None else controller
     _check(servo, law, gap)
     loop = servo.loop(law)
-    found = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
-    return tuple(_prediction(servo, loop, gap, omega) for omega in found)
+    solutions = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
+    return tuple(_prediction(servo, loop, gap, omega) for omega in solutions)
 
 
 def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
-    """rad/s, ascending, within one band: looked for on a grid that is dense at its ends, in every decade from 0."""
+    """Solutions within one band, rad/s, ascending, from a grid that is dense at its ends, in every decade from 0."""
     ends = [low, high] if low > 0.0 else [0.0, *(high * 10.0**k for k in range(-5, 1))]
-    part = 0.5 * (1.0 - np.cos(np.pi * np.arange(_LOOKS + 1) / _LOOKS))
+    part = 0.5 * (1.0 - np.cos(np.pi * np.arange(_GRID + 1) / _GRID))
     grid = np.unique([a + (b - a) * part for a, b in pairwise(ends)])[1:-1].tolist()
     values = [_mismatch(loop, w) for w in grid]
     places = [i for i in range(len(grid) - 1) if values[i] * values[i + 1] < 0.0]
@@ -127,10 +127,10 @@ def _angle(phase: float) -> float:
 
 def _mismatch(loop: LinearSystem, omega: float) -> float:
     """log abs(-1 / L) - log abs(N) at the amplitude whose N has the phase of -1 / L; NaN where none has."""
-    wanted = -1.0 / complex(loop.response(omega))
-    if not _play_phase(_ANGLES[1]) < cmath.phase(wanted) < _play_phase(_ANGLES[0]):
+    required = -1.0 / complex(loop.response(omega))
+    if not _play_phase(_ANGLES[1]) < cmath.phase(required) < _play_phase(_ANGLES[0]):
         return math.nan
-    return math.log(abs(wanted) / abs(_play(_angle(cmath.phase(wanted)))))
+    return math.log(abs(required) / abs(_play(_angle(cmath.phase(required)))))
 
 
 def _play_phase(angle: float) -> float:
@@ -160,8 +160,9 @@ def _prediction(servo: Servo, loop: LinearSystem, gap: float, omega: float) -> P
 
 
 def _attracts(loop: LinearSystem, omega: float, angle: float) -> bool:
-    """A larger amplitude moves s = j omega by -(N_A / N) (L / L_s) dA: to the left? The angle falls as A grows."""
+    """True when a larger amplitude decays: it moves s = j omega by -(N_A / N) (L / L_s) dA, to the left."""
     sine, cosine = math.sin(angle), math.cos(angle)
+    # The angle falls as A grows, hence the sign of the test.
     by_angle = complex(-2.0 * sine**2, -2.0 * sine * cosine) / (math.pi * _play(angle))
     s = 1j * omega
     slope = _relative_slope(loop.numerator, s) - _relative_slope(loop.denominator, s)
@@ -179,7 +180,7 @@ _CREST = ("+/on", "release", 1)
 def limit_cycle_near(
     servo: Servo, gap: float, prediction: Prediction, controller: Controller | None = None
 ) -> CycleResult:
-    """The symmetric orbit to which Newton's method goes from a prediction; the loop has no dead zone.
+    """Find the symmetric orbit to which Newton's method converges from a prediction; the loop has no dead zone.
 
     Parameters
     ----------
@@ -197,17 +198,17 @@ def limit_cycle_near(
         Status CYCLE or, when the prediction leads to no orbit, IRREGULAR with the reason.
     """
     law = servo.controller if controller is None else controller
-    # At rest about a zero reference; what this step would do is never run.
+    # Only the scaling is used: this step is never simulated.
     loop = scaled_loop(servo, gap, None, law, step=gap * servo.p)
     start = crest(servo, loop, prediction, law) / loop.unit
     section = _section(loop, prediction)
     swings = np.abs(phasors(servo, loop, prediction, law)) / loop.unit
     swings[swings == 0.0] = 1.0
     try:
-        found = closed_orbit(loop, section, start, swings, True)
+        closed = closed_orbit(loop, section, start, swings, True)
     except (LostOrbit, ZenoError) as error:
         return CycleResult(CycleStatus.IRREGULAR, None, f"Newton's method from the prediction: {error}")
-    return CycleResult(CycleStatus.CYCLE, found.orbit, "")
+    return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
 
 
 def crest(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Controller) -> Array:

@@ -26,8 +26,8 @@ from servotwin.hybrid.trajectory import Trajectory
 from servotwin.plant.automaton import ServoAutomaton
 from servotwin.plant.linear import Complex
 
-# Looks per radian of the fastest lasting motion, for the extremes of a signal.
-_LOOKS = 4
+# Intervals per radian of the fastest lasting motion, for the extremes of a signal.
+_PER_RADIAN = 4
 
 
 class OrbitEvent(NamedTuple):
@@ -114,27 +114,27 @@ def extremes(automaton: Automaton, state: Array, segments: tuple[FlowSegment, ..
     x = state
     for segment in segments:
         flow, row = automaton.flows[segment.mode], rows[segment.mode]
-        parts = max(2, int(np.ceil(_LOOKS * automaton.fastest_lasting * segment.duration)))
-        look = segment.duration / parts
-        jump = expm1(flow, look).astype(float)
+        parts = max(2, int(np.ceil(_PER_RADIAN * automaton.fastest_lasting * segment.duration)))
+        interval = segment.duration / parts
+        jump = expm1(flow, interval).astype(float)
         for _ in range(parts):
             after = x + jump @ x
             values += [float(row @ x), float(row @ after)]
             slope = row @ flow
             if (slope @ x) * (slope @ after) < 0.0:
-                values.append(_turn(row, flow, x, look))
+                values.append(_turn(row, flow, x, interval))
             x = after
         x = segment.reset @ x
     return min(values), max(values)
 
 
-def _turn(row: Array, flow: Array, x: Array, look: float) -> float:
-    """The value where the slope vanishes within a look."""
+def _turn(row: Array, flow: Array, x: Array, interval: float) -> float:
+    """Value of the output where its slope vanishes within an interval (s)."""
 
     def at(time: float) -> Array:
         return np.asarray(x + expm1(flow, time).astype(float) @ x)
 
-    time = brentq(lambda t: float(row @ flow @ at(t)), 0.0, look, xtol=1e-12 * look)
+    time = brentq(lambda t: float(row @ flow @ at(t)), 0.0, interval, xtol=1e-12 * interval)
     return float(row @ at(time))
 
 
@@ -206,10 +206,10 @@ def closed_orbit(loop: ScaledLoop, section: Section, start: Array, scale: Array,
     period = sum(segment.duration for segment in full.segments)
     residual = _residual(loop, section, point.state, full, period)
     if residual > CLOSED:
-        raise LostOrbit(f"the orbit that was found fails to close by {residual:.2g} of its range")
+        raise LostOrbit(f"the orbit fails to close by {residual:.2g} of its range in the event simulation")
     orbit = _orbit(loop, section, point, full, period, residual, reflection is not None)
     if orbit.amplitude < _SMALLEST * loop.extent * loop.unit:
-        raise LostOrbit("the orbit that was found is an equilibrium")
+        raise LostOrbit("the orbit shrinks to an equilibrium")
     return ClosedOrbit(orbit, distance)
 
 

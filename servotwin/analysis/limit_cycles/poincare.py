@@ -2,14 +2,14 @@
 
 A point of the map is a state *just before* a section event, in the mode that the event ends. The map fires the event,
 follows the flow through every further event and stops just before the next section event. The kernel finds the
-sequence of events and their times; state and derivative are then propagate along it by matrix exponentials and, at
+sequence of events and their times; state and derivative are then propagated along it by matrix exponentials and, at
 events, saltation matrices. Within one sequence nothing else is nonlinear than the times of the events.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +55,7 @@ class Shot(NamedTuple):
 
 
 class LostOrbit(RuntimeError):
-    """The section is not met again, met otherwise than it was left, or an event grazes its guard."""
+    """Error: the flow does not return to the section, meets another event first, or grazes a guard."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +91,8 @@ class Section:
 
     def approach(self, state: Array, mode: int) -> Array:
         """The state just before the first start event from any state in any mode."""
-        opposite = Section(self.automaton, self.start, self.start, 1, self.sample_step, self.horizon, self.refine)
-        return propagate(self.automaton, state, opposite._segments(state, mode, 1, skip=0)).state
+        to_start = replace(self, end=self.start, hits=1)
+        return propagate(self.automaton, state, to_start._segments(state, mode, 1, skip=0)).state
 
     def _segments(self, state: Array, mode: int, hits: int, skip: int) -> tuple[FlowSegment, ...]:
         run = Trajectory(self.automaton, state, mode, self.sample_step, self.refine)
@@ -102,9 +102,9 @@ class Section:
             except ZenoError as error:
                 raise LostOrbit(str(error)) from None
             times, guards = guard_events(run)
-            found = [i for i, guard_id in enumerate(guards) if i >= skip and guard_id == self.end]
-            if len(found) >= hits:
-                last = found[hits - 1]
+            ends = [i for i, guard_id in enumerate(guards) if i >= skip and guard_id == self.end]
+            if len(ends) >= hits:
+                last = ends[hits - 1]
                 return _grouped(self.automaton, times[: last + 1], guards[: last + 1])
         raise LostOrbit(f"{self._name(self.end)} does not come within {self.horizon:.6g} s")
 
@@ -226,9 +226,9 @@ def _damped(
             shot = shoot(trial)
         except LostOrbit:
             continue
-        found = _residual(shot, trial, free, scale)
-        if found < residual:
-            return FixedPoint(trial, shot, found)
+        lower = _residual(shot, trial, free, scale)
+        if lower < residual:
+            return FixedPoint(trial, shot, lower)
     return None
 
 

@@ -86,14 +86,14 @@ def mirror(loop: ServoAutomaton) -> Mirror | None:
         for g, guard in enumerate(mode.guards):
             target = _opposite(names[guard.target])
             row = np.asarray(guard.row) * signs
-            found = [
+            matches = [
                 k
                 for k, candidate in enumerate(partner.guards)
                 if names[candidate.target] == target and np.array_equal(np.asarray(candidate.row), row)
             ]
-            if len(found) != 1:
+            if len(matches) != 1:
                 return None
-            guards[GuardId(index, g)] = GuardId(names.index(other), found[0])
+            guards[GuardId(index, g)] = GuardId(names.index(other), matches[0])
     return Mirror(signs, guards)
 
 
@@ -119,9 +119,9 @@ class ScaledLoop:
     state, mode : (n,) array, int
         At time 0.
     unit : float
-        Multiplies every state of an orbit found here.
+        Factor from scaled states to SI units.
     displacement : (n,) array
-        To be added afterwards: the reference that was shifted away.
+        Added after scaling: the shift of the reference to zero.
     extent : float
         Scaled metres, of the gap at the screw (or of the tolerance, or of the step, where there is no gap).
     time : float

@@ -27,7 +27,7 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class RatioAxes:
-    """Tolerance and reference step in units of p b, half the gap at the screw: all that the behaviour depends on.
+    """Tolerance and reference step in units of p b (half the gap at the screw), the only ratios that matter.
 
     The loop is homogeneous of degree one, so that a map over these two serves every gap; it is computed at one.
 
@@ -82,7 +82,7 @@ class PhysicalAxes:
     amplitude : tuple of float
         m, reference step, greater than 0.
     estimate : tuple of float
-        rad, the total gap that the dead zone is made for; empty: the true one.
+        rad, estimate of the total gap, for which the dead zone is set; empty: the true gap.
 
     Raises
     ------
@@ -113,8 +113,8 @@ class PhysicalAxes:
     def cells(self, servo: Servo) -> Cells:
         """Every cell in SI units."""
         gap, estimate, k_dz, amplitude = _grid(self.gap, self.estimate or (math.nan,), self.k_dz, self.amplitude)
-        believed = gap if not self.estimate else estimate
-        return Cells(gap, k_dz * servo.p * believed, amplitude)
+        estimate = estimate if self.estimate else gap
+        return Cells(gap, k_dz * servo.p * estimate, amplitude)
 
 
 Axes: TypeAlias = RatioAxes | PhysicalAxes

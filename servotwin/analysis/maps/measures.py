@@ -21,7 +21,7 @@ from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.simulation.continuous import controller_constants
 
-# Around where the position ends, in parts of the reference step: the usual five per cent.
+# Half-width about the final position, per reference step: the usual five per cent.
 SETTLING_BAND = 0.05
 
 
@@ -59,7 +59,7 @@ MEASURES = tuple(field.name for field in fields(Measures))
 
 
 def measured(settings: MapSettings, chunk: range) -> Measures:
-    """Run all members of some cells, in this thread; the same numbers however the cells are put together."""
+    """Run all members of some cells in this thread; how cells are grouped does not change their numbers."""
     cells = Cells(*(values[chunk.start : chunk.stop] for values in settings.axes.cells(settings.servo)))
     position, voltage = trajectories(settings, cells, chunk)
     with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
@@ -83,12 +83,12 @@ def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Arr
     states = starts(settings, loop, cells, chunk).reshape(-1, len(loop.automaton.names))
     modes, rows = _modes(settings, loop, states), np.array([loop.rows["position"], loop.rows["voltage"]])
     try:
-        found, _ = run_ensemble(
+        traces, _ = run_ensemble(
             loop.automaton, states, modes, 1.0 / settings.sample_rate, settings.samples, rows, threads=1
         )
     except ZenoError as error:
         raise InvalidInput(f"map cells {chunk.start} to {chunk.stop - 1}: {error}") from None
-    position, voltage = np.moveaxis(found.reshape(len(chunk), settings.members, 2, -1), 2, 0)
+    position, voltage = np.moveaxis(traces.reshape(len(chunk), settings.members, 2, -1), 2, 0)
     return position, voltage
 
 
@@ -125,6 +125,7 @@ def _draws(settings: MapSettings, cell: int) -> Array:
     # What SeedSequence(seed).spawn(...)[cell] would be: a cell's numbers do not depend on which others are computed.
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(cell,)))
     draws = rng.uniform(-1.0, 1.0, (settings.members, 3))
+    # The first member starts as the paper does, in the middle of the gap; every second of the others is at rest too.
     draws[0] = 0.0
     draws[1::2, 1:] = 0.0
     return draws
@@ -138,7 +139,7 @@ def _modes(settings: MapSettings, loop: ServoAutomaton, states: Array) -> NDArra
 
 
 def _reduced(settings: MapSettings, step: Array, position: Array, voltage: Array) -> Measures:
-    """`step` is (cells, 1, 1)."""
+    """Measures of trajectories (cells, members, samples); `step` is (cells, 1, 1)."""
     tail = _tail(position, settings.window * settings.sample_rate)
     short = _tail(tail, SHORT_WINDOW * settings.sample_rate)
     swing, swing_short = (0.5 * np.ptp(each, axis=2) for each in (tail, short))

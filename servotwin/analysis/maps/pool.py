@@ -28,7 +28,7 @@ _R = TypeVar("_R")
 
 @contextmanager
 def workplace(workers: int | None = None, scheduler: str | None = None) -> Iterator[None]:
-    """Provide the processes of `shared` inside this block.
+    """Provide the worker processes for `shared` inside this block.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple
     tasks : iterable
         Picklable.
     """
-    with _interrupts_held():
+    with _interrupts_blocked():
         outcomes = Parallel(batch_size=1, return_as="generator_unordered")(
             delayed(_performed)(function, task) for task in tasks
         )
     try:
-        # Not `yield from`: that would close `outcomes` before `finally` begins, and joblib warn of unfinished tasks.
+        # Not `yield from`: it would close `outcomes` before `finally`, and joblib would warn of unfinished tasks.
         for outcome in outcomes:  # noqa: UP028
             yield outcome
     finally:
@@ -80,7 +80,7 @@ def _processes(workers: int) -> Iterator[None]:
             parallel_config(backend="loky", n_jobs=workers, initializer=_ignore_interrupts),
             warnings.catch_warnings(),
         ):
-            # A worker whose caches have grown is replaced, which is no news.
+            # loky replaces workers whose caches have grown; nothing is wrong then.
             warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
             yield
     finally:
@@ -104,8 +104,8 @@ def _cluster(address: str) -> Iterator[None]:
         if not type(error).__module__.startswith("distributed."):
             raise
         raise InvalidInput(
-            f"--scheduler {address}: was lost, or its workers were ({type(error).__name__}); what was finished is kept,"
-            " the same command goes on from there"
+            f"--scheduler {address}: the connection to it or to its workers was lost ({type(error).__name__}); finished"
+            " pieces are stored, and the same command continues from them"
         ) from None
     finally:
         client.close()
@@ -114,7 +114,7 @@ def _cluster(address: str) -> Iterator[None]:
 def _connected(address: str) -> Any:
     distributed = require("distributed", f"--scheduler {address}:")
     for name in ("distributed", "distributed.client", "tornado.application"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what they have to say is said once, by us
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # the InvalidInput below says it once
     connect: Any = distributed.Client
     try:
         client = connect(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
@@ -130,8 +130,8 @@ def _connected(address: str) -> Any:
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Let interrupts wait; processes that are started meanwhile never see one, and leave it to this one."""
+def _interrupts_blocked() -> Iterator[None]:
+    """Block interrupts; processes started meanwhile inherit that, so only this process handles one."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -23,7 +23,7 @@ _AXIS_UNITS = {"gap": "_rad", "estimate": "_rad", "k_dz": "", "amplitude": "_m"}
 
 @dataclass(frozen=True, eq=False)
 class StabilityMap:
-    """Settings and measures."""
+    """A finished map: its settings and the measures of its cells."""
 
     settings: MapSettings
     measures: Measures
@@ -54,22 +54,22 @@ class StabilityMap:
         return (*axes, *(name + _UNITS.get(name, "") for name in MEASURES))
 
 
-def write_numbers(found: StabilityMap, directory: Path) -> None:
-    """map.npz, the axes and the measures shaped as they are, and map.csv, one line per cell."""
-    names, count = found.columns, len(found.axes)
-    arrays = {name: np.array(values) for name, (_, values) in zip(names, found.axes, strict=False)}
-    arrays |= {name: found.grid(measure) for name, measure in zip(names[count:], MEASURES, strict=True)}
+def write_numbers(stability: StabilityMap, directory: Path) -> None:
+    """Write map.npz, the axes and the measures on the grid, and map.csv, one line per cell."""
+    names, count = stability.columns, len(stability.axes)
+    arrays = {name: np.array(values) for name, (_, values) in zip(names, stability.axes, strict=False)}
+    arrays |= {name: stability.grid(measure) for name, measure in zip(names[count:], MEASURES, strict=True)}
     with files.atomic_output(directory / "map.npz") as temporary:
-        np.savez(temporary, allow_pickle=False, fingerprint=np.array(found.settings.fingerprint), **arrays)
+        np.savez(temporary, allow_pickle=False, fingerprint=np.array(stability.settings.fingerprint), **arrays)
     with (
         files.atomic_output(directory / "map.csv") as temporary,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
-        csv.writer(file).writerows([names, *_lines(found)])
+        csv.writer(file).writerows([names, *_lines(stability)])
 
 
-def _lines(found: StabilityMap) -> Iterator[list[str]]:
-    cells = product(*(values for _, values in found.axes))
-    measures = zip(*(getattr(found.measures, name).tolist() for name in MEASURES), strict=True)
+def _lines(stability: StabilityMap) -> Iterator[list[str]]:
+    cells = product(*(values for _, values in stability.axes))
+    measures = zip(*(getattr(stability.measures, name).tolist() for name in MEASURES), strict=True)
     for cell, row in zip(cells, measures, strict=True):
         yield [repr(value) for value in (*cell, *row)]

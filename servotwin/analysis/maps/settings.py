@@ -14,14 +14,14 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 
-# To be raised whenever the same settings would give other numbers.
+# Raise it whenever the same settings would give other numbers: stored pieces then no longer match.
 FORMAT = 1
 SHORT_WINDOW = 10.0
 MAX_SAMPLES = 200_000
-# Of all members of a chunk: a quarter of a second's work, 16 MB of position and voltage.
+# Samples of all members of a chunk: a quarter of a second's work, 16 MB of position and voltage.
 _SAMPLES_PER_CHUNK = 1_000_000
-# Per turn at the loop's crossover: a limit cycle's peak is missed by half a per cent at most.
-_LOOKS = 32
+# Samples per turn at the loop's crossover: a limit cycle's peak is missed by half a per cent at most.
+_SAMPLES_PER_TURN = 32
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class MapSettings:
     duration : float
         s, of every run.
     window : float
-        s, the end of the run in which it is looked at. A loop with integral action may rest for more than ten seconds
-        and move on, in cycles of 27 s.
+        s, length of the last part of the run, from which the measures are taken. A loop with integral action may rest
+        for more than ten seconds and move on, in cycles of 27 s.
     still : float
         m; a run has settled when half the peak-to-peak of the position in the window is below this.
 
     Raises
     ------
     InvalidInput
-        A value is outside its range, the controller is sampled or does not even stabilise the servo without a gap.
+        A value is outside its range, the controller is sampled or does not stabilise the servo even without a gap.
     """
 
     servo: Servo
@@ -83,7 +83,7 @@ class MapSettings:
             raise InvalidInput(f"map window = {self.window:g} s: must be at most the duration, {self.duration:g} s")
         if self.samples > MAX_SAMPLES:
             raise InvalidInput(
-                f"map duration = {self.duration:g} s: is {self.samples} samples of this loop, at"
+                f"map duration = {self.duration:g} s: gives {self.samples} samples of this loop, at"
                 f" {self.sample_rate:g} Hz; at most {MAX_SAMPLES} are allowed"
             )
 
@@ -99,17 +99,17 @@ class MapSettings:
 
     @property
     def sample_rate(self) -> float:
-        """Hz, of what the measures are taken from; events are located exactly whatever it is."""
-        return math.ceil(_LOOKS / characteristic_time(self.servo, self.law))
+        """Rate of the samples that the measures are taken from, Hz; the location of events does not depend on it."""
+        return math.ceil(_SAMPLES_PER_TURN / characteristic_time(self.servo, self.law))
 
     @property
     def samples(self) -> int:
-        """Of a run, both ends included."""
+        """Number of samples of a run, both ends included."""
         return round(self.duration * self.sample_rate) + 1
 
     @property
     def chunks(self) -> tuple[range, ...]:
-        """The cells in pieces that are computed, and kept, together."""
+        """Cells in pieces; each piece is computed and stored as one."""
         size = max(1, _SAMPLES_PER_CHUNK // (self.members * self.samples))
         return tuple(range(first, min(first + size, self.count)) for first in range(0, self.count, size))
 

@@ -1,4 +1,4 @@
-"""Finished pieces of a map on the disk, and the computing of those that are missing: an interrupted map goes on."""
+"""Store of the finished pieces of a map, and computation of the missing ones: an interrupted map can be continued."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MapStore:
         files.make_directory(self.directory)
         files.make_directory(self._folder)
         path = self.directory / "settings.json"
-        # As it is read back: tuples have become lists.
+        # JSON turns tuples into lists: compare what a file gives back.
         described = json.loads(json.dumps(self.settings.described()))
         if path.exists():
             _compare(path, described)
@@ -57,14 +57,14 @@ class MapStore:
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"
 
-    def keep(self, number: int, measures: Measures) -> None:
+    def save(self, number: int, measures: Measures) -> None:
         """Write one piece, whole or not at all."""
         values = {name: getattr(measures, name) for name in MEASURES}
         with files.atomic_output(self._path(number)) as temporary:
             np.savez(temporary, allow_pickle=False, fingerprint=np.array(self.settings.fingerprint), **values)
 
-    def kept(self, number: int) -> Measures | None:
-        """A piece, if it is there and whole.
+    def load(self, number: int) -> Measures | None:
+        """Read a piece; None when it is missing or incomplete.
 
         Raises
         ------
@@ -84,16 +84,16 @@ class MapStore:
 
     def missing(self) -> tuple[int, ...]:
         """Numbers of the pieces that are still to be computed."""
-        return tuple(number for number in range(len(self.settings.chunks)) if self.kept(number) is None)
+        return tuple(number for number in range(len(self.settings.chunks)) if self.load(number) is None)
 
 
-def _compare(path: Path, wanted: dict[str, Any]) -> None:
+def _compare(path: Path, described: dict[str, Any]) -> None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InvalidInput(f"{path}: cannot be read as the settings of a map; choose another --out") from None
-    for key, value in wanted.items():
-        there = found.get(key) if isinstance(found, dict) else None
+    for key, value in described.items():
+        there = stored.get(key) if isinstance(stored, dict) else None
         if there != value:
             raise InvalidInput(
                 f"{path}: this folder holds a map with {_shown(key, there, value)};"
@@ -121,22 +121,28 @@ class Piece:
 
 
 def compute(store: MapStore, workers: int | None, scheduler: str | None, console: Console) -> None:
-    """Compute and keep the pieces that are missing, under a progress bar."""
+    """Compute and store the missing pieces, under a progress bar."""
     chunks = store.settings.chunks
     pieces = [Piece(store.settings, number, chunks[number]) for number in store.missing()]
     total = len(chunks)
     if not pieces:
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:
         with (
             workplace(workers, scheduler),
-            Progress(*columns, TimeRemainingColumn(), console=console) as progress,
+            Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                console=console,
+            ) as progress,
             closing(shared(Piece.measured, pieces)) as outcomes,
         ):
             bar = progress.add_task("mapping", total=total, completed=total - len(pieces))
             for piece, measures in outcomes:
-                store.keep(piece.number, measures)
+                store.save(piece.number, measures)
                 progress.advance(bar)
     except KeyboardInterrupt:
         done = total - len(store.missing())
@@ -147,8 +153,8 @@ def compute(store: MapStore, workers: int | None, scheduler: str | None, console
 
 def collected(store: MapStore) -> Measures:
     """Join all pieces into one."""
-    parts = [store.kept(number) for number in range(len(store.settings.chunks))]
+    parts = [store.load(number) for number in range(len(store.settings.chunks))]
     whole = [part for part in parts if part is not None]
     if len(whole) < len(parts):
-        raise InvalidInput(f"{store.directory}: pieces of the map vanished meanwhile; give the same command again")
+        raise InvalidInput(f"{store.directory}: pieces of the map have disappeared; give the same command again")
     return joined(whole)

@@ -20,7 +20,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.linear import Complex
 
-# Where a type has no filter of its own: the law's derivative needs one, so fast that it costs half a degree at most.
+# Filter time times crossover of types without a filter: the law needs one, so fast that it costs half a degree at most.
 FASTEST_FILTER = 0.01
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
 
@@ -57,7 +57,7 @@ class Factors(NamedTuple):
     def controller(self) -> Controller:
         """The gains of the law that equals C(s); the filter's time is tan(al) / wc."""
         Kp, Ki, Kd, time = (float(value) for value in _gains(self))
-        # Without derivative action the filter has nothing to filter; the law wants one all the same.
+        # Without derivative action the filter has no input, but the law's filter time must be positive.
         return Controller(Kp, Ki, Kd, time if time > 0.0 else FASTEST_FILTER / self.wc)
 
     def response(self, omega: ArrayLike) -> Complex:
@@ -141,15 +141,14 @@ class Candidate(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """The stable candidates, at least one, and how many were looked at and stable."""
+    """The stable candidates, at least one, and the number of candidates evaluated."""
 
-    kept: list[Candidate]
+    stable: list[Candidate]
     evaluated: int
-    stable: int
 
 
 def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Candidate], float]) -> SearchResult:
-    """All stable candidates of a type for a crossover (rad/s) and a phase margin (rad), more of them where `cost` is
+    """Search the stable candidates of a type for a crossover (rad/s) and a phase margin (rad), densest where `cost` is
     low.
 
     Raises
@@ -161,11 +160,12 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
     omega = plant.search_frequencies(wc)
     values = plant.response(omega)
     possible = False
+    # Positive gains first; a plant of negative gain needs negative ones.
     for sign in (1.0, -1.0):
         turn = _wrapped(margin - math.pi - np.angle(sign * at))
         if name == "P":
             turn = 0.0 if _wrapped(math.pi + np.angle(sign * at)) >= margin else math.nan
-        kept: list[Candidate] = []
+        stable: list[Candidate] = []
         count = 0
         be, al = (0.5 * _HIGHEST, _HIGHEST), (0.5 * (_LOWEST + _HIGHEST), _HIGHEST - _LOWEST)
         for zoom in range(_ZOOMS):
@@ -173,13 +173,13 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
             if not grid:
                 break
             count, possible = count + len(grid), True
-            kept += _stable_candidates(grid, omega, values, plant.integrators)
-            if not kept:
+            stable += _stable_candidates(grid, omega, values, plant.integrators)
+            if not stable:
                 break
-            best = min(kept, key=cost).factors
+            best = min(stable, key=cost).factors
             be, al = (best.be, _HIGHEST / 4 ** (zoom + 1)), (best.al, _HIGHEST / 4 ** (zoom + 1))
-        if kept:
-            return SearchResult(kept, count, len(kept))
+        if stable:
+            return SearchResult(stable, count)
     if not possible:
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
     where = f"{wc:g} rad/s and {math.degrees(margin):g} deg there"
@@ -224,12 +224,12 @@ def _stable_candidates(grid: list[Factors], omega: Array, plant: Complex, integr
     loops = np.array([factors.response(omega) for factors in grid]) * plant
     stable = nyquist_stable(loops, integrators + grid[0].integral)
     Ms = np.max(1.0 / np.abs(1.0 + loops), axis=1)
-    kept = []
+    candidates = []
     for factors, good, peak in zip(grid, stable, Ms, strict=True):
         if good:
             law = factors.controller()
-            kept.append(Candidate(factors, float(peak), abs(law.Ki) or abs(law.Kp)))
-    return kept
+            candidates.append(Candidate(factors, float(peak), abs(law.Ki) or abs(law.Kp)))
+    return candidates
 
 
 def _wrapped(angle: float) -> float:

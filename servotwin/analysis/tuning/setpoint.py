@@ -1,4 +1,4 @@
-"""The second degree of freedom: setpoint weights, as a filter of the reference, so that the law stays what it is.
+"""The second degree of freedom: setpoint weights as a filter of the reference; the law does not change.
 
 With weights b and c the law would act on b r - y and c r - y in its proportional and derivative terms. On a linear loop
 that equals the unchanged law with its reference filtered by F = C_r / C,
@@ -59,7 +59,7 @@ def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
 
 
 def shaped(controller: Controller, b: float, c: float, size: float, duration: float, rate: float) -> Samples:
-    """A reference step of a size (m) behind the prefilter, sampled at a rate (Hz) and held, for a simulation."""
+    """A reference step of a size (m) behind the prefilter, piecewise constant at a rate (Hz), for a simulation."""
     times = np.arange(round(duration * rate) + 1) / rate
     return Samples(times.tolist(), (size * prefilter(controller, b, c).step(times)).tolist())
 

@@ -1,8 +1,8 @@
-"""Tuning a controller to a crossover and a phase margin: what pidtune does, for the law of this package.
+"""Tuning of a controller to a crossover and a phase margin, as pidtune does, for the law of this package.
 
-Every candidate has the wanted crossover and margin exactly: the angles be and al of `factors` are free, phz follows
-from the phase and K from the modulus of the plant there. Of all stable ones those with the smallest Ms are kept, and of
-these the one with the largest Ki; or, if that is preferred, simply the largest Ki within a bound on Ms.
+Every candidate has the specified crossover and margin exactly: the angles be and al of `factors` are free, phz follows
+from the phase and K from the modulus of the plant there. Of all stable ones those with the smallest Ms compete,
+and the largest Ki wins; or, with ``prefer = "Ki"``, the largest Ki within a bound on Ms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Specification:
     phase_margin : float
         rad, there; of a P controller, which cannot choose it, the least.
     kind : str
-        P, PI, PD, PDF, PID or PIDF. PD and PID get the filter 0.01 / crossover, since the law cannot do without.
+        P, PI, PD, PDF, PID or PIDF. PD and PID get the filter 0.01 / crossover, since the law needs one.
     Ms_max : float
         Largest sensitivity peak that is accepted.
     prefer : str
@@ -125,26 +125,26 @@ def tune(
     ------
     InvalidInput
         The plant is unstable, the type cannot give this margin at this crossover, no candidate is stable, or none has
-        Ms_max; one sentence with what can be reached.
+        Ms_max; the sentence says what can be reached.
     """
     plant = Plant(system, delay)
-    wanted = specification
-    found = search(plant, wanted.kind, wanted.crossover, wanted.phase_margin, wanted.cost)
-    best = min(found.kept, key=lambda one: one.Ms)
-    if not best.Ms <= wanted.Ms_max:
-        reached = f"the smallest Ms that a {wanted.kind} controller reaches there is {best.Ms:.3f}"
-        raise InvalidInput(f"Ms_max = {wanted.Ms_max:g}: {reached}; lower the crossover or change the margin")
-    limit = wanted.Ms_max if wanted.prefer == "Ki" else min(_EQUAL * best.Ms, wanted.Ms_max)
-    eager = sorted((one for one in found.kept if one.Ms <= limit), key=lambda one: -one.integral)
-    for candidate in [*eager, best]:
+    spec = specification
+    result = search(plant, spec.kind, spec.crossover, spec.phase_margin, spec.cost)
+    best = min(result.stable, key=lambda one: one.Ms)
+    if not best.Ms <= spec.Ms_max:
+        reached = f"the smallest Ms that a {spec.kind} controller reaches there is {best.Ms:.3f}"
+        raise InvalidInput(f"Ms_max = {spec.Ms_max:g}: {reached}; lower the crossover or change the margin")
+    limit = spec.Ms_max if spec.prefer == "Ki" else min(_EQUAL * best.Ms, spec.Ms_max)
+    by_integral = sorted((one for one in result.stable if one.Ms <= limit), key=lambda one: -one.integral)
+    for candidate in [*by_integral, best]:
         law = candidate.factors.controller()
         achieved = evaluate(system, law, delay)
         # The frequencies of the search may just miss a peak; the exact Ms decides.
-        if achieved.Ms <= wanted.Ms_max:
+        if achieved.Ms <= spec.Ms_max:
             break
     if like is not None:
         law = like.replace(Kp=law.Kp, Ki=law.Ki, Kd=law.Kd, Tf=law.Tf)
-    return Tuning(law, candidate.factors, achieved, found.evaluated, found.stable)
+    return Tuning(law, candidate.factors, achieved, result.evaluated, len(result.stable))
 
 
 def evaluate(system: LinearSystem | FrequencyData, controller: Controller, delay: float = 0.0) -> Margins:

@@ -1,4 +1,4 @@
-"""Simulation of settings on many machines that the model may stand for, and the measures of each."""
+"""Simulation of settings on many machines within the model's uncertainty, and the measures of each."""
 
 from __future__ import annotations
 
@@ -98,9 +98,10 @@ def assess(settings: Sequence[Design], members: SimulatedMachines, trial: Trial)
         trial.rate,
         trial.threads,
     )
+    # The voltage of a saturated machine equals its limit exactly, so that reaching it is what counts.
     limits = [setting.controller.voltage_limit or math.inf for setting in settings]
     return [
-        _outcome(_of(figures["error"], k), _of(figures["voltage"], k), members.step, trial, limit)
+        _measures(_of(figures["error"], k), _of(figures["voltage"], k), members.step, trial, limit)
         for k, limit in enumerate(limits)
     ]
 
@@ -111,15 +112,16 @@ def nearness(setting: Design, input_bias: Array, step: float) -> Array:
     It is 2 % of the step, plus the error that an input bias leaves where nothing integrates, plus the dead zone.
     """
     law = setting.controller
-    left = np.abs(input_bias + law.feedforward) / abs(law.Kp)
-    return np.asarray(max(NEAR * step, STILL) + left + law.leave * setting.tolerance)
+    # In the steady state the proportional term must supply what the feedforward leaves of the bias.
+    steady = np.abs(input_bias + law.feedforward) / abs(law.Kp)
+    return np.asarray(max(NEAR * step, STILL) + steady + law.leave * setting.tolerance)
 
 
 def _of(figures: Figures, setting: int) -> Figures:
     return Figures(*(values[setting] for values in figures))
 
 
-def _outcome(error: Figures, voltage: Figures, step: Array, trial: Trial, limit: float) -> MachineMeasures:
+def _measures(error: Figures, voltage: Figures, step: Array, trial: Trial, limit: float) -> MachineMeasures:
     """Measures from (P, C) figures."""
     return MachineMeasures(
         ripple=0.5 * (error.last_highest - error.last_lowest),

@@ -32,7 +32,7 @@ class Demands:
     screened, plants, conditions : int
         Plants that rank the candidates, plants of the verification, and conditions of each.
     attempts : int
-        Candidates that are verified before the search is given up.
+        Candidates that are simulated on all machines before the search gives up.
     """
 
     Ms: Annotated[
@@ -58,7 +58,7 @@ class Demands:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check(self, but=("overshoot",))  # inf where the fallback set is looked for: no demand
+        check(self, but=("overshoot",))  # inf: no demand, where an input bias or friction disturbs
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ class Certificate:
         Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain
         is below one at every frequency has the crossover 0 and the margin pi.
     saturated : bool
-        True when the voltage met its limit on any machine.
+        True when the voltage reached its limit on any machine.
     looked_at : int
-        Candidates simulated, this one included.
+        Number of candidates simulated, this one included.
     seconds : float
         Computing time.
     """
@@ -121,7 +121,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class NotVerified:
-    """The reason why no candidate was verified, and the certificate of the best one."""
+    """Failed search: the reason, and the certificate of the best candidate."""
 
     reason: str
     best: Certificate | None = None

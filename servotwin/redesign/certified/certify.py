@@ -1,4 +1,4 @@
-"""The search for a setting that is verified by simulation on the machines that the estimate allows.
+"""Search for a setting that is verified by simulation on the machines within the uncertainty.
 
 Candidates are simulated on machines drawn from everything that is uncertain: the plant's parameters, the gap within the
 estimate's interval, the size of the steps, the rest of the input bias. A few machines rank the candidates; the best is
@@ -53,7 +53,7 @@ def certify(
     noise : float
         m rms on the measured position.
     clock : callable
-        s, for the certificate's own time.
+        s, from which the certificate's computing time is taken.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def certify(
     members = draw(servo, uncertainty, demands.plants, demands.conditions, demands.seed)
     best: Certificate | None = None
     for setting in ranked[: demands.attempts]:
-        (outcome,) = assess([setting], members, trial)
-        tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
+        (measures,) = assess([setting], members, trial)
+        tried = _certificate(servo, setting, members, uncertainty, measures, demands, noise)
         tried = replace(tried, looked_at=len(candidates), seconds=clock() - begin)
         if not _shortcoming(tried, demands):
             return tried
@@ -92,7 +92,7 @@ def confirm(
     noise: float = 0.0,
     clock: Callable[[], float] = perf_counter,
 ) -> Certificate | NotVerified:
-    """Verify one setting on simulated machines that the uncertainty allows; no other is looked at.
+    """Verify one given setting on the simulated machines within the uncertainty.
 
     Parameters
     ----------
@@ -104,17 +104,17 @@ def confirm(
     begin, fed = clock(), setting.controller.feedforward
     demands = _for_disturbance(demands, uncertainty, fed)[0]
     members = draw(servo, uncertainty, demands.plants, demands.conditions, demands.seed)
-    (outcome,) = assess([setting], members, trial or Trial())
-    tried = _certificate(servo, setting, members, uncertainty, outcome, demands, noise)
+    (measures,) = assess([setting], members, trial or Trial())
+    tried = _certificate(servo, setting, members, uncertainty, measures, demands, noise)
     tried = replace(tried, looked_at=1, seconds=clock() - begin)
     missing = _shortcoming(tried, demands)
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
 def _for_disturbance(demands: Demands, uncertainty: Uncertainty, feedforward: float) -> tuple[Demands, bool]:
-    """Demands where friction or bias act on a machine, and True where they do.
+    """Demands for machines on which friction or bias act, and True where they act.
 
-    The bias sets in together with the step, so that the overshoot it adds means nothing.
+    In the simulation the bias sets in together with the step, so the overshoot that it adds means nothing.
     """
     low, high = (bias + feedforward for bias in uncertainty.input_bias)
     disturbed = max(abs(low), abs(high)) > demands.bias_known or uncertainty.friction[1] > 0.0
@@ -130,7 +130,7 @@ def candidates_of(servo: Servo, demands: Demands, gap: float, disturbed: bool, n
     Raises
     ------
     InvalidInput
-        There is none.
+        No scaled controller is within the bound on Ms.
     """
     laws = _laws(servo, demands, demands.integral if disturbed else (0.0,))
     if not laws:
@@ -170,20 +170,20 @@ def _with_feedforward(setting: Design, feedforward: float) -> Design:
 def _ranked(
     candidates: list[Design], members: SimulatedMachines, trial: Trial, demands: Demands, noise: float
 ) -> list[Design]:
-    """Best first: those that settle on more members, in whole percents, then the cheaper."""
-    outcomes = assess(candidates, members, trial)
+    """Candidates that meet the demands on these members first, then by cost."""
+    measures = assess(candidates, members, trial)
 
-    def place(k: int) -> tuple[bool, float]:
-        fails = float(np.mean(outcomes[k].settled)) < demands.settled or outcomes[k].overshoot.max() > demands.overshoot
-        fails = fails or bool(outcomes[k].tail.max() > _ROUNDED * demands.tail)
-        return fails, _cost(candidates[k], outcomes[k], demands, noise)
+    def rank(k: int) -> tuple[bool, float]:
+        fails = float(np.mean(measures[k].settled)) < demands.settled or measures[k].overshoot.max() > demands.overshoot
+        fails = fails or bool(measures[k].tail.max() > _ROUNDED * demands.tail)
+        return fails, _cost(candidates[k], measures[k], demands, noise)
 
-    return [candidates[k] for k in sorted(range(len(candidates)), key=place)]
+    return [candidates[k] for k in sorted(range(len(candidates)), key=rank)]
 
 
-def _cost(setting: Design, outcome: MachineMeasures, demands: Demands, noise: float) -> float:
+def _cost(setting: Design, measures: MachineMeasures, demands: Demands, noise: float) -> float:
     price = demands.effort_weight * setting.noise_effort(noise, _NOISE_BAND) if noise else 0.0
-    return float(np.percentile(outcome.cost, 95.0)) + price
+    return float(np.percentile(measures.cost, 95.0)) + price
 
 
 def _certificate(
@@ -191,10 +191,11 @@ def _certificate(
     setting: Design,
     members: SimulatedMachines,
     uncertainty: Uncertainty,
-    outcome: MachineMeasures,
+    measures: MachineMeasures,
     demands: Demands,
     noise: float,
 ) -> Certificate:
+    # Margins do not depend on these three: equal ones share a cached result.
     loop = _margins(servo, setting.controller.replace(feedforward=0.0, enter=1.0, leave=1.0))
     crossover = loop.gain_crossovers[-1] if loop.gain_crossovers else GainCrossover(0.0, math.pi)
     return Certificate(
@@ -204,20 +205,20 @@ def _certificate(
         step=uncertainty.step,
         friction=uncertainty.friction,
         members=members.count,
-        settled=float(np.mean(outcome.settled)),
-        cost=_cost(setting, outcome, demands, noise),
-        tail=float(outcome.tail.max()),
-        tail_p95=float(np.percentile(outcome.tail, 95.0)),
-        error_rms=float(outcome.error_rms.max()),
-        effort=float(outcome.effort.max()),
-        overshoot=float(outcome.overshoot.max()),
-        settling=float(np.percentile(outcome.settling, 95.0)),
-        settling_worst=float(outcome.settling.max()),
+        settled=float(np.mean(measures.settled)),
+        cost=_cost(setting, measures, demands, noise),
+        tail=float(measures.tail.max()),
+        tail_p95=float(np.percentile(measures.tail, 95.0)),
+        error_rms=float(measures.error_rms.max()),
+        effort=float(measures.effort.max()),
+        overshoot=float(measures.overshoot.max()),
+        settling=float(np.percentile(measures.settling, 95.0)),
+        settling_worst=float(measures.settling.max()),
         within=float(np.max(nearness(setting, np.array(uncertainty.input_bias), uncertainty.step[1]))),
         Ms=loop.Ms,
         crossover=crossover.omega,
         phase_margin=crossover.phase_margin,
-        saturated=bool(outcome.saturated.any()),
+        saturated=bool(measures.saturated.any()),
         looked_at=0,
         seconds=0.0,
     )

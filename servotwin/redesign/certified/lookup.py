@@ -1,7 +1,8 @@
 """Settings verified beforehand, one for each cell of a grid over gap, input bias and noise.
 
-A cell is an interval of gaps and a largest input bias that the feedforward leaves; its setting was verified on machines
-of the whole cell, so it serves every region inside. A region that no verified cell contains gets the fallback set.
+A cell is an interval of gaps and a largest input bias that the feedforward leaves uncancelled; its setting was
+verified on machines of the whole cell, so it serves every region inside. A region that no verified cell contains gets
+the fallback set.
 Cells of every width overlap by half, so that a region lies in one at most four times as wide, but for the narrowest.
 """
 
@@ -26,8 +27,10 @@ from servotwin.redesign.design import Design
 from servotwin.redesign.evidence import Evidence
 from servotwin.redesign.policy import Redesign
 
-_KEPT_LEVELS = 2  # of width: nobody is troubled with an update for a little less
-_QUIET = 1e-6  # m rms: noise below is like none
+# Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
+_PREFERRED_LEVELS = 2
+# m rms: smaller noise counts as none.
+_QUIET = 1e-6
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,9 @@ class Grid:
     finest : float
         rad, width of the narrowest cells; others are twice, four times ... as wide, up to the whole stated range.
     biases : tuple of float
-        V, rising: largest input bias that is left beside the feedforward.
+        V, rising: largest input bias that the feedforward leaves uncancelled.
     noises : tuple of float
-        m rms, rising: for which settings are ranked; the verification does not depend on it.
+        m rms, rising: noise for which candidates are ranked; the verification does not depend on it.
 
     Raises
     ------
@@ -92,9 +95,9 @@ class CertifiedTable:
     feedforward_limit : float
         V, either sign.
     bias_known : float
-        V: up to here the policy demands less overshoot, and only cells up to here are verified for that.
+        V: for a bias up to this the policy bounds the overshoot, and only cells up to this are verified for that.
     fallback : Certificate
-        Of the fallback set, which serves the whole stated range.
+        Certificate of the fallback set, which serves the whole stated range.
     cells : dict of CellIndex to Certificate or None
         None: no setting was verified there.
     """
@@ -110,16 +113,17 @@ class CertifiedTable:
     def find(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
         """Find the certificate of the narrowest verified cell that contains a region, with the region's feedforward.
 
-        A cell up to four times as wide is preferred whose setting is `running` already, but for the feedforward.
+        A cell up to four times as wide is preferred if its setting, but for the feedforward, is `running` already.
         """
         if region.friction[0] < self.friction[0] or region.friction[1] > self.friction[1]:
             return NotVerified(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")
         if abs(region.feedforward) > self.feedforward_limit:
             return NotVerified(f"a feedforward of {region.feedforward:.3g} V is in no cell of the table")
-        verified = [(key, found) for key in self._containing(region) if (found := self.cells.get(key)) is not None]
+        cells = [(key, self.cells.get(key)) for key in self._containing(region)]
+        verified = [(key, certificate) for key, certificate in cells if certificate is not None]
         if verified:
-            widest = verified[0][0].level + _KEPT_LEVELS
-            same = [found for key, found in verified if key.level <= widest and _alike(found.setting, running)]
+            widest = verified[0][0].level + _PREFERRED_LEVELS
+            same = [one for key, one in verified if key.level <= widest and _alike(one.setting, running)]
             return _with_feedforward((same or [verified[0][1]])[0], region.feedforward)
         low, high = (math.degrees(end) for end in region.gap)
         bias = 1e3 * region.largest_bias
@@ -133,21 +137,21 @@ class CertifiedTable:
         noise = self._noise(region.noise)
         wide = enumerate(self.grid.levels(self.stated))
         places = [CellIndex(level, self._place(low, width), 0, noise) for level, width in wide]
-        holding = [key for key in places if _holds(cell_range(self.grid, self.stated, key), low, high)]
+        containing = [key for key in places if _contains(cell_range(self.grid, self.stated, key), low, high)]
         known = region.largest_bias <= self.bias_known
         for bias, limit in enumerate(self.grid.biases):
             if region.largest_bias <= limit and (limit <= self.bias_known) == known:
-                yield from (key._replace(bias=bias) for key in holding)
+                yield from (key._replace(bias=bias) for key in containing)
 
     def _place(self, low: float, width: float) -> int:
-        """Place of the cell of a width that begins highest, but not above `low`."""
+        """Place of the highest cell of a width that does not begin above `low`."""
         most = 2 * round((self.stated[1] - self.stated[0]) / width) - 2 if width > 0.0 else 0
         if most <= 0:
             return 0
         return min(max(0, math.floor((low - self.stated[0]) / (0.5 * width))), most)
 
     def _noise(self, noise: float) -> int:
-        """Nearest level, in ratios."""
+        """Index of the nearest noise of the grid, by ratio."""
         distances = [abs(math.log((level + _QUIET) / (noise + _QUIET))) for level in self.grid.noises]
         return distances.index(min(distances))
 
@@ -182,11 +186,11 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     limit = policy.servo.controller.voltage_limit
     servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
     demands = replace(policy.demands_within_band(), settled=1.0)
-    found = certify(servo, known, demands, policy.trial, 0.0, grid.noises[key.noise], policy.clock)
-    if isinstance(found, NotVerified) or found.saturated:
+    certificate = certify(servo, known, demands, policy.trial, 0.0, grid.noises[key.noise], policy.clock)
+    if isinstance(certificate, NotVerified) or certificate.saturated:
         return None
-    law = found.setting.controller.replace(voltage_limit=limit)
-    return replace(found, setting=replace(found.setting, controller=law))
+    law = certificate.setting.controller.replace(voltage_limit=limit)
+    return replace(certificate, setting=replace(certificate.setting, controller=law))
 
 
 def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[CellIndex, Certificate | None]) -> CertifiedTable:
@@ -216,7 +220,7 @@ class TablePolicy:
         return self.policy.decide(evidence, self)
 
     def verify(self, region: Region, running: Setting | None) -> Certificate | NotVerified:
-        """Look a region up."""
+        """Look up the certificate for a region."""
         return self.table.find(region, running)
 
     def fallback(self) -> Certificate:
@@ -224,13 +228,13 @@ class TablePolicy:
         return self.table.fallback
 
     def withdrawn(self, evidence: Evidence, why: str) -> Redesign:
-        """The fallback set, whatever the table says."""
+        """Decide for the fallback set, whatever the table holds."""
         return self.policy.decide(evidence, _WithdrawnTable(self.table.fallback, why))
 
 
 @dataclass(frozen=True)
 class _WithdrawnTable:
-    """A table that verifies nothing any more."""
+    """A withdrawn table: it has the fallback set only."""
 
     certificate: Certificate
     why: str
@@ -243,7 +247,7 @@ class _WithdrawnTable:
         return self.certificate
 
 
-def _holds(cell: Range, low: float, high: float) -> bool:
+def _contains(cell: Range, low: float, high: float) -> bool:
     return cell[0] <= low and high <= cell[1]
 
 
@@ -256,9 +260,9 @@ def _alike(one: Design, other: Setting | None) -> bool:
     )
 
 
-def _with_feedforward(found: Certificate, feedforward: float) -> Certificate:
-    """Certificate with a feedforward, and the input bias that then is the cell's."""
-    low, high = found.input_bias
-    law = found.setting.controller.replace(feedforward=feedforward)
-    setting = replace(found.setting, controller=law)
-    return replace(found, setting=setting, input_bias=(low - feedforward, high - feedforward))
+def _with_feedforward(certificate: Certificate, feedforward: float) -> Certificate:
+    """Certificate with a feedforward, and with the range of input biases that the cell then covers."""
+    low, high = certificate.input_bias
+    law = certificate.setting.controller.replace(feedforward=feedforward)
+    setting = replace(certificate.setting, controller=law)
+    return replace(certificate, setting=setting, input_bias=(low - feedforward, high - feedforward))

@@ -1,4 +1,4 @@
-"""A table of verified settings as a file, and for whom it holds."""
+"""File of a table of verified settings, with the model and demands that it holds for."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from servotwin.runtime import files
 
 SUFFIX = ".table"
 LARGEST = 64 * 1024 * 1024
-"""Bytes of a file that are looked at."""
-_KEPT_EVERY = 10.0  # s between two states of an unfinished table on the disk
+"""Largest file that is read, bytes."""
+_SAVED_EVERY = 10.0  # s between two writes of an unfinished table
 
 
 class TableFile(Struct, frozen=True, tag="certified-table/1"):
-    """What is on the disk.
+    """Content of the file.
 
     Attributes
     ----------
@@ -47,65 +47,67 @@ _decoder = msgspec.msgpack.Decoder(TableFile)
 
 
 def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:
-    """The finished table of a file, for the policy whose certificates it holds.
+    """Read a finished table that was verified for a policy.
 
     Raises
     ------
     InvalidInput
-        It cannot be read, belongs to another model, other demands or another version, or is unfinished.
+        The file cannot be read, belongs to another model, other demands or another version, or is unfinished.
     """
-    found = _read(path)
-    _check_owner(path, found, policy)
-    missing = len(set(cells_of(found.grid, policy.uncertainty.gap)) - {key for key, _ in found.cells})
+    file = _read(path)
+    _check_owner(path, file, policy)
+    missing = len(set(cells_of(file.grid, policy.uncertainty.gap)) - {key for key, _ in file.cells})
     if missing:
         raise InvalidInput(f"{path}: {missing} cells of this table are not verified yet: run the same command again")
-    return table_of(policy, found.grid, dict(found.cells))
+    return table_of(policy, file.grid, dict(file.cells))
 
 
 def build(
     path: Path, policy: CertifiedPolicy, grid: Grid, clock: Callable[[], float] = perf_counter
 ) -> Generator[tuple[int, int], None, None]:
-    """Verify a table cell by cell into a file, going on where an earlier run ended; gives (cells done, cells in all).
+    """Verify a table cell by cell into a file, continuing an earlier run; yield (cells done, cells in all).
 
-    What is done is on the disk every few seconds and when this is closed.
+    Finished cells are written every few seconds and when the generator is closed.
 
     Raises
     ------
     InvalidInput
-        The file is there and no table, another's or on another grid; it cannot be written; there is no fallback set.
+        The file exists and is no table, or one for another policy or grid; it cannot be written; there is no fallback
+        set.
     """
     keys = list(cells_of(grid, policy.uncertainty.gap))
-    cells = _begun(path, policy, grid)
-    kept, fallback = clock(), policy.fallback()
+    cells = _finished_cells(path, policy, grid)
+    saved, fallback = clock(), policy.fallback()
     try:
         for key in keys:
             if key not in cells:
                 cells[key] = certify_cell(policy, grid, key)
             yield len(cells), len(keys)
-            if clock() - kept > _KEPT_EVERY:
-                _write(path, TableFile(told(policy), grid, fallback, tuple(cells.items())))
-                kept = clock()
+            if clock() - saved > _SAVED_EVERY:
+                _write(path, TableFile(dependencies(policy), grid, fallback, tuple(cells.items())))
+                saved = clock()
     finally:
-        _write(path, TableFile(told(policy), grid, fallback, tuple(cells.items())))
+        _write(path, TableFile(dependencies(policy), grid, fallback, tuple(cells.items())))
 
 
-def told(policy: CertifiedPolicy) -> dict[str, str]:
+def dependencies(policy: CertifiedPolicy) -> dict[str, str]:
     """Everything that a policy's certificates depend on, by name and in full."""
     parts = {"servotwin": servotwin.__version__, "feedforward_limit": repr(policy.feedforward_limit)}
     for name in ("servo", "uncertainty", "demands"):
-        parts |= dict(spelled(name, getattr(policy, name)))
+        parts |= dict(flattened(name, getattr(policy, name)))
     trial = {f"trial.{name}": repr(getattr(policy.trial, name)) for name in ("duration", "last", "rate")}
     return {**parts, **trial}
 
 
-def _begun(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[CellIndex, Certificate | None]:
+def _finished_cells(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[CellIndex, Certificate | None]:
+    """Cells that an earlier run has verified; none without a file."""
     if not path.exists():
         return {}
-    found = _read(path)
-    _check_owner(path, found, policy)
-    if found.grid != grid:
-        raise InvalidInput(f"{path}: is a table on another grid ({found.grid}); choose another file, or remove it")
-    return dict(found.cells)
+    file = _read(path)
+    _check_owner(path, file, policy)
+    if file.grid != grid:
+        raise InvalidInput(f"{path}: is a table on another grid ({file.grid}); choose another file, or remove it")
+    return dict(file.cells)
 
 
 def _read(path: Path) -> TableFile:
@@ -121,12 +123,13 @@ def _read(path: Path) -> TableFile:
         raise InvalidInput(f"{path}: is no table of verified settings ({error})") from None
 
 
-def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
-    wanted = told(policy)
-    differing = [key for key in sorted({*wanted, *found.of}) if wanted.get(key) != found.of.get(key)]
+def _check_owner(path: Path, file: TableFile, policy: CertifiedPolicy) -> None:
+    """Refuse a table whose certificates depend on other values than this policy's."""
+    ours = dependencies(policy)
+    differing = [key for key in sorted({*ours, *file.of}) if ours.get(key) != file.of.get(key)]
     if differing:
         key = differing[0]
-        there, here = (each.get(key, "nothing") for each in (found.of, wanted))
+        there, here = (each.get(key, "nothing") for each in (file.of, ours))
         more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
         raise InvalidInput(
             f"{path}: was verified for {key} = {there}, and this is {here}{more}: certify a table of its own with"
@@ -134,11 +137,11 @@ def _check_owner(path: Path, found: TableFile, policy: CertifiedPolicy) -> None:
         )
 
 
-def spelled(name: str, value: object) -> Iterator[tuple[str, str]]:
+def flattened(name: str, value: object) -> Iterator[tuple[str, str]]:
     """(dotted name, value in full) of everything in nested dataclasses."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            yield from spelled(f"{name}.{field.name}", getattr(value, field.name))
+            yield from flattened(f"{name}.{field.name}", getattr(value, field.name))
     else:
         yield name, repr(value)
 

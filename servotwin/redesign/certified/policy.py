@@ -1,4 +1,4 @@
-"""The default policy: send a setting verified for all that the evidence allows, otherwise the fallback set."""
+"""The default policy: a setting verified on all machines that the evidence allows, otherwise the fallback set."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Verifier(Protocol):
     Attributes
     ----------
     provisional : bool
-        True when its certificates are of wider regions, and the exact verification is still to come.
+        True when its certificates are those of wider regions, and the region itself is still to be verified.
     """
 
     @property
@@ -57,20 +57,20 @@ class CertifiedPolicy:
     servo : Servo
         The model.
     uncertainty : Uncertainty
-        Prior knowledge, before any window; its gap is the range that the fallback set is verified for.
+        Prior knowledge, before any window; the fallback set is verified for its range of gaps.
     demands : Demands
     trial : Trial
     feedforward_limit : float
         V, either sign.
     bias_floor : float
-        V: the input bias is never taken to be known better.
+        V: least half-width of the range of input biases, however well it is estimated.
     bias_moved : float
-        V: a voltage at rest that differs by this much from the feedforward indicates friction, which holds the motor
-        short of its place.
+        V: a voltage at rest that differs by this much from the feedforward indicates friction, which stops the motor
+        short of its reference.
     horizon : float
         s for which a setting is to hold: the gap may grow meanwhile as fast as the trend says.
     clock : callable
-        s, for the certificates' own times.
+        s, from which the certificates' computing times are taken.
     """
 
     servo: Servo
@@ -88,14 +88,14 @@ class CertifiedPolicy:
     def redesign(self, evidence: Evidence) -> Redesign:
         """Choose the verified setting for the evidence; without one the fallback set, and the reason.
 
-        Nothing is sent that may leave the fallback set's band, to which the edge holds the loop. Nor is anything
-        where the gap may be wider than the stated range: not even the fallback set is verified there.
-        Where the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
+        The setting must stay within the fallback set's band, since the edge falls back when the loop leaves it. Where
+        the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
+        the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
         return self.decide(evidence, self)
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
-        """Choose as `redesign` does, with another's verifications."""
+        """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
         if estimate is None:
             return Redesign(None, math.nan, evidence.unusable)
@@ -106,14 +106,15 @@ class CertifiedPolicy:
                 f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
             )
             return Redesign(None, math.nan, reason)
-        region = Region(gap, *self._input_bias(evidence), self._friction(evidence), _noise(evidence))
-        found = verifier.verify(region, evidence.setting)
-        if isinstance(found, NotVerified):
-            return _fallen_back(verifier.fallback(), region, found.reason)
-        if _in_force(found.setting, evidence):
-            return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=found)
-        sent = _sent(found, region.noise, estimate.gap, "")
-        return replace(sent, to_verify=region) if verifier.provisional else sent
+        feedforward, input_bias = self._input_bias(evidence)
+        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence))
+        result = verifier.verify(region, evidence.setting)
+        if isinstance(result, NotVerified):
+            return _fallback_redesign(verifier.fallback(), region, result.reason)
+        if _in_force(result.setting, evidence):
+            return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=result)
+        redesign = _redesign(result, region.noise, estimate.gap, "")
+        return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
         """Find the cheapest setting for a region, by simulation."""
@@ -128,7 +129,7 @@ class CertifiedPolicy:
         return confirm(self.servo, known, setting, self.demands_within_band(), self.trial, region.noise, self.clock)
 
     def demands_within_band(self) -> Demands:
-        """The demands, and the fallback set's band; a dead zone opens the loop inside of it only."""
+        """Demands with the fallback set's band as a bound; a dead zone must open the loop inside of that band."""
         certificate, leave = self.fallback(), max((leave for _, leave in self.demands.hysteresis), default=1.0)
         tolerance = min(self.demands.tolerance, band_of(certificate).error / leave)
         return replace(self.demands, tail=min(self.demands.tail, certificate.tail), tolerance=tolerance)
@@ -164,12 +165,13 @@ class CertifiedPolicy:
         if not math.isfinite(disturbance.bias_std):
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * disturbance.bias_std, self.bias_floor)
+        # Only a significant change: every new feedforward is an update at the edge.
         if abs(disturbance.bias + fed) > spread:
             fed = min(max(-disturbance.bias, -limit), limit)
         return fed, (disturbance.bias - spread, disturbance.bias + spread)
 
     def _friction(self, evidence: Evidence) -> Range:
-        """Range of friction torques (N m): those stated, and the torque that the last feedforward left at rest."""
+        """Range of friction torques (N m): as stated, widened to the torque that the last feedforward left at rest."""
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
@@ -185,7 +187,7 @@ def _noise(evidence: Evidence) -> float:
 
 
 def _in_force(setting: Design, evidence: Evidence) -> bool:
-    """True when the edge is known to run it already."""
+    """True when the edge runs the setting already, by its last report."""
     now, new = evidence.gains, setting.controller
     if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > _SAME_FEEDFORWARD:
         return False
@@ -197,7 +199,7 @@ def _in_force(setting: Design, evidence: Evidence) -> bool:
 def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
     """Band within which the loop stays once it has arrived, `noise` (m rms) included.
 
-    The simulated machines are a sample: arriving may take half as long again as the slowest of them took.
+    The simulated machines are a sample: the real one may need half as long again as the slowest of them.
     """
     error = max(certificate.within, certificate.tail) + noise
     effort = certificate.effort + abs(certificate.setting.controller.Kp) * (NEAR * certificate.step[1] + noise)
@@ -206,18 +208,18 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
 
 @lru_cache(maxsize=16)
 def _fallback(servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> Certificate:
-    found = certify(servo, uncertainty, demands, trial)
-    if isinstance(found, NotVerified):
-        raise InvalidInput(f"no fallback set for the servo's stated range: {found.reason}")
-    return found
+    result = certify(servo, uncertainty, demands, trial)
+    if isinstance(result, NotVerified):
+        raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}")
+    return result
 
 
-def _fallen_back(certificate: Certificate, region: Region, reason: str) -> Redesign:
+def _fallback_redesign(certificate: Certificate, region: Region, reason: str) -> Redesign:
     law = certificate.setting.controller.replace(feedforward=region.feedforward)
-    sent = replace(certificate, setting=replace(certificate.setting, controller=law))
-    return _sent(sent, region.noise, math.nan, f"{reason}; the fallback set is sent")
+    certificate = replace(certificate, setting=replace(certificate.setting, controller=law))
+    return _redesign(certificate, region.noise, math.nan, f"{reason}; the fallback set is sent")
 
 
-def _sent(certificate: Certificate, noise: float, gap: float, reason: str) -> Redesign:
-    """Redesign that carries a certificate."""
+def _redesign(certificate: Certificate, noise: float, gap: float, reason: str) -> Redesign:
+    """Redesign that sends a certificate's setting, with its band."""
     return Redesign(certificate.setting.setting(band_of(certificate, noise)), gap, reason, certificate)

@@ -23,7 +23,7 @@ _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 @settings("uncertainty")
 @dataclass(frozen=True)
 class Uncertainty:
-    """Ranges of a machine's parameters and conditions; within them nothing is known.
+    """Ranges of a machine's parameters and conditions; within them every value is possible.
 
     Raises
     ------
@@ -77,14 +77,14 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Region:
-    """Ranges of a machine's conditions that evidence leaves open.
+    """Ranges of a machine's conditions that the evidence allows.
 
     Attributes
     ----------
     gap : (float, float)
         rad, total.
     feedforward : float
-        V: a part of the setting.
+        V, part of the setting.
     input_bias, friction : (float, float)
         V, N m.
     noise : float
@@ -153,7 +153,7 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
 
 
 def drawn_plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
-    """The model and `count` - 1 others about it."""
+    """The model and `count` - 1 plants drawn about it."""
     widths = tuple(getattr(uncertainty, name) for name in _PARAMETERS)
     return _plants(servo, widths, count, seed)
 
@@ -175,6 +175,7 @@ def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """(count, dimensions) in 0 .. 1."""
+    # Sobol points are balanced in powers of two only: draw one and keep the first `count`.
     return np.asarray(qmc.Sobol(dimensions, seed=seed).random(2 ** math.ceil(math.log2(max(count, 1))))[:count])
 
 
