@@ -17,7 +17,7 @@ from benchmarks.novelty.loops import LoopCase, account, summary
 from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
@@ -117,7 +117,7 @@ def agent(rules: NoveltyRules | None, rate: float = 500.0) -> Agent:
 @pytest.mark.parametrize("block", [1, 7, 1000, 5000])
 def test_a_window_is_cut_and_judged_though_the_reference_never_changes(block: int) -> None:
     rules, count = NoveltyRules(look_s=2.0, period_s=5.0, patience=2), 5000
-    edge, sent = agent(rules), list[OutgoingMessage]()
+    edge, sent = agent(rules), list[ScheduledMessage]()
     for first in range(0, count, block):
         zeros = [0.0] * min(block, count - first)
         sent += edge.absorb_block(zeros, zeros, zeros, zeros)
@@ -127,7 +127,7 @@ def test_a_window_is_cut_and_judged_though_the_reference_never_changes(block: in
     assert edge.dropped[FILTERED] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
 
 
-def messages(sent: list[OutgoingMessage]) -> list[WindowMessage]:
+def messages(sent: list[ScheduledMessage]) -> list[WindowMessage]:
     return [each.message for each in sent if isinstance(each.message, WindowMessage)]
 
 
