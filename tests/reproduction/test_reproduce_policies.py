@@ -47,7 +47,7 @@ def test_only_the_policy_differs():
         assert {one.twin.method for one in scenarios} == {"whitened"}
         assert [one.twin.policy for one in scenarios] == [*policy_runs.POLICIES, "certified"]
         assert [one.twin.enabled for one in scenarios] == [True, True, True, True, False]
-        assert [one.window for one in scenarios] == [1.0, 1.0, 1.0, 2.0, 2.0]
+        assert [one.commissioning.window for one in scenarios] == [1.0, 1.0, 1.0, 2.0, 2.0]
 
 
 def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_does_not(outcomes):
