@@ -1,8 +1,8 @@
-"""A recorded log in place of a machine, in the role supervise: what twin and edge would have made of it.
+"""Replay of a recorded log in place of a machine, in the role supervise.
 
 The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, reference_m, theta_m_rad, voltage_v, and
-measured_position_m or position_m. Logs of other kinds become one by `servotwin convert LOG LOG.csv`, where numpy is.
-Parameters are taken and noted, and change nothing: the samples are what they were.
+measured_position_m or position_m. `servotwin convert LOG LOG.csv` converts logs of other kinds; it needs numpy.
+The replay accepts and records parameters, which change nothing: the samples are those of the log.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 
 COLUMNS = ("time_s", "reference_m", "theta_m_rad", ("measured_position_m", "position_m"), "voltage_v")
-"""What is read; of two names the first one that is there."""
+"""Columns that are read; of two names the first one in the file counts."""
 
-JITTER = 0.05
-"""Of a sample interval: how far rounded time stamps may be from a uniform grid."""
+_JITTER = 0.05
+"""Largest distance of a rounded time stamp from a uniform grid, in sample intervals."""
 
-NOTED = 1000
-"""Parameters that are remembered as written."""
+_MOST_WRITTEN = 1000
+"""Largest number of written parameters that are stored."""
 
 
 class Written(NamedTuple):
-    """Parameters that a log was given, and the sample from which they would have held."""
+    """Parameters written to a replay, and the sample from which they would have been in force."""
 
     number: int
     parameters: Parameters
 
 
 class Extent(NamedTuple):
-    """A log as a whole: samples, and Hz."""
+    """Extent of a log: number of samples, and their rate (Hz)."""
 
     samples: int
     rate: float
@@ -55,12 +55,11 @@ class Replay:
     speed : float
         Seconds of the log per second; 0: as fast as it is read.
     loop : bool
-        Begin again at the end. Between two rounds one number is left out, so that the reader knows that samples do not
-        follow one another there.
+        Begin again at the end. Between two rounds one sample number is left out, so that the reader sees the break.
     block_s : float
-        s of the log in one block where the reader does not say.
+        Length of a block where the reader gives none, s of the log.
     clock, sleep : callable
-        Monotonic seconds, and how to wait for some.
+        Returns monotonic seconds; waits for so many seconds.
     """
 
     can_move = False
@@ -81,30 +80,30 @@ class Replay:
         self._file: TextIO | None = None
         self._rows: Iterator[tuple[float, ...]] = iter(())
         self._number = self._version = 0
-        self.written: deque[Written] = deque(maxlen=NOTED)
+        self.written: deque[Written] = deque(maxlen=_MOST_WRITTEN)
 
     @property
     def rate(self) -> float:
-        """Hz."""
+        """Samples per second of the log, Hz."""
         return self._extent.rate
 
     @property
     def patient(self) -> bool:
-        """The log is read as fast as possible."""
+        """True where the log is read as fast as possible."""
         return self._speed == 0.0
 
     @property
     def machine(self) -> str:
-        """The log's name."""
+        """Name of the log."""
         return self._path.name
 
     def connect(self) -> None:
-        """Read the whole log once to see that it is one, then begin with its first sample.
+        """Check the whole log, then begin with its first sample.
 
         Raises
         ------
         InvalidInput
-            It is missing, damaged somewhere, lacks a column, or its times are not uniform.
+            The log is missing, has a damaged line, lacks a column, or its times are not uniform.
         """
         self.close()
         self._extent = extent(self._path)
@@ -112,7 +111,7 @@ class Replay:
         self._zero = self._clock() - (self._number / (self.rate * self._speed) if self._speed else 0.0)
 
     def read(self, most: int = 0) -> Block | None:
-        """The next samples, when the last of them is due."""
+        """Return the next samples, when the last of them is due; None: the log has ended."""
         if self._file is None:
             raise DriveLost(f"log {self._path}: not connected")
         rows = list(islice(self._rows, most or max(1, round(self._block_s * self.rate))))
@@ -128,15 +127,15 @@ class Replay:
         return Block(first, self._version, *(array("d", signal) for signal in list(zip(*rows, strict=True))[1:]))
 
     def write(self, parameters: Parameters) -> None:
-        """Note them; the log's samples carry their version from here on and are what they were."""
+        """Record the parameters; only the version of the samples changes from here on."""
         self._version = parameters.version
         self.written.append(Written(self._number, parameters))
 
     def move(self, _offset: float) -> None:
-        """Nothing: the past cannot be moved."""
+        """Do nothing: a recorded reference cannot be moved."""
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -148,12 +147,12 @@ class Replay:
 
 
 def opened(path: Path) -> TextIO:
-    """A log's file.
+    """Open a log.
 
     Raises
     ------
     InvalidInput
-        It cannot be read, or is of another kind.
+        The file cannot be read, or is not a .csv.
     """
     if path.suffix != ".csv":
         made = f"servotwin convert {path} {path.with_suffix('.csv')}"
@@ -165,25 +164,25 @@ def opened(path: Path) -> TextIO:
 
 
 def extent(path: Path) -> Extent:
-    """Return the number of samples of a log and their rate, after a check of every one."""
+    """Check every sample of a log, and return their number and rate."""
     with opened(path) as file:
         times = array("d", (row[0] for row in rows(path, file)))
     if len(times) < 2:
         raise InvalidInput(f"log {path}: has {len(times)} samples; at least 2 are needed")
     interval = (times[-1] - times[0]) / (len(times) - 1)
     for index, at in enumerate(times):
-        if not abs(at - (times[0] + index * interval)) < JITTER * interval:
+        if not abs(at - (times[0] + index * interval)) < _JITTER * interval:
             raise InvalidInput(f"log {path}: time_s = {at!r} s at sample {index}: must be increasing, uniformly spaced")
     return Extent(len(times), float(f"{1.0 / interval:.9g}"))
 
 
 def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
-    """(time, reference, theta_m, position, voltage) of each line.
+    """Yield (time, reference, theta_m, position, voltage) of each line: s, m, rad, m, V.
 
     Raises
     ------
     InvalidInput
-        A column is missing, or a line is no row of finite numbers.
+        A column is missing, or a line does not hold finite numbers.
     """
     try:
         line, number = file.readline(), 1
@@ -199,12 +198,12 @@ def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
 def _places(path: Path, names: list[str]) -> list[int]:
     """Indices of the columns."""
     places = []
-    for wanted in COLUMNS:
-        allowed = (wanted,) if isinstance(wanted, str) else wanted
-        found = next((name for name in allowed if name in names), None)
-        if found is None:
+    for column in COLUMNS:
+        allowed = (column,) if isinstance(column, str) else column
+        present = next((name for name in allowed if name in names), None)
+        if present is None:
             raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
-        places.append(names.index(found))
+        places.append(names.index(present))
     return places
 
 

@@ -1,4 +1,4 @@
-"""The table [drive] of an edge's file: which drive, and what it is told. Each kind is imported when it is asked for."""
+"""The table [drive] of an edge's file: the drive's kind and options. Each kind is imported when it is used."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _SILENCE = "Time without an answer, or a new sample, after which the drive count
 
 
 def control_drive(table: Table, folder: Path) -> ControlDrive:
-    """A drive whose voltage the edge sets; not connected yet. Paths are relative to `folder`.
+    """Make a drive whose voltage the edge sets; it is not connected yet. Paths are relative to `folder`.
 
     Raises
     ------
     InvalidInput
-        A key is unknown, missing or not allowed, or the kind has no such role.
+        A key is unknown, missing or not allowed, or drives of this kind do not have the role control.
     """
     return _read(table, folder, CONTROLLED)
 
 
 def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
-    """The same of a drive with its own controller."""
+    """Make a drive with its own controller; see `control_drive`."""
     return _read(table, folder, SUPERVISED)
 
 
@@ -115,7 +115,7 @@ def _opcua(
 
 
 def _socket(address: str, folder: Path) -> str:
-    """The machine's address; the path of a socket is relative to the file."""
+    """Resolve the path of a machine's socket relative to the file."""
     kind, _, path = address.partition(":")
     return f"unix:{folder / path}" if kind == "unix" and path else address
 

@@ -1,6 +1,6 @@
 """Hook of an optional window filter, which chooses the cut windows that are sent.
 
-The agent's settings carry a `WindowFilterSettings`. The edge's core names no implementation; `servotwin.novelty` is one.
+The agent's settings carry a `WindowFilterSettings`. The edge's core names no implementation.
 """
 
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""`python -m servotwin.edge_process edge.toml`: one servo's edge as a process; it needs no numbers library."""
+"""`python -m servotwin.edge_process edge.toml`: one servo's edge as a process; it needs neither numpy nor numba."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from servotwin.errors import InvalidInput
 
 
 def main(arguments: list[str]) -> int:
-    """Run until the drive's run is over or a signal comes; 2: something in the configuration is not allowed."""
+    """Run until the drive's run is over or a signal comes; return the exit code, 2 for an invalid configuration."""
     if len(arguments) != 1:
         print("usage: python -m servotwin.edge_process edge.toml", file=sys.stderr)
         return 2

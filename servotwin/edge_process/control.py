@@ -11,16 +11,16 @@ from servotwin.edge_process.edge import EdgeRuntime
 
 
 class GuardedLaw:
-    """The law in force and its state, safe against samples that are not finite.
+    """The law in force and its state, guarded against samples that are not finite.
 
-    The last voltage is held for a while, then the safe one is applied; with the first good sample after that the law
+    It holds the last voltage for a while, then applies the safe one; with the first good sample after that the law
     begins anew, as after a start. A law whose state is not finite begins anew at once.
 
     Parameters
     ----------
     law : LawParameters
     hold : int
-        Bad samples in a row through which the last voltage is held.
+        Number of bad samples in a row during which the last voltage is held.
     safe : float
         V.
     """
@@ -62,7 +62,7 @@ class ControlRole:
     ----------
     edge : EdgeRuntime
     drive : ControlDrive
-        Connected by whoever runs this.
+        The caller connects it.
     """
 
     def __init__(self, edge: EdgeRuntime, drive: ControlDrive) -> None:
@@ -91,7 +91,7 @@ class ControlRole:
         return True
 
     def lost(self) -> None:
-        """Note that the drive is away: its state meanwhile is not known."""
+        """Note that the drive is lost; the law begins anew, since the machine's motion meanwhile is not known."""
         self.law.state, self._drive_lost = None, True
 
     def stop(self) -> None:
@@ -102,7 +102,7 @@ class ControlRole:
     def _tick(self, sample: DriveSample) -> None:
         edge, agent = self._edge, self._edge.agent
         if isfinite(sample.reference):
-            self._reference = sample.reference  # where there is none, the last one holds
+            self._reference = sample.reference  # the last one holds where this one is bad
         reference = self._reference + agent.offset
         if agent.parameters is not self._applied and isfinite(sample.position):
             self._apply(agent.parameters, reference, sample.position)
@@ -113,7 +113,7 @@ class ControlRole:
         edge.send(agent.absorb(reference, sample.theta_m, sample.position, voltage))
 
     def _jumped(self, number: int) -> None:
-        """Go on where samples are missing, in which the voltage was held, or are counted from 0 again."""
+        """Continue after missing samples, during which the voltage was held, or where the count began anew."""
         if self._edge.due is None:
             return
         same = self._drive.machine == self._machine
@@ -123,7 +123,7 @@ class ControlRole:
             self._edge.skip(missing, self._reference + self._edge.agent.offset, self.law.voltage)
 
     def _apply(self, parameters: Parameters, reference: float, position: float) -> None:
-        """Run on these parameters; after a new boot they may be those that the law has already."""
+        """Change the law to these parameters, unless it has them already, as after a new boot."""
         self._applied, law = parameters, self._law(parameters)
         if law != self.law.law:
             self.law.change(law, reference, position)

@@ -20,20 +20,20 @@ from servotwin.edge_process.outlet import PipeOutlet
 
 Clock = Callable[[], float]
 CHECK_PERIOD_S, STATUS_PERIOD_S, PAUSE_S = 0.1, 1.0, 0.005
-LONGEST_WAIT_FOR_LINK_S = 1.0
-LONGEST_GAP_S = 1.0
+_LONGEST_WAIT_FOR_LINK_S = 1.0
+_LONGEST_GAP_S = 1.0
 """Time without samples after which a new boot begins."""
 
 
-class LinkProcessChild(Protocol):
-    """The process that takes what the outlet sends."""
+class _LinkProcessChild(Protocol):
+    """The link process, seen from the control process."""
 
     def check(self, now: float) -> None:
         """Restart it where it has ended."""
 
 
-class LinkParameterStore:
-    """Parameter store of an agent whose disk belongs to the link process."""
+class _LinkParameterStore:
+    """Parameter store of an agent that leaves the disk to the link process."""
 
     def __init__(self, first: Parameters | None, outlet: PipeOutlet) -> None:
         self._first, self._outlet = first, outlet
@@ -54,13 +54,13 @@ class EdgeRuntime:
     ----------
     config : EdgeConfig
     boot : str
-        This start's name; where samples are missing a boot begins within it, named after it.
+        Name of this start; a boot that begins within it, after missing samples, is named after it.
     outlet : PipeOutlet
-    child : LinkProcessChild
+    child : LinkChild
     first : Parameters, optional
-        Stored by an earlier start.
+        Parameters stored by an earlier start.
     clock, pause : callable
-        Monotonic, s; wait for so long, s.
+        Returns monotonic seconds; waits for so many seconds.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class EdgeRuntime:
         config: EdgeConfig,
         boot: str,
         outlet: PipeOutlet,
-        child: LinkProcessChild,
+        child: _LinkProcessChild,
         first: Parameters | None,
         clock: Clock,
         pause: Callable[[float], None],
@@ -87,22 +87,22 @@ class EdgeRuntime:
         self._check_due = self._status_due = clock()
         self.agent = self._new_agent(first)
 
-    def skip(self, missing: int, wanted: float, voltage: float) -> None:
-        """Go on at other samples than those due; a few that are missing cost the windows that they were in.
+    def skip(self, missing: int, reference: float, voltage: float) -> None:
+        """Continue after missing samples: a few cost the windows that they were in, more begin a new boot.
 
         Parameters
         ----------
         missing : int
-            Samples; negative: they are counted from 0 again.
-        wanted, voltage : float
-            Reference and voltage meanwhile, m and V, as far as known.
+            Number of missing samples; negative: the count began anew.
+        reference, voltage : float
+            Reference and voltage meanwhile, m and V; NaN where not known.
         """
-        if not 0 < missing <= LONGEST_GAP_S * self.config.agent.sample_rate:
+        if not 0 < missing <= _LONGEST_GAP_S * self.config.agent.sample_rate:
             self._new_boot("samples missing" if missing > 0 else "machine counts anew")
             return
         self.counts["samples missed"] += missing
         unknown = array("d", [nan]) * missing
-        references, voltages = array("d", [wanted]) * missing, array("d", [voltage]) * missing
+        references, voltages = array("d", [reference]) * missing, array("d", [voltage]) * missing
         self.send(self.agent.absorb_block(references, unknown, unknown, voltages))
 
     def _new_boot(self, why: str) -> None:
@@ -112,7 +112,7 @@ class EdgeRuntime:
         self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters())
 
     def exchange(self) -> None:
-        """Exchange a piece with the link process, and give the agent what has come."""
+        """Exchange a piece with the link process, and give the agent the messages that have arrived."""
         received = self._outlet.exchange()
         if received is None:
             return
@@ -123,9 +123,9 @@ class EdgeRuntime:
         if received.reconnected:
             self._outlet.send_letter(self.agent.hello())
 
-    def send(self, letters: list[ScheduledMessage]) -> None:
-        """Send the agent's letters."""
-        for each in letters:
+    def send(self, messages: list[ScheduledMessage]) -> None:
+        """Send the agent's messages to the twin."""
+        for each in messages:
             self._outlet.send_letter(each.message)
 
     def supervise(self) -> None:
@@ -140,15 +140,21 @@ class EdgeRuntime:
             self._outlet.send_status(self._status())
 
     def wait_for_link(self) -> None:
-        """Wait while the link process is far behind, a second at most; for a drive whose samples wait."""
-        end = self.clock() + LONGEST_WAIT_FOR_LINK_S
+        """Wait while the link process is far behind, a second at most; only for a drive whose samples wait."""
+        end = self.clock() + _LONGEST_WAIT_FOR_LINK_S
         while self._outlet.congested and self.clock() < end:
             self.exchange()
             self.supervise()
             self.pause(PAUSE_S)
 
     def finish(self, seconds: float) -> None:
-        """Wait until the link process has taken what is left, while it takes any, and send it a last status."""
+        """Wait until the link process has taken all windows, and send it a last status.
+
+        Parameters
+        ----------
+        seconds : float
+            Time after which this gives up where the link process takes no further window.
+        """
         end, status_sent, left = self.clock() + seconds, False, self._outlet.untaken
         while self.clock() < end and not (status_sent and self._outlet.idle):
             if self._outlet.untaken < left:
@@ -164,7 +170,7 @@ class EdgeRuntime:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
         self._outlet.boot = boot
         settings = replace(self.config.agent, boot=boot)
-        agent = Agent(settings, store=LinkParameterStore(first, self._outlet), outlet=self._outlet)
+        agent = Agent(settings, store=_LinkParameterStore(first, self._outlet), outlet=self._outlet)
         self._outlet.send_letter(agent.hello())
         log("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
         return agent
@@ -186,7 +192,7 @@ class EdgeRuntime:
 
 
 def _gains(law: Controller | None) -> dict[str, Value]:
-    """Gains of the controller in force, as far as they are known here."""
+    """Gains of the controller in force, for the status; empty where the drive's own controller is not known."""
     if law is None:
         return {}
     return {

@@ -1,6 +1,6 @@
-"""The link process's side of the frames: windows and letters go into the outbox, parameters into their file, once each.
+"""The link process's side of the frames: it puts windows and letters into the outbox, parameters into their file.
 
-A frame is confirmed when the disk has what it brought, or when there is nothing to keep.
+A frame is confirmed when its content is on the disk, or when nothing of it has to be stored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LAST_CUT = "last cut"
 
 
 class _Unconfirmed(NamedTuple):
-    """A frame whose content the disk does not have yet: a window's key (None: a letter), and its bytes."""
+    """A frame whose content is not on the disk yet: the key of its window (None: a letter), and its bytes."""
 
     window: Key | None
     size: int
@@ -49,7 +49,7 @@ class FrameHandler:
         self.faults: Counter[str] = Counter()
 
     def handle(self, frame: ToLink) -> list[int]:
-        """Do what a frame asks for."""
+        """Handle one frame; return the serials confirmed by it."""
         if isinstance(frame, WindowFrame):
             with self._outbox.transaction():
                 self._write(frame)
@@ -69,12 +69,12 @@ class FrameHandler:
         return []
 
     def retry(self) -> list[int]:
-        """Try again what could not be written."""
+        """Write again what could not be written; return the serials confirmed by it."""
         self._outbox.flush()
         return self._confirmed() + self._save()
 
     def _confirmed(self) -> list[int]:
-        """Serials that the control process need not keep: on the disk, dropped, or too much to keep unwritten."""
+        """Serials of frames that are on the disk, were dropped, or are beyond the limit of unwritten bytes."""
         flushed, pending = self._outbox.flushed, set(self._outbox.pending())
         over = sum(each.size for each in self._unconfirmed.values()) - MOST_UNWRITTEN
         confirmed = []
@@ -87,7 +87,7 @@ class FrameHandler:
         return confirmed
 
     def _write(self, frame: WindowFrame) -> None:
-        """Write a window once: one that comes again, unconfirmed, is known by its sequence in its boot."""
+        """Write a window once: a repeated one is recognised by its sequence in its boot."""
         last = self._outbox.value(_LAST_CUT)
         boot, sequence = ("", -1) if last is None else msgspec.msgpack.decode(last, type=tuple[str, int])
         if boot == frame.boot and frame.sequence <= sequence:

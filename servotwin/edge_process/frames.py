@@ -1,7 +1,7 @@
 """Frames between the control process and the link process.
 
-A frame that must not be lost carries a serial. The control process keeps it until the link process has its content on
-disk (`AckFrame`), so that either may be killed at any time.
+A frame that must not be lost carries a serial. The control process stores it until the link process has its content on
+disk and sends an `AckFrame`; so either process may be killed at any time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Value = float | int | str | bool | None
 
 
 class WindowFrame(Struct, frozen=True, array_like=True, tag="window"):
-    """A cut window, raw: doubles as this machine has them."""
+    """A cut window, raw: doubles in this machine's byte order."""
 
     serial: int
     boot: str
@@ -56,7 +56,7 @@ class LetterFrame(Struct, frozen=True, array_like=True, tag="letter"):
 
 
 class SaveFrame(Struct, frozen=True, array_like=True, tag="save"):
-    """Parameters that kept their band at the machine, to be stored on disk."""
+    """Parameters under which the loop kept its band, to be stored on disk."""
 
     serial: int
     parameters: StoredParameters
@@ -92,7 +92,7 @@ class MessageFrame(Struct, frozen=True, array_like=True, tag="message"):
 
 
 class PendingFrame(Struct, frozen=True, array_like=True, tag="pending"):
-    """Number of windows that wait for the twin's acknowledgement, and of those dropped, by reason."""
+    """Number of windows that wait for the twin's acknowledgement, and numbers of windows dropped, by reason."""
 
     pending: int
     dropped: dict[str, int]

@@ -1,4 +1,4 @@
-"""The link process as the control process sees it: started, and restarted when it has ended."""
+"""The link process as a child of the control process, which starts it, and restarts it when it has ended."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LinkChild:
     Parameters
     ----------
     start : callable
-        Starts a process that speaks over a socket.
+        Starts a process that communicates over a socket.
     outlet : PipeOutlet
     """
 
@@ -46,11 +46,11 @@ class LinkChild:
 
     @property
     def pid(self) -> int | None:
-        """Its process id."""
+        """Process id; None: it does not run."""
         return None if self._process is None else self._process.pid
 
     def check(self, now: float) -> None:
-        """Start it where it is due; note where it has ended. Costs microseconds while it runs."""
+        """Start it where a start is due; detect that it has ended. Costs microseconds while it runs."""
         if self._process is None:
             if now >= self._due:
                 self._launch(now)
@@ -65,7 +65,7 @@ class LinkChild:
         self._ended(now)
 
     def close(self) -> None:
-        """Let it finish what it has, and wait for its end."""
+        """Close the connection, so that it finishes its work, and wait for its end."""
         self._outlet.disconnect()
         if self._process is not None:
             self._process.wait(_END_S)
@@ -87,7 +87,7 @@ class LinkChild:
         self._outlet.connect(FrameSocket(ours))
 
     def _ended(self, now: float) -> None:
-        """Restart one that ran for a while at once, one that keeps ending later and later."""
+        """Schedule the restart: soon after a run of some time, later and later where it keeps ending."""
         self._outlet.disconnect()
         self._process = None
         if now - self._started > 10.0:

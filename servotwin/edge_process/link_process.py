@@ -1,4 +1,4 @@
-"""The link process: filters, packs, stores, sends and receives, so that the control process waits for none of it.
+"""The link process: it filters, packs, stores, sends and receives, so that the control process never waits.
 
 `python -m servotwin.edge_process.link_process edge.toml FD`; it ends when the other end of the socket FD is closed.
 """
@@ -32,10 +32,10 @@ from servotwin.link.transport import Transport
 from servotwin.messages import Acknowledge, InvalidMessage, encode
 from servotwin.runtime.frames import FrameSocket
 
-NICE = 10
+_NICE = 10
 STATUS_PERIOD_S = 1.0
-SHORTEST_POLL_S = 0.1
-"""Time between two polls that bring nothing: a twin that is about to end does not wait with its answer."""
+_SHORTEST_POLL_S = 0.1
+"""Time between two empty polls: a twin that is about to end answers a poll at once."""
 
 
 class LinkProcess:
@@ -55,7 +55,7 @@ class LinkProcess:
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = _token(config), False
-        self._transport = transport_of(config)
+        self._transport = _transport(config)
         self._session = Session(self.outbox, config.agent.retry, random.random)
         self._sender = self._receiver = None
         if self._transport is not None:
@@ -86,7 +86,7 @@ class LinkProcess:
             raise self._broken[0]
 
     def _guarded(self, loop: Callable[[], None]) -> None:
-        """Run a thread's loop; an error ends the process, and the control process starts another."""
+        """Run a thread's loop; an error in it ends the process, and the control process starts another."""
         try:
             loop()
         except BaseException as error:
@@ -146,7 +146,7 @@ class LinkProcess:
             log("token replaced")
 
     def _log_troubles(self) -> None:
-        """Log what has gone wrong since, and what is well again."""
+        """Log new troubles, and those that are over."""
         if self._stopping.is_set():
             return
         self._troubles.update("disk", "" if self.outbox.flushed else self.outbox.trouble)
@@ -159,7 +159,8 @@ class LinkProcess:
             log("windows dropped", **dropped)
 
     def _send_pending(self) -> None:
-        """Tell the control process how many windows are pending, when that has changed: before an acknowledgement."""
+        """Send the number of pending windows to the control process where it has changed."""
+        # Before the acknowledgement: with the old number the agent would think that the twin still has to answer.
         now = len(self.outbox.pending()), Counter(self.outbox.dropped)
         if now != self._pending:
             self._pending = now
@@ -184,13 +185,13 @@ class LinkProcess:
             received = self._receiver.step()
             for serial, body in received.messages:
                 self._emit(frames.encode(frames.MessageFrame(serial, body)))
-            self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, SHORTEST_POLL_S))
+            self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, _SHORTEST_POLL_S))
 
     def _emit(self, frame: bytes) -> None:
         """Have the main thread send a frame; called from another."""
         if frame:
             self._outgoing.append(frame)
-        with suppress(BlockingIOError):  # as many as fit are enough to wake it
+        with suppress(BlockingIOError):  # a full socket wakes the main thread too
             self._wake.send(b"w")
 
     def _end_all(self, threads: list[Thread]) -> None:
@@ -229,8 +230,8 @@ class LinkProcess:
         return {**status, "link_process": os.getpid(), "written": time.time()}
 
 
-def transport_of(config: EdgeConfig) -> Transport | None:
-    """Make the transport that a configuration asks for; None: there is no twin."""
+def _transport(config: EdgeConfig) -> Transport | None:
+    """Make the transport of a configuration; None: there is no twin."""
     twin = config.twin
     if twin is None:
         return None
@@ -253,7 +254,7 @@ def _mqtt(config: EdgeConfig, twin: TwinLink, token: str, ca_file: str | None) -
 
 
 _TRANSPORTS: dict[str, Callable[[EdgeConfig, TwinLink, str, str | None], Transport]] = {"http": _http, "mqtt": _mqtt}
-"""Transports by name; each is imported when it is asked for."""
+"""Transports by name; each is imported when it is used."""
 
 
 def _token(config: EdgeConfig) -> str:
@@ -262,10 +263,10 @@ def _token(config: EdgeConfig) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Run as a child."""
+    """Run as the child of a control process; return the exit code."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    os.nice(NICE)
+    os.nice(_NICE)
     path, descriptor = arguments
     end = socket.socket(fileno=int(descriptor))
     try:

@@ -15,7 +15,7 @@ import msgspec
 
 from servotwin.runtime.files import replace_file
 
-STATUS_SCHEMA = "servotwin-edge-status/1"
+_STATUS_SCHEMA = "servotwin-edge-status/1"
 BINS = 4096
 """Bins of one microsecond; a longer time counts in the last one."""
 
@@ -23,13 +23,13 @@ _TYPECODE = "Q"  # 64 bits on every machine: at 5 kHz 32 bits are full in ten da
 
 
 class TroubleLog:
-    """Logs what goes wrong with a part, once until it is another thing, and when it is over."""
+    """Logs the trouble of each part once, again when it changes, and when it is over."""
 
     def __init__(self) -> None:
         self._logged: dict[str, str] = {}
 
     def update(self, where: str, why: str) -> None:
-        """Log a change; `why` says what is wrong with a part now, empty: nothing."""
+        """Log a change; `why` is the present trouble of a part, empty: there is none."""
         if why != self._logged.get(where, ""):
             self._logged[where] = why
             if why:
@@ -39,7 +39,7 @@ class TroubleLog:
 
 
 def log(event: str, **values: Any) -> None:
-    """Write one JSON line to the standard error; where that is gone, or nobody reads it, the line is lost."""
+    """Write one JSON line to the standard error; the line is lost where that is closed or nobody reads it."""
     line = {"time": round(time.time(), 3), "event": event, **values}
     stream: TextIO | None = sys.stderr
     try:
@@ -51,26 +51,27 @@ def log(event: str, **values: Any) -> None:
 
 
 def _is_writable(stream: TextIO) -> bool:
-    """True where writing would not wait: a pipe whose reader stands still is full one day."""
+    """True where writing would not block; a pipe whose reader has stopped is full one day."""
     try:
         descriptor = stream.fileno()
     except (OSError, ValueError):
-        return True  # nothing of the system's is behind it
+        return True  # not a file of the system (a test's StringIO): writing does not block
     return bool(select.select([], [descriptor], [], 0.0)[1])
 
 
 def write_status(path: Path, status: Mapping[str, Any]) -> None:
-    """Replace the status file; raises OSError. A status is old in a second: it is not flushed to the disk."""
-    replace_file(path, msgspec.json.format(msgspec.json.encode({"schema": STATUS_SCHEMA, **status})) + b"\n")
+    """Replace the status file; raises OSError."""
+    # Not durable: a status is outdated in a second, and a flush to a slow disk may take as long.
+    replace_file(path, msgspec.json.format(msgspec.json.encode({"schema": _STATUS_SCHEMA, **status})) + b"\n")
 
 
 def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Read the last status; None: there is none, or the file is no status."""
+    """Read the last status; None: there is no file, or it does not hold a status."""
     try:
         status = msgspec.json.decode(Path(path).read_bytes())
     except (OSError, msgspec.MsgspecError):
         return None
-    return status if isinstance(status, dict) and status.get("schema") == STATUS_SCHEMA else None
+    return status if isinstance(status, dict) and status.get("schema") == _STATUS_SCHEMA else None
 
 
 class TickHistogram:

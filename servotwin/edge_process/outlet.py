@@ -1,5 +1,6 @@
-"""Outlet of the control process: windows, letters and parameters go to the link process, and are kept until it has
-acknowledged them; no call waits for anything.
+"""Outlet of the control process: it sends windows, letters and parameters to the link process; no call blocks.
+
+It stores each frame until the link process has acknowledged it.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
 MOST = 64_000_000
-"""Bytes that are kept for a link process that does not acknowledge them."""
+"""Bytes stored for a link process that does not acknowledge them; the oldest frames are dropped first."""
 
 
 class ReceivedFrames:
-    """Frames of the link process, as the agent needs them.
+    """Content of the frames received in one exchange, for the agent.
 
     Attributes
     ----------
     messages : list of Message
-        From the twin.
+        Messages from the twin.
     pending_changed : bool
-        The number of windows that wait for the twin's acknowledgement may have changed.
+        True where the number of windows that wait for the twin's acknowledgement may have changed.
     reconnected : bool
-        The twin is reached again: the agent says hello.
+        True where the twin is reached again: the agent sends a hello.
     """
 
     def __init__(self) -> None:
@@ -39,12 +40,12 @@ class ReceivedFrames:
 
 
 class PipeOutlet:
-    """Implements `edge.outlet.Outlet`; speaks to one link process after the other.
+    """`edge.outlet.Outlet` that sends to a link process, and after its end to the next one.
 
     Parameters
     ----------
     has_twin : bool
-        False: nobody owes acknowledgements.
+        False: no acknowledgements are expected.
     """
 
     next_time: float | None = None
@@ -64,41 +65,41 @@ class PipeOutlet:
 
     @property
     def unacknowledged(self) -> bool:
-        """The twin owes the acknowledgement of a window."""
+        """True where a window waits for the twin's acknowledgement."""
         return self._has_twin and (self._pending > 0 or bool(self._windows))
 
     @property
     def dropped(self) -> Counter[str]:
-        """Windows that will never be sent without having been acknowledged, by reason, of all boots."""
+        """Number of windows dropped without an acknowledgement in all boots, by reason."""
         return self._lost + Counter(self._dropped)
 
     @property
     def lost(self) -> Counter[str]:
-        """Those of them that no link process has taken."""
+        """Number of frames dropped here because no link process has taken them, by reason."""
         return self._lost
 
     @property
     def connected(self) -> bool:
-        """A link process is there."""
+        """True where a link process is connected."""
         return self._pipe is not None and not self._pipe.broken
 
     @property
     def idle(self) -> bool:
-        """The link process has acknowledged everything."""
+        """True where the link process has acknowledged everything."""
         return not self._unacknowledged and (self._pipe is None or self._pipe.backlog == 0)
 
     @property
     def untaken(self) -> int:
-        """Number of windows that no link process is known to have on the disk."""
+        """Number of windows that no link process has acknowledged."""
         return len(self._windows)
 
     @property
     def congested(self) -> bool:
-        """The link process is so far behind that windows may have to be given up soon."""
+        """True where the link process is so far behind that windows may have to be dropped soon."""
         return self._size > MOST // 2
 
     def connect(self, pipe: FrameSocket) -> None:
-        """Use a new link process, and send it everything that the last one has not acknowledged."""
+        """Connect to a new link process, and send it everything that the last one has not acknowledged."""
         self.disconnect()
         self._pipe = pipe
         for frame in self._unacknowledged.values():
@@ -111,11 +112,11 @@ class PipeOutlet:
         self._pipe = None
 
     def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
-        """Take charge of a cut window."""
+        """Take over a cut window."""
         serial = self._send(frames.window_frame(cut, self.boot, self._next_serial()))
         self._windows.add(serial)
         while self._size > MOST:
-            self._give_up(next(iter(self._unacknowledged)))
+            self._drop(next(iter(self._unacknowledged)))
 
     def due(self, now: float) -> list[WindowMessage]:  # noqa: ARG002
         """Return nothing: the link process sends."""
@@ -130,7 +131,7 @@ class PipeOutlet:
         self._send(frames.LetterFrame(self._next_serial(), encode(message)))
 
     def save(self, parameters: Parameters) -> None:
-        """Have parameters stored on disk."""
+        """Have the link process store parameters on disk."""
         self._send(frames.SaveFrame(self._next_serial(), StoredParameters.of(parameters)))
 
     def send_status(self, frame: frames.StatusFrame) -> None:
@@ -169,7 +170,7 @@ class PipeOutlet:
         return received
 
     def _message(self, frame: MessageFrame, received: ReceivedFrames) -> None:
-        """Take a message of the twin's once, however often it is repeated."""
+        """Take a message of the twin's once, even where it is repeated."""
         if frame.serial == 0 or frame.serial > self._processed:
             received.messages.append(decode(frame.body))
         if frame.serial > 0:
@@ -193,8 +194,8 @@ class PipeOutlet:
         self._size -= len(self._unacknowledged.pop(serial, b""))
         self._windows.discard(serial)
 
-    def _give_up(self, serial: int) -> None:
-        """Drop a frame, and the link process with it: the next one gets what is left."""
+    def _drop(self, serial: int) -> None:
+        """Drop a frame, and the connection, whose backlog holds it too; the next link process gets the others."""
         if self._pipe is not None:
             self._pipe.broken = True
         self._lost[BEHIND if serial in self._windows else "letter: " + BEHIND] += 1

@@ -1,4 +1,4 @@
-"""Puts an edge together and runs it, until its drive is done or a signal comes."""
+"""Assembly and main loop of an edge, until its drive's run is over or a signal comes."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _RECONNECT_S, _PAUSE_S, _FINISH_S = 1.0, 0.02, 3.0
 
 
-class Role(Protocol):
-    """Control or supervise: samples of a drive, one step after the other."""
+class _Role(Protocol):
+    """Control or supervise: it handles the samples of a drive, step by step."""
 
     def step(self) -> bool:
         """Take the next samples; False: the run is over. Raises `DriveLost`."""
 
     def lost(self) -> None:
-        """Note that the drive is away."""
+        """Note that the drive is lost."""
 
     def stop(self) -> None:
         """Leave the drive in a safe state. Raises `DriveLost`."""
 
 
 class StopSignal:
-    """Signal handler; `requested` becomes true at a signal.
+    """Signal handler; `requested` becomes True at a signal.
 
-    Python's `signal` module waits for the end of a system call under way; a drive that is silent returns by itself.
+    The loop tests it between two steps: a drive's `read` resumes after the signal, and returns by its own time limit.
     """
 
     def __init__(self) -> None:
@@ -89,9 +89,9 @@ def _run(config: EdgeConfig, path: Path) -> None:
         log("end", windows_left_behind=outlet.untaken)
 
 
-def until(stop: StopSignal, edge: EdgeRuntime, drive: Drive, role_of: Callable[[], Role]) -> None:
+def until(stop: StopSignal, edge: EdgeRuntime, drive: Drive, role_of: Callable[[], _Role]) -> None:
     """Connect, run, and connect again where the drive was lost, until the run is over or a signal comes."""
-    role: Role | None = None
+    role: _Role | None = None
     troubles = TroubleLog()
     tame_garbage_collector()
     set_realtime_priority(edge.config.priority)
@@ -110,8 +110,8 @@ def until(stop: StopSignal, edge: EdgeRuntime, drive: Drive, role_of: Callable[[
                 role.lost()
 
 
-def run_role(stop: StopSignal, role: Role) -> None:
-    """Step until the run is over or a signal comes; whatever ends it, the drive is left in a safe state."""
+def run_role(stop: StopSignal, role: _Role) -> None:
+    """Step until the run is over or a signal comes; leave the drive in a safe state, also after an error."""
     step = role.step
     try:
         while not stop.requested:
@@ -127,7 +127,7 @@ def run_role(stop: StopSignal, role: Role) -> None:
 
 
 def _is_ignored(number: signal.Signals) -> bool:
-    """True where the edge is to outlive its terminal (nohup)."""
+    """True where the edge shall outlive its terminal (nohup)."""
     return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
@@ -139,7 +139,7 @@ def tame_garbage_collector() -> None:
 
 
 def set_realtime_priority(priority: int) -> bool:
-    """Let the scheduler run this process before others, but not those it starts; False where it does not."""
+    """Run this process, but not its children, under the real-time scheduler; False where that is not possible."""
     if priority == 0:
         return False
     try:
@@ -151,7 +151,7 @@ def set_realtime_priority(priority: int) -> bool:
 
 
 def _wait(stop: StopSignal, edge: EdgeRuntime) -> None:
-    """Wait before the next try to reach the drive; the link goes on."""
+    """Wait before the next try to connect to the drive; the link goes on."""
     end = edge.clock() + _RECONNECT_S
     while not stop.requested and edge.clock() < end:
         edge.exchange()
@@ -159,12 +159,12 @@ def _wait(stop: StopSignal, edge: EdgeRuntime) -> None:
         edge.pause(_PAUSE_S)
 
 
-def _role(edge: EdgeRuntime, drive: Any) -> Role:
+def _role(edge: EdgeRuntime, drive: Any) -> _Role:
     return ControlRole(edge, drive) if edge.config.role == "control" else SupervisingRole(edge, drive)
 
 
 def _connect(config: EdgeConfig, drive: Drive, known: bool) -> None:
-    """Reach the drive; one that was right before and is wrong now may be starting up: it counts as lost."""
+    """Connect to the drive; one that was right before and is wrong now counts as lost: it may be starting up."""
     try:
         drive.connect()
         _check_rate(config, drive)

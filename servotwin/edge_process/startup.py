@@ -20,12 +20,12 @@ from servotwin.runtime.locks import locked
 
 
 def check(config: EdgeConfig) -> None:
-    """Refuse what could never work; what may come back, such as a twin or a full disk, is not looked at.
+    """Check a configuration for faults that do not pass; a twin out of reach or a full disk is none.
 
     Raises
     ------
     InvalidInput
-        The token, the broker's password, the certificates or a library of the link are not there, or a folder is not.
+        The token, the broker's password, the certificates, a library of the link or a folder is missing.
     """
     for key in ("outbox", "parameters", "status", "boots"):
         name = getattr(config.keeping, key)
@@ -50,12 +50,12 @@ def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
 def exclusive(config: EdgeConfig) -> Iterator[None]:
     """Lock an edge's files for this process: two edges would give one machine two voltages.
 
-    Where the disk takes no lock the machine runs anyway.
+    The edge runs without a lock where the file system has none.
 
     Raises
     ------
     InvalidInput
-        Another process holds them.
+        Another process holds a lock.
     """
     with ExitStack() as locks:
         for name in dict.fromkeys((config.keeping.parameters, config.keeping.outbox)):
@@ -69,12 +69,12 @@ def exclusive(config: EdgeConfig) -> Iterator[None]:
 
 
 def next_boot(path: Path, random: bytes) -> str:
-    """Name this start: its number, and something random that makes it unique where the count is lost.
+    """Name this start by its number, and by random bytes that make it unique where the count is lost.
 
     Parameters
     ----------
     path : path
-        Holds the number of starts; it need not be readable or writable.
+        File with the number of starts; it need not be readable or writable.
     random : bytes
         8 bytes.
     """
@@ -93,7 +93,7 @@ def _count(path: Path) -> int:
 
 
 def stored_parameters(path: Path) -> Parameters | None:
-    """Load the parameters of an earlier start; a file that holds none is renamed, since the machine must run."""
+    """Load the parameters of an earlier start; a file that holds none is renamed, so that the machine can run."""
     try:
         return FileParameterStore(path).load()
     except InvalidInput as error:

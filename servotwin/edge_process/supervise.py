@@ -9,8 +9,8 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.monitoring import log
 
-LONGEST_BLOCK_S = 0.05
-"""Longest time that a message of the twin's waits for the drive's block."""
+_LONGEST_BLOCK_S = 0.05
+"""Length of a block, the longest time for which a message of the twin's waits for the drive."""
 
 
 class SupervisingRole:
@@ -20,12 +20,12 @@ class SupervisingRole:
     ----------
     edge : EdgeRuntime
     drive : SupervisedDrive
-        Connected by whoever runs this.
+        The caller connects it.
     """
 
     def __init__(self, edge: EdgeRuntime, drive: SupervisedDrive) -> None:
         self._edge, self._drive = edge, drive
-        self._most = max(1, round(LONGEST_BLOCK_S * edge.config.agent.sample_rate))
+        self._most = max(1, round(_LONGEST_BLOCK_S * edge.config.agent.sample_rate))
         self._machine = drive.machine
         self._written: Parameters | None = None
         self._accepted: Parameters | None = None
@@ -48,7 +48,7 @@ class SupervisingRole:
         return True
 
     def lost(self) -> None:
-        """Note that the drive is away: its parameters after that are not known."""
+        """Note that the drive is lost: its parameters after that are not known."""
         self._written, self._offset = None, 0.0
 
     def stop(self) -> None:
@@ -77,14 +77,14 @@ class SupervisingRole:
                 self._drive.write(agent.parameters)
                 self._accepted = agent.parameters
             except DriveRefused as refusal:
-                self._rejected(str(refusal))
+                self._restore(str(refusal))
             self._written = agent.parameters
         if agent.offset != self._offset:
             self._drive.move(agent.offset)
             self._offset = agent.offset
 
-    def _rejected(self, why: str) -> None:
-        """Restore the parameters that the drive accepted last, and tell the twin; at first none are known."""
+    def _restore(self, why: str) -> None:
+        """Restore the parameters that the drive accepted last, if any, and report that to the twin."""
         self._edge.counts["parameters refused by the drive"] += 1
         log("drive refused", version=self._edge.agent.parameters.version, why=why)
         if self._accepted is not None:

@@ -62,7 +62,7 @@ def test_known_multipliers_of_the_half_period():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_the_event_simulation_goes_there(share):
+def test_the_event_simulation_converges_to_the_orbit(share):
     servo, found = Servo.preset("paper"), orbit(share=share)
     duration = 40.0 if share == 0.0 else 300.0
     releases, position = simulated(servo, GAP, servo.tolerance_for(GAP, share), servo.controller, duration)
@@ -237,7 +237,7 @@ def test_saturation_counts():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"gap": -0.1}, "gap = -0.1 rad"),
         ({"gap": math.nan}, "gap = nan rad"),
@@ -247,6 +247,6 @@ def test_saturation_counts():
         ({"gap": GAP, "controller": Servo.preset().controller.replace(rate_limit=1.0)}, "rate_limit"),
     ],
 )
-def test_refusals(arguments, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_loops_without_a_limit_cycle_search_are_refused(arguments, message):
+    with pytest.raises(InvalidInput, match=message):
         limit_cycle(Servo.preset("paper"), **arguments)

@@ -113,7 +113,7 @@ def test_a_loop_filter_is_part_of_the_loop():
 
 
 @pytest.mark.parametrize(
-    ("changes", "gap", "said"),
+    ("changes", "gap", "message"),
     [
         ({"k_d": 1e7}, GAP, "k_d"),
         ({"voltage_limit": 5.0}, GAP, "voltage_limit = 5 V"),
@@ -121,6 +121,6 @@ def test_a_loop_filter_is_part_of_the_loop():
         ({}, 0.0, "gap = 0.0 rad"),
     ],
 )
-def test_refusals(changes, gap, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_loops_without_a_describing_function_are_refused(changes, gap, message):
+    with pytest.raises(InvalidInput, match=message):
         predictions(Servo.preset("paper").replace(**changes), gap)

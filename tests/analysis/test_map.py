@@ -151,7 +151,7 @@ def test_an_estimate_is_the_truth_where_none_is_given():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: RatioAxes((-1.0,), (1.0,)), "tolerance"),
         (lambda: RatioAxes((1.0,), (0.0,)), "amplitude"),
@@ -170,8 +170,8 @@ def test_an_estimate_is_the_truth_where_none_is_given():
         (lambda: MapSettings(PAPER, WORN, PAPER.controller.replace(Kp=-1.0)), "unstable"),
     ],
 )
-def test_what_cannot_be_mapped_is_refused(make, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_a_map_out_of_range_is_refused(make, message):
+    with pytest.raises(InvalidInput, match=message):
         make()
 
 

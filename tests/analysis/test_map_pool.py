@@ -11,7 +11,7 @@ def wait_and_return(task: int) -> int:
     return task
 
 
-def test_leaving_tasks_undone_warns_of_nothing():
+def test_closing_with_unfinished_tasks_gives_no_warning():
     """As Ctrl-C does: joblib's warning would stand before the message."""
     with workplace(workers=2), warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")

@@ -88,7 +88,7 @@ def test_a_proportional_controller_takes_the_margin_it_gets():
     st.sampled_from(["PI", "PIDF", "PDF"]),
 )
 @settings(max_examples=25)
-def test_what_is_returned_is_stable_and_what_is_wanted(crossover, margin_deg, kind):
+def test_the_returned_controller_is_stable_and_meets_its_specification(crossover, margin_deg, kind):
     try:
         found = tune(PAPER.plant(), Specification(crossover, math.radians(margin_deg), kind))
     except InvalidInput:
@@ -122,10 +122,10 @@ def test_a_double_zero_is_factored():
 
 
 @pytest.mark.parametrize(
-    ("law", "said"), [(Controller(1.0, 1.0, 1.0, 0.1), "complex"), (Controller(1.0, -1.0, 0.0, 0.1), "-10, 1 1/s")]
+    ("law", "message"), [(Controller(1.0, 1.0, 1.0, 0.1), "complex"), (Controller(1.0, -1.0, 0.0, 0.1), "-10, 1 1/s")]
 )
-def test_zeros_that_are_not_real_and_stable_have_no_factors(law, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_zeros_that_are_not_real_and_stable_have_no_factors(law, message):
+    with pytest.raises(InvalidInput, match=message):
         factored(law, 1.0)
 
 
@@ -182,7 +182,7 @@ def unstable() -> linear.LinearSystem:
 
 
 @pytest.mark.parametrize(
-    ("system", "wanted", "said"),
+    ("system", "wanted", "message"),
     [
         (unstable(), (1.0, 60.0, "PI"), "has a pole at 1"),
         (PAPER.plant(), (10.0, 60.0, "PD"), "cannot be had at 10 rad/s"),
@@ -190,8 +190,8 @@ def unstable() -> linear.LinearSystem:
         (FrequencyData([1.0, 2.0, 3.0, 4.0], [1.0, 0.5, 0.3, 0.2]), (9.0, 60.0, "PI"), "1 to 4 rad/s"),
     ],
 )
-def test_what_cannot_be_reached_is_said(system, wanted, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_an_unreachable_specification_is_refused_with_the_reason(system, wanted, message):
+    with pytest.raises(InvalidInput, match=message):
         tune(system, Specification(wanted[0], math.radians(wanted[1]), wanted[2]))
 
 
@@ -201,7 +201,7 @@ def test_an_unreachable_sensitivity_names_the_one_that_can_be_had():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"crossover": 0.0}, "crossover = 0.0 rad/s"),
         ({"phase_margin": math.pi}, "phase margin = 180 deg"),
@@ -210,8 +210,8 @@ def test_an_unreachable_sensitivity_names_the_one_that_can_be_had():
         ({"prefer": "Kd"}, "prefer = 'Kd'"),
     ],
 )
-def test_specifications_are_checked(changes, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_specifications_are_checked(changes, message):
+    with pytest.raises(InvalidInput, match=message):
         Specification(**({"crossover": 4.2, "phase_margin": 1.0} | changes))
 
 
@@ -234,7 +234,7 @@ def test_setpoint_weights_calm_the_step_and_leave_the_end():
 
 
 @pytest.mark.parametrize(
-    ("law", "weights", "said"),
+    ("law", "weights", "message"),
     [
         (PAPER.controller, (1.5, 1.0), "weight b = 1.5"),
         (PAPER.controller.replace(Ki=0.0), (0.5, 0.5), "integral action"),
@@ -242,8 +242,8 @@ def test_setpoint_weights_calm_the_step_and_leave_the_end():
         (Controller(1.0, 1.0, -1.0, 1.0), (0.5, 0.0), "only c = b"),
     ],
 )
-def test_weights_are_checked(law, weights, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_weights_are_checked(law, weights, message):
+    with pytest.raises(InvalidInput, match=message):
         prefilter(law, *weights)
 
 
@@ -251,11 +251,11 @@ def run(*arguments):
     return CliRunner().invoke(cli.app, ["tune", *map(str, arguments)])
 
 
-def test_the_command_tells_gains_and_every_crossover():
+def test_the_command_prints_gains_and_every_crossover():
     result = run(9.9996, 14.498)
     assert result.exit_code == 0
-    for said in ("tuned", "present", "4.6111", "24.8765 rad/s", "28.4648 rad/s", "overshoot"):
-        assert said in result.output
+    for message in ("tuned", "present", "4.6111", "24.8765 rad/s", "28.4648 rad/s", "overshoot"):
+        assert message in result.output
 
 
 def test_the_command_as_json():

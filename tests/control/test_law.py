@@ -141,7 +141,7 @@ def test_the_feedforward_is_added_at_all_times_and_the_limits_act_on_the_sum() -
     assert run(law, [2e-2] * 2000)[-1].voltage == 8.0
 
 
-def test_the_offset_is_let_go_with_the_release_time() -> None:
+def test_the_offset_fades_with_the_release_time() -> None:
     law = PAPER.replace(release_time=0.25).law(1e-3)
     states = run(law, [0.0] * 5000, start(0.0)._replace(offset=0.7))
     assert states[0].voltage == 0.7
@@ -183,13 +183,13 @@ def test_a_swap_to_the_same_law_changes_nothing() -> None:
     assert moved.offset == pytest.approx(0.3, abs=1e-13)
 
 
-def test_what_the_old_law_wanted_beyond_the_limit_is_forgotten() -> None:
+def test_voltage_of_the_old_law_beyond_its_limit_is_dropped() -> None:
     old, new = PAPER.replace(voltage_limit=4.0).law(), PAPER.replace(Kp=100.0, Ki=0.0, Kd=0.0, voltage_limit=4.0).law()
     moved = transfer(old, new, run(old, [0.1] * 10)[-1], 0.1, 0.0)
     assert moved.offset == pytest.approx(4.0 - 10.0, rel=1e-12)
 
 
-def test_without_integral_action_what_the_integral_held_is_let_go() -> None:
+def test_without_integral_action_the_integral_becomes_a_fading_offset() -> None:
     old, new = PAPER.law(), PAPER.replace(Ki=0.0, release_time=0.2).law()
     state = run(old, [1e-3] * 500)[-1]
     moved = transfer(old, new, state, 0.0, 0.0)
@@ -198,7 +198,7 @@ def test_without_integral_action_what_the_integral_held_is_let_go() -> None:
 
 
 @given(power=st.integers(-40, 40), seed=st.integers(0, 10))
-def test_homogeneous_bit_for_bit(power: int, seed: int) -> None:
+def test_the_law_is_homogeneous_bit_for_bit(power: int, seed: int) -> None:
     rng, scale = random.Random(seed), 2.0**power
     errors = [rng.uniform(-3e-3, 3e-3) for _ in range(50)]
     plain = run(PAPER.law(1e-3), errors)

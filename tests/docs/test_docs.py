@@ -11,7 +11,7 @@ import pytest
 
 import servotwin as st
 from servotwin.drives.simulated.settings import MachineSettings
-from servotwin.edge_process import config_file as gateway
+from servotwin.edge_process import config_file as edge_config_file
 from servotwin.reproduction.report import errata
 from servotwin.twin_service.twin_file import read_twin
 
@@ -22,7 +22,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`(servotwin(?:\.\w+)+)`")
 FILE = re.compile(r"`((?:servotwin|tests|docs)/[\w./-]+\.\w+)(?:::(\w+))?`")
 
-LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": gateway.load, "models": read_twin}
+LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": edge_config_file.load, "models": read_twin}
 """By a key that only files of this sort have; any other is a scenario."""
 
 

@@ -1,4 +1,4 @@
-"""The simulated drive: a process that is the simulation bit for bit, in both roles; and what its clients are told."""
+"""The simulated drive: a process that is the simulation bit for bit, in both roles; and its clients."""
 
 import signal
 import socket
@@ -111,7 +111,7 @@ def test_a_dead_zone_without_gains_is_set_as_it_is(tmp_path: Path) -> None:
     assert np.array_equal(joined(blocks)[3], whole(same).voltage[:-1])
 
 
-def test_what_is_no_controller_is_refused_and_nothing_changes(tmp_path: Path) -> None:
+def test_parameters_of_no_controller_are_refused_and_nothing_changes(tmp_path: Path) -> None:
     gains = Gains(1.0, 2.0, 3.0, 0.1)
     path = plant_file(tmp_path, "supervise", 4.0)
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
@@ -124,7 +124,7 @@ def test_what_is_no_controller_is_refused_and_nothing_changes(tmp_path: Path) ->
         assert drive.read(10).version == 0
 
 
-def test_a_killed_edge_finds_the_same_machine_where_it_has_got_to(tmp_path: Path) -> None:
+def test_a_killed_edge_reconnects_to_the_running_machine(tmp_path: Path) -> None:
     """In supervise nothing is missing either, as long as the machine keeps it."""
     path = plant_file(tmp_path, "supervise", speed=20.0, endless=True)
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
@@ -143,7 +143,7 @@ def test_a_killed_edge_finds_the_same_machine_where_it_has_got_to(tmp_path: Path
             assert another.read().first > first.last
 
 
-def test_a_paced_machine_runs_on_without_its_edge_and_is_met_again(tmp_path: Path) -> None:
+def test_a_paced_machine_runs_on_without_its_edge(tmp_path: Path) -> None:
     path = plant_file(tmp_path, "control", speed=5.0, endless=True)
     with machine(path) as (address, _), closing(SimulatedControl(address)) as drive:
         drive.connect()
@@ -186,7 +186,7 @@ def test_a_voltage_that_is_no_number_lets_the_last_one_hold(tmp_path: Path) -> N
     assert all(np.diff(positions) > 0.0)
 
 
-def test_roles_protocols_and_machines_that_are_not_there(tmp_path: Path) -> None:
+def test_wrong_roles_protocols_and_missing_machines_are_refused(tmp_path: Path) -> None:
     with machine(plant_file(tmp_path, "control", 1.0, listen="unix:here.sock")) as (address, process):
         assert address == f"unix:{tmp_path / 'here.sock'}"
         assert (tmp_path / "here.sock").stat().st_mode & 0o777 == 0o600
@@ -237,7 +237,7 @@ def test_without_its_edge_the_voltage_holds_until_the_watchdog_takes_it_away(tmp
     assert (alone.index, alone.over) == (201, False)
 
 
-def test_samples_wait_for_their_reader_and_not_for_ever(tmp_path: Path) -> None:
+def test_samples_wait_for_their_reader_for_a_limited_time(tmp_path: Path) -> None:
     plant = SupervisedPlant(MachineSettings.load(plant_file(tmp_path, "supervise", 1.0, keep_s=0.1)))
     for _ in range(19):
         plant.advance(250)
@@ -268,7 +268,7 @@ supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), 
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"role": "both"}, "role = 'both' is not allowed"),
         ({"listen": "0.0.0.0:7000"}, "machine address '0.0.0.0:7000' is not allowed"),
@@ -281,13 +281,11 @@ supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), 
         ({"watchdog": 1.0}, "unknown key 'watchdog' (did you mean 'watchdog_s'?)"),
     ],
 )
-def test_what_is_wrong_in_a_machines_file_is_said_in_one_sentence(
-    tmp_path: Path, changes: dict[str, Any], said: str
-) -> None:
+def test_an_error_in_a_machines_file_is_one_sentence(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     path = plant_file(tmp_path, **{"role": "control", **changes})
     with pytest.raises(InvalidInput) as error:
         MachineSettings.load(path)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert str(path) in str(error.value)
 
 

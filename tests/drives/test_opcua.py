@@ -47,9 +47,9 @@ def free_url() -> str:
 def server(folder: Path, **options: Any) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A running server: its URL and its process, killed in the end."""
     plant = plant_file(folder, "supervise", SIMULATED, endless=True, block_s=0.02)
-    told = {"plant": str(plant), "url": free_url(), **options}
+    arguments = {"plant": str(plant), "url": free_url(), **options}
     process = subprocess.Popen(
-        [sys.executable, str(SERVER), json.dumps(told)],
+        [sys.executable, str(SERVER), json.dumps(arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -58,7 +58,7 @@ def server(folder: Path, **options: Any) -> Iterator[tuple[str, subprocess.Popen
     assert process.stdout is not None
     try:
         assert process.stdout.readline().startswith("ready")
-        yield told["url"], process
+        yield arguments["url"], process
     finally:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -111,7 +111,7 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
     assert same(blocks, whole(simulation))
 
 
-def test_a_server_that_hangs_is_lost_and_found_without_a_hole(tmp_path: Path) -> None:
+def test_a_server_that_hangs_is_reconnected_without_missing_samples(tmp_path: Path) -> None:
     with server(tmp_path, ring=LONG) as (url, process), closing(drive_at(url, silence_s=1.0)) as drive:
         drive.connect()
         name, blocks = drive.machine, [drive.read()]
@@ -128,7 +128,7 @@ def test_a_server_that_hangs_is_lost_and_found_without_a_hole(tmp_path: Path) ->
         assert [block.first for block in blocks[1:]] == [block.last for block in blocks[:-1]]
 
 
-def test_a_server_that_began_anew_is_another_machine(tmp_path: Path) -> None:
+def test_a_restarted_server_is_another_machine(tmp_path: Path) -> None:
     url = free_url()
     with server(tmp_path, url=url), closing(drive_at(url, silence_s=1.0)) as drive:
         drive.connect()
@@ -142,7 +142,7 @@ def test_a_server_that_began_anew_is_another_machine(tmp_path: Path) -> None:
     assert first.last > 0
 
 
-def test_what_was_written_over_is_a_hole_and_never_old_samples(tmp_path: Path) -> None:
+def test_overwritten_samples_are_missing_and_never_old_ones(tmp_path: Path) -> None:
     with server(tmp_path, ring=500, speed=2.0) as (url, _), closing(drive_at(url)) as drive:
         drive.connect()
         blocks, holes = [drive.read()], 0
@@ -187,7 +187,7 @@ def test_servers_that_have_no_such_drive(tmp_path: Path) -> None:
             drive.connect()
 
 
-def test_without_asyncua_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_asyncua_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "asyncua", None)
     with pytest.raises(InvalidInput, match=r"pip install 'servotwin\[opcua\]'"):
         drive_at("opc.tcp://127.0.0.1:4840").connect()
@@ -197,7 +197,7 @@ URL = "opc.tcp://127.0.0.1:4840"
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [
         ({"url": "http://127.0.0.1"}, "url = 'http://127.0.0.1' is not allowed"),
         ({"url": "opc.tcp://user:word@127.0.0.1"}, "is not allowed"),
@@ -211,12 +211,12 @@ URL = "opc.tcp://127.0.0.1:4840"
         ({"url": URL, "poll_s": 0.0}, "poll_s = 0.0 is not allowed"),
     ],
 )
-def test_what_is_wrong_in_the_table_is_said(tmp_path: Path, values: dict[str, object], said: str) -> None:
+def test_an_error_in_the_drive_table_is_named(tmp_path: Path, values: dict[str, object], message: str) -> None:
     (tmp_path / "open.txt").write_text("secret")
     (tmp_path / "open.txt").chmod(0o644)
     with pytest.raises(InvalidInput) as error:
         supervised_drive(Table("edge.toml", {"kind": "opcua", **values}, "drive"), tmp_path)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert str(error.value).startswith("edge.toml")
 
 

@@ -20,7 +20,7 @@ def rings(written: int) -> tuple[list[float], ...]:
 
 
 @given(some.integers(0, 60), some.integers(0, 5), some.integers(0, MARGIN), some.integers(0, 70))
-def test_only_whole_samples_are_read(before: int, more: int, unannounced: int, first: int) -> None:
+def test_only_samples_not_overwritten_are_read(before: int, more: int, unannounced: int, first: int) -> None:
     """The arrays are read when up to `more` samples were counted since and up to a margin are being written."""
     after = before + more
     reading = RingReading(before, after, rings(after + unannounced))
@@ -46,7 +46,7 @@ def test_blocks_are_cut_where_versions_change(first: int, count: int, since: lis
             assert block.version == max((c.version for c in changes if c.since <= number), default=0)
 
 
-def test_what_is_no_reading_is_seen() -> None:
+def test_values_that_are_no_reading_are_detected() -> None:
     good = [[0.0, 1.0]] * 4
     assert is_valid(RingReading(1, 2, tuple(good)))
     for rings_ in ([None] * 4, [[1]] * 4, [[]] * 4, [*good[:3], [0.0]], [["a", "b"]] * 4):

@@ -1,4 +1,4 @@
-"""A log replayed: its samples as they are, at their pace, and what is wrong with it said before it begins."""
+"""A log replayed: its samples as they are, at their pace, and the errors in it that are raised before it begins."""
 
 from contextlib import closing
 from pathlib import Path
@@ -81,7 +81,7 @@ def test_a_loop_leaves_out_one_number_at_its_seam(log: Path) -> None:
     assert blocks[2].position == blocks[0].position
 
 
-def test_parameters_are_noted_and_change_nothing(log: Path) -> None:
+def test_parameters_are_recorded_and_change_nothing(log: Path) -> None:
     with closing(Replay(log, speed=0.0)) as drive:
         drive.connect()
         before, parameters = drive.read(10), Parameters(4, Setting(1e-4))
@@ -109,7 +109,7 @@ def test_an_npz_is_converted_first(log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (("theta_m_rad", "theta"), "column theta_m_rad is missing; it has time_s, position_m"),
         (("5.05,", "5.0512,"), r"time_s = 5\.0512 s at sample 50: must be increasing, uniformly spaced"),
@@ -118,26 +118,26 @@ def test_an_npz_is_converted_first(log: Path, tmp_path: Path) -> None:
         (("\n5.099,", "\n5.099;"), "line 102 must hold finite numbers"),
     ],
 )
-def test_what_is_wrong_is_said_before_it_begins(log: Path, change: tuple[str, str], said: str) -> None:
+def test_an_error_in_a_log_is_raised_before_the_replay_begins(log: Path, change: tuple[str, str], message: str) -> None:
     text = log.read_text()
     assert change[0] in text
     log.write_text(text.replace(*change))
     drive = Replay(log)
-    with pytest.raises(InvalidInput, match=said):
+    with pytest.raises(InvalidInput, match=message):
         drive.connect()
     with pytest.raises(DriveLost, match="not connected"):
         drive.read()
 
 
 @pytest.mark.parametrize("text", ["", "# {}\n", f"{HEAD}\n", f"{HEAD}\n0,1,2,3,4,5\n"])
-def test_a_log_without_samples_is_none(tmp_path: Path, text: str) -> None:
+def test_a_log_without_samples_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "short.csv"
     path.write_text(text)
     with pytest.raises(InvalidInput, match=r"is missing|at least 2 are needed"):
         Replay(path).connect()
 
 
-def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
+def test_a_log_that_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     with pytest.raises(InvalidInput, match="cannot be read"):
         Replay(path).connect()

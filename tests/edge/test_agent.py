@@ -156,7 +156,7 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
     assert windows(feed(agent, [3e-3] * 10))[0].parameter_version == 1
 
 
-def test_hello_tells_what_is_in_force() -> None:
+def test_a_hello_names_the_parameters_in_force() -> None:
     agent = Agent(settings(parameters=Parameters(7, Setting(2e-4))))
     feed(agent, [0.0] * 5)
     assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper")
@@ -178,7 +178,7 @@ def test_a_window_with_a_sample_that_is_not_finite_is_dropped_and_counted(bad: f
     assert windows(feed(agent, [2e-3] * 10))[0].sequence == 1
 
 
-def test_a_restart_sends_what_the_outbox_still_holds() -> None:
+def test_a_restart_sends_the_windows_in_the_outbox() -> None:
     outbox = MemoryOutbox()
     feed(Agent(settings(), outbox), [1e-3] * 10)
     agent = Agent(settings(boot="b1"), outbox)

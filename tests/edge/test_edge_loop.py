@@ -193,7 +193,7 @@ def check_bytes(loop: Loop) -> None:
 
 @settings(max_examples=1000, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES, st.booleans())
-def test_whatever_the_link_does(
+def test_windows_and_parameters_are_consistent_over_any_link(
     link: LinkSettings, seed: int, capacity: int, lifetime_s: float, careless: bool
 ) -> None:
     loop = Loop(link, seed, capacity, CarelessTwin(lifetime_s) if careless else StubTwin(lifetime_s))

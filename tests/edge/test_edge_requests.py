@@ -129,7 +129,7 @@ def test_a_law_that_ignores_the_offset_ends_the_move() -> None:
     assert agent.probe is None
 
 
-def test_without_permission_no_move() -> None:
+def test_a_probing_move_without_permission_is_refused() -> None:
     agent = Agent(settings(probe=None))
     feed(agent, [0.0] * 30)
     assert answer(agent, request()) == Answer("axis-1", "b0", 1, 30, RequestOutcome.NOT_ALLOWED, 1)
@@ -152,7 +152,7 @@ def test_without_permission_no_move() -> None:
         (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.TAKEN),
     ],
 )
-def test_what_is_refused_and_why(message: Request, outcome: RequestOutcome) -> None:
+def test_a_refused_request_has_its_reason(message: Request, outcome: RequestOutcome) -> None:
     agent = Agent(settings())
     feed(agent, [0.0] * 30)
     before = agent._requests
@@ -173,7 +173,7 @@ def test_a_request_counts_once_and_is_answered_again() -> None:
 
 
 @pytest.mark.parametrize("fed", [0, 3, 31, 35])
-def test_only_at_rest(fed: int) -> None:
+def test_a_probing_move_begins_only_at_rest(fed: int) -> None:
     """Before anything rested, and while a window is recorded."""
     agent = Agent(settings())
     feed(agent, ([0.0] * 30 + [1e-3] * 10)[:fed])

@@ -89,7 +89,7 @@ def test_a_repeated_update_gets_its_first_receipt_again() -> None:
     assert second == first
 
 
-def test_a_version_used_twice_is_no_repetition() -> None:
+def test_another_update_with_the_same_version_is_not_a_repeat() -> None:
     parameters, _ = decide(UPDATE, CURRENT, LIMITS, HERE)
     other = replace(UPDATE, window=("b0", 2), data_time=21.0, setting=Setting(1.1e-4))
     assert decide(other, parameters, LIMITS, HERE)[1].reason is Reason.OLD_VERSION

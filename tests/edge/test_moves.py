@@ -12,7 +12,7 @@ STEPS = st.lists(st.tuples(st.integers(0, 3), st.integers(-4, 12), VALUES, VALUE
 
 
 @given(STEPS)
-def test_it_is_the_extremes_of_the_moves_that_count(steps: list[tuple[int, int, float, float]]) -> None:
+def test_travel_is_the_distance_between_the_extremes_of_the_moves(steps: list[tuple[int, int, float, float]]) -> None:
     moves, every, sample = ReferenceMoves(), deque[tuple[int, float, float]](), 0
     for ahead, lasting, a, b in steps:
         sample += ahead

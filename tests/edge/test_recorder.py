@@ -12,7 +12,7 @@ from servotwin.errors import InvalidInput
 
 
 @given(st.integers(1, 9), st.lists(st.integers(0, 25), max_size=8), st.data())
-def test_any_kept_stretch_can_be_cut(capacity: int, blocks: list[int], data: st.DataObject) -> None:
+def test_any_samples_in_the_buffer_can_be_cut(capacity: int, blocks: list[int], data: st.DataObject) -> None:
     recorder, total = Recorder(("a", "b"), capacity), 0
     for count in blocks:
         values = array("d", range(total, total + count))
@@ -32,7 +32,7 @@ def test_any_kept_stretch_can_be_cut(capacity: int, blocks: list[int], data: st.
 
 
 @pytest.mark.parametrize(("first", "last"), [(2, 8), (6, 11), (6, 6), (-1, 2)])
-def test_what_is_not_kept_is_refused(first: int, last: int) -> None:
+def test_samples_outside_the_buffer_are_refused(first: int, last: int) -> None:
     recorder = Recorder(("a",), 5)
     recorder.extend(array("d", range(10)))
     with pytest.raises(InvalidInput, match="5 to 10 are in the recorder"):

@@ -63,7 +63,7 @@ def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -
         assert hostile.endured(seed, TwinFault.NONE, QUICK).worst < 1.0
 
 
-def test_a_lie_about_the_gap_alone_cannot_leave_the_band() -> None:
+def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
     """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be."""
     policy = CertifiedPolicy(hostile.model())
     candidates = candidates_of(policy.servo, policy.demands_within_band(), 0.0, disturbed=True, noisy=False)
@@ -91,7 +91,7 @@ def test_old_updates_are_refused_however_they_are_numbered() -> None:
     assert outcome.refused[Reason.OLD_VERSION] > 0
 
 
-def test_what_leaves_the_band_is_brought_back() -> None:
+def test_a_loop_that_leaves_the_band_is_brought_back() -> None:
     """Settings that nobody certified, in bounds and a little beyond: every loop recovers."""
     outcomes = [hostile.endured(seed, TwinFault.WANTON, QUICK) for seed in (33, 36)]
     assert all(outcome.recovered for outcome in outcomes)

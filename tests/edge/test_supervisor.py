@@ -96,7 +96,7 @@ def test_after_a_fallback_a_good_update_counts_again() -> None:
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_a_silent_twin_is_borne_for_a_while(answers: bool) -> None:
+def test_a_silent_twin_is_tolerated_for_a_while(answers: bool) -> None:
     agent = Agent(agent_settings(silence_s=6.0, watch=None))
     sent = feed(agent, 2.0)
     (window,) = [out.message for out in sent if isinstance(out.message, WindowMessage)]
@@ -109,13 +109,13 @@ def test_a_silent_twin_is_borne_for_a_while(answers: bool) -> None:
         assert found[0].measured == pytest.approx(6.0)
 
 
-def test_a_twin_that_was_not_asked_is_not_silent() -> None:
+def test_a_twin_without_a_window_to_answer_is_not_silent() -> None:
     agent = Agent(agent_settings(silence_s=2.0))
     agent.absorb_block(*[array("d", bytes(8 * 4000))] * 4)
     assert agent.parameters.version == 0
 
 
-def test_what_was_proved_is_kept_and_what_was_not_is_not() -> None:
+def test_only_parameters_under_which_the_loop_kept_its_band_are_stored() -> None:
     store = MemoryParameterStore()
     agent = Agent(agent_settings(), store=store)
     agent.receive(update(1, 0, 0.0))
@@ -180,7 +180,7 @@ def test_the_period_is_whole_slots() -> None:
         Supervision(period_s=0.0)
 
 
-def test_no_prediction_excuses_what_is_not_certified() -> None:
+def test_a_prediction_does_not_excuse_an_error_outside_the_certified_band() -> None:
     agent = Agent(agent_settings())
     generous = replace(update(1, 0, 0.0), setting=Setting(1e-4, CALM, Band(1.0, 1.0, 5.0, 1e6)))
     agent.receive(generous)

@@ -44,7 +44,7 @@ def test_a_safe_instant_is_used_at_once(error: float | None) -> None:
 
 
 @pytest.mark.parametrize("error", [1e-4, 1.5e-4, -2e-4])
-def test_between_the_thresholds_it_waits_and_the_receipt_tells_the_sample(error: float) -> None:
+def test_an_update_waits_between_the_thresholds_and_its_receipt_names_the_sample(error: float) -> None:
     state, said = offer(START, UPDATE, RULES, at(22.0), error)
     assert (said, state.current) == ((), START.current)
     assert apply_pending(state, RULES, at(22.5), error) == (state, ())
@@ -65,19 +65,19 @@ def test_without_patience_nothing_waits() -> None:
     assert reasons(offer(START, UPDATE, Rules(Limits(), PAPER), at(22.0), 1.5e-4).messages) == [(1, Reason.APPLIED)]
 
 
-def test_what_expires_while_it_waits_is_refused() -> None:
+def test_an_update_that_expires_while_it_waits_is_refused() -> None:
     state, _ = offer(START, replace(UPDATE, not_after=23.0), RULES, at(22.0), 1.5e-4)
     state, said = apply_pending(state, RULES, at(23.0), 0.0)
     assert reasons(said) == [(1, Reason.EXPIRED)]
     assert state == START
 
 
-def test_a_copy_of_what_waits_gets_no_answer_yet() -> None:
+def test_a_copy_of_the_pending_update_gets_no_answer_yet() -> None:
     state, _ = offer(START, UPDATE, RULES, at(22.0), 1.5e-4)
     assert offer(state, UPDATE, RULES, at(22.5), 0.0) == (state, ())
 
 
-def test_a_newer_update_takes_the_place_of_what_waits() -> None:
+def test_a_newer_update_replaces_the_pending_one() -> None:
     state, _ = offer(START, UPDATE, RULES, at(22.0), 1.5e-4)
     newer = replace(UPDATE, version=2, window=("b0", 1), data_time=21.0)
     state, said = offer(state, newer, RULES, at(22.5), 1.5e-4)
@@ -147,7 +147,7 @@ def test_the_fallback_set_is_a_version_of_its_own() -> None:
         ({"version": 9, "base_version": 5, "data_time": 24.0}, 33.0, Reason.APPLIED),
     ],
 )
-def test_after_a_fallback_only_news_counts_and_not_at_once(
+def test_after_a_fallback_updates_need_newer_data_and_wait(
     changes: dict[str, Any], seconds: float, reason: Reason
 ) -> None:
     state, _ = fall_back(Switch(Parameters(4, Setting(1e-4), 20.0)), SET, VERDICT, at(23.0))

@@ -60,14 +60,14 @@ def test_without_a_band_only_cycles_count() -> None:
     assert found[0] > 1.0 + WatchSettings().settling_s
 
 
-def test_a_growing_oscillation_is_one() -> None:
+def test_a_growing_oscillation_is_a_limit_cycle() -> None:
     found = watched(ringing(1.1, 2e-5), band=None)
     assert found is not None
     assert found[1].cause is Cause.LIMIT_CYCLE
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.65, 0.9])
-def test_what_rings_down_is_none(ratio: float) -> None:
+def test_a_decaying_oscillation_is_no_limit_cycle(ratio: float) -> None:
     assert watched(ringing(ratio), band=None, settling_s=0.0) is None
 
 
@@ -109,7 +109,7 @@ def test_effort_outside_the_band() -> None:
     assert result[1].measured == pytest.approx(0.2 / math.sqrt(2.0), rel=0.02)
 
 
-def test_small_things_are_no_evidence() -> None:
+def test_values_below_the_floors_are_no_evidence() -> None:
     assert watched(lambda _: 0.9e-5, lambda _: 0.015, band=Band(0.0, 0.0, 0.0, 1.0)) is None
 
 
@@ -139,7 +139,7 @@ def test_a_loop_that_runs_away_is_stopped_before_it_should_have_settled() -> Non
     assert 1.0 + math.log(1.425) / 5.0 < (caught + 1) * BLOCK / RATE < 1.25
 
 
-def test_new_parameters_are_held_to_what_is_certified_until_they_must_do_what_is_predicted() -> None:
+def test_new_parameters_must_keep_the_certified_band_until_the_predicted_one_holds() -> None:
     watch = Watch(WatchSettings(), RATE, 0.0, BAND)
     calm = [0.0] * BLOCK
     for first in range(0, 5000, BLOCK):

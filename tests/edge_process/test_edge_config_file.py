@@ -86,7 +86,7 @@ def test_a_short_file_is_enough(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ('role = "control"', 'role = "contrl"', "role = 'contrl'.*did you mean 'control'"),
         ("sample_rate_hz = 1000.0", "sample_rate_hz = 0", "sample_rate_hz = 0 is not allowed"),
@@ -110,13 +110,13 @@ def test_a_short_file_is_enough(tmp_path: Path) -> None:
         ("filter_time_s = 0.1", "filter_time_s = 0.1\n[limits]\nmaximum_m = -1", "limits.maximum_m = -1"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(old: str, new: str, said: str) -> None:
-    with pytest.raises(InvalidInput, match=said):
+def test_what_is_wrong_is_refused_by_name(old: str, new: str, message: str) -> None:
+    with pytest.raises(InvalidInput, match=message):
         read_config(parse_toml(PLAIN.replace(old, new), "edge.toml"))
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost"])
-def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
+def test_a_loopback_url_may_be_in_clear(host: str) -> None:
     assert TwinLink(f"http://{host}:8765", "token").url == f"http://{host}:8765"
     for other in ("10.0.0.1", "[2001:db8::1]", "localhost.example", "127.0.0.1.example", "127.1"):
         for scheme in ("http", "HTTP"):
@@ -124,7 +124,7 @@ def test_on_this_machine_itself_nobody_listens_in(host: str) -> None:
                 TwinLink(f"{scheme}://{other}:8765", "token")
 
 
-def test_to_control_a_controller_is_needed() -> None:
+def test_the_role_control_needs_a_controller() -> None:
     text = PLAIN[: PLAIN.index("[controller]")]
     with pytest.raises(InvalidInput, match=r"table \[controller\] is missing"):
         read_config(parse_toml(text, "edge.toml"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from gateway_parts import CONFIG, cut
+from edge_process_parts import CONFIG, cut
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,7 +28,7 @@ def handler(tmp_path: Path) -> Iterator[FrameHandler]:
     outbox.close()
 
 
-def test_a_cut_that_comes_again_is_kept_and_counted_once(handler: FrameHandler, tmp_path: Path) -> None:
+def test_a_repeated_cut_is_stored_and_counted_once(handler: FrameHandler, tmp_path: Path) -> None:
     bad = cut(1)
     bad.signals["position"][3] = math.nan
     for serial, each in enumerate([cut(0), bad, cut(0), bad, cut(2)], 1):
@@ -39,7 +39,7 @@ def test_a_cut_that_comes_again_is_kept_and_counted_once(handler: FrameHandler, 
     assert outbox.get(("b1", 0)).boot == "b1"
 
 
-def test_proved_parameters_are_written_or_tried_again(handler: FrameHandler, tmp_path: Path) -> None:
+def test_parameters_are_written_or_tried_again(handler: FrameHandler, tmp_path: Path) -> None:
     store = FileParameterStore(tmp_path / "parameters.json")
     (tmp_path / "parameters.json.new").mkdir()
     assert handler.handle(frames.SaveFrame(1, StoredParameters.of(Parameters(1, Setting(1e-4))))) == []
@@ -93,12 +93,12 @@ def test_counted_durations_give_quantiles_to_a_microsecond(durations: list[float
     assert found["max_us"] == pytest.approx(ordered[-1] * 1e6, abs=0.06)
 
 
-def test_a_trouble_is_told_when_it_comes_when_it_is_another_one_and_when_it_is_over(capfd: pytest.CaptureFixture[str]):
+def test_a_trouble_is_logged_when_it_begins_changes_and_ends(capfd: pytest.CaptureFixture[str]):
     troubles = TroubleLog()
     for why in ("", "", "refused", "refused", "away", "", ""):
         troubles.update("to the twin", why)
     troubles.update("disk", "")
-    told = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
-    assert [(line["event"], line["where"], line.get("why")) for line in told] == [
+    lines = [msgspec.json.decode(line) for line in capfd.readouterr().err.splitlines()]
+    assert [(line["event"], line["where"], line.get("why")) for line in lines] == [
         ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)
     ]  # fmt: skip

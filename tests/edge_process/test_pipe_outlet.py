@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from gateway_parts import RATE, Far, cut, pumped
+from edge_process_parts import RATE, LinkEnd, cut, exchange_all
 
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
@@ -18,8 +18,8 @@ from servotwin.messages import (
 
 
 @pytest.fixture
-def far() -> Iterator[Far]:
-    made = Far()
+def far() -> Iterator[LinkEnd]:
+    made = LinkEnd()
     yield made
     made.close()
 
@@ -34,7 +34,7 @@ def test_a_cut_crosses_as_it_is() -> None:
         frames.to_control(frames.encode(frame))
 
 
-def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Far) -> None:
+def test_an_outlet_sends_unacknowledged_frames_to_the_next_link_process(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.boot = "b0"
     box.offer(cut(0), 0.0)
@@ -42,46 +42,46 @@ def test_an_outlet_keeps_what_is_not_confirmed_for_the_next_link_process(far: Fa
     box.connect(far.near)
     box.send_letter(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
     box.save(Parameters(3, Setting(1e-4)))
-    pumped(box)
-    assert [type(frame).__name__ for frame in far.heard()] == ["WindowFrame", "LetterFrame", "SaveFrame"]
-    far.say(frames.PendingFrame(1, {"outbox full": 2}), frames.AckFrame(1), frames.AckFrame(2))
-    heard = box.exchange()
-    assert heard is not None
-    assert heard.pending_changed
+    exchange_all(box)
+    assert [type(frame).__name__ for frame in far.received()] == ["WindowFrame", "LetterFrame", "SaveFrame"]
+    far.send(frames.PendingFrame(1, {"outbox full": 2}), frames.AckFrame(1), frames.AckFrame(2))
+    received = box.exchange()
+    assert received is not None
+    assert received.pending_changed
     assert box.unacknowledged
     assert box.dropped == {"outbox full": 2}
-    again = Far()
+    again = LinkEnd()
     box.connect(again.near)
-    pumped(box)
-    assert [type(frame).__name__ for frame in again.heard()] == ["SaveFrame"]
+    exchange_all(box)
+    assert [type(frame).__name__ for frame in again.received()] == ["SaveFrame"]
     assert not box.idle
-    again.say(frames.AckFrame(3), frames.PendingFrame(0, {}))
-    pumped(box)
+    again.send(frames.AckFrame(3), frames.PendingFrame(0, {}))
+    exchange_all(box)
     assert box.idle
     assert not box.unacknowledged
     again.close()
 
 
-def test_the_twins_messages_count_once_whoever_repeats_them(far: Far) -> None:
+def test_a_repeated_message_of_the_twin_counts_once(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     body = encode(Acknowledge("axis-1", "b0", 0))
-    far.say(
+    far.send(
         frames.MessageFrame(4, body),
         frames.MessageFrame(0, body),
         frames.MessageFrame(4, body),
         frames.ReconnectedFrame(),
     )
-    heard = box.exchange()
-    assert heard is not None
-    assert len(heard.messages) == 2
-    assert heard.reconnected
-    pumped(box)
-    assert far.heard() == [frames.ProcessedFrame(4), frames.ProcessedFrame(4)]
+    received = box.exchange()
+    assert received is not None
+    assert len(received.messages) == 2
+    assert received.reconnected
+    exchange_all(box)
+    assert far.received() == [frames.ProcessedFrame(4), frames.ProcessedFrame(4)]
 
 
-def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
-    far: Far, monkeypatch: pytest.MonkeyPatch
+def test_an_outlet_is_bounded_and_disconnects_a_link_process_that_acknowledges_nothing(
+    far: LinkEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(outlet, "MOST", 100_000)
     box = PipeOutlet(True)
@@ -92,13 +92,13 @@ def test_an_outlet_is_bounded_and_gives_up_a_link_process_that_takes_nothing(
     assert not box.connected
 
 
-def test_without_a_twin_nobody_owes_an_answer() -> None:
+def test_without_a_twin_no_answer_is_expected() -> None:
     box = PipeOutlet(False)
     box.offer(cut(), 0.0)
     assert not box.unacknowledged
 
 
-def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: Far) -> None:
+def test_rubbish_from_the_link_process_breaks_the_pipe_only(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     far.pipe.post(b"rubbish")

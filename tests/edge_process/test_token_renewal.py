@@ -48,20 +48,20 @@ def linked(tmp_path: Path):
     assert not running.is_alive()
 
 
-def test_another_token_ends_it(linked, capfd):
+def test_the_link_process_ends_when_its_token_is_replaced(linked, capfd):
     folder, running = linked
     running.join(1.5)
     assert running.is_alive(), "the same token, however long the twin is away"
     write_token(folder, "second")
     running.join(PATIENCE)
     assert not running.is_alive()
-    said = capfd.readouterr().err
-    assert '"event":"token replaced"' in said
-    assert "first" not in said
-    assert "second" not in said
+    log = capfd.readouterr().err
+    assert '"event":"token replaced"' in log
+    assert "first" not in log
+    assert "second" not in log
 
 
-def test_a_token_that_is_missing_for_a_while_does_not(linked):
+def test_the_link_process_goes_on_while_its_token_is_missing(linked):
     folder, running = linked
     (folder / "token").unlink()
     running.join(2.5)

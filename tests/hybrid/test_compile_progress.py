@@ -62,7 +62,7 @@ def test_a_pipe_sees_nothing(monkeypatch):
     assert stream.getvalue() == ""
 
 
-def test_functions_of_other_packages_are_not_ours_to_tell(monkeypatch):
+def test_compilations_of_other_packages_are_not_shown(monkeypatch):
     terminal = terminal_of(monkeypatch)
     compile_two("somebody.else")
     assert terminal.getvalue() == ""

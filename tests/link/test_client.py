@@ -90,7 +90,7 @@ def test_letters_go_first_then_windows_in_order(sender: Sender, outbox: SqliteOu
     assert sender.session.counts == {"letters": 1, "windows": 2}
 
 
-def test_out_of_reach_everything_waits_longer_and_longer(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
+def test_pauses_grow_while_the_twin_is_out_of_reach(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:
     outbox.put(window(0))
     script.faults = [Unreachable("gone")] * 6
     now, waits = 0.0, []
@@ -107,7 +107,7 @@ def test_out_of_reach_everything_waits_longer_and_longer(sender: Sender, outbox:
 
 
 @pytest.mark.parametrize("reason", [reason for reason in Refusal if not reason.passing])
-def test_what_will_never_be_taken_is_dropped_and_counted(
+def test_a_message_refused_for_good_is_dropped_and_counted(
     sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
 ) -> None:
     outbox.put(window(0))
@@ -124,7 +124,9 @@ def test_what_will_never_be_taken_is_dropped_and_counted(
 
 
 @pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.passing and reason is not Refusal.FUTURE])
-def test_what_may_be_taken_later_is_kept(sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal) -> None:
+def test_a_message_refused_for_now_stays_in_the_outbox(
+    sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
+) -> None:
     outbox.put(window(0))
     script.faults = [Refused(reason, "not now", 5.0)]
     assert sender.step(0.0).wait_s == 5.0
@@ -196,7 +198,7 @@ def sealed(serial: int, body: bytes | None = None, key: bytes = KEY, direction: 
     return seal(key, direction, "axis-1", serial, encode(Acknowledge("axis-1", "b0", serial)) if body is None else body)
 
 
-def test_what_the_twin_says_is_heard_once_and_in_order(receiver: Receiver, script: Script) -> None:
+def test_messages_of_the_twin_are_received_once_and_in_order(receiver: Receiver, script: Script) -> None:
     script.news = [sealed(2), sealed(3), sealed(2), sealed(1)]
     assert [serial for serial, _ in receiver.step().messages] == [2, 3]
     script.news = [sealed(3), sealed(7)]
@@ -205,7 +207,7 @@ def test_what_the_twin_says_is_heard_once_and_in_order(receiver: Receiver, scrip
     assert receiver.counts == {"received": 3, "repeated": 3}
 
 
-def test_nothing_comes_through_with_a_broken_seal(receiver: Receiver, script: Script) -> None:
+def test_a_message_with_a_broken_seal_is_rejected(receiver: Receiver, script: Script) -> None:
     other, good = key_of(verifier_of("other")), sealed(1)
     script.news = [sealed(9, key=other), sealed(9, direction=TO_TWIN), good[:-1] + bytes([good[-1] ^ 1]), b"rubbish"]
     received = receiver.step()
@@ -215,7 +217,7 @@ def test_nothing_comes_through_with_a_broken_seal(receiver: Receiver, script: Sc
     assert [serial for serial, _ in receiver.step().messages] == [1]
 
 
-def test_a_message_that_is_none_or_not_for_an_edge_is_passed_over(receiver: Receiver, script: Script) -> None:
+def test_a_message_not_understood_or_not_for_an_edge_is_skipped(receiver: Receiver, script: Script) -> None:
     hello = encode(Hello("axis-1", "b0", 0.0, 1.0, 0, Setting(0.0), ""))
     script.news = [sealed(1, b"rubbish"), sealed(2, hello), sealed(3)]
     assert [serial for serial, _ in receiver.step().messages] == [3]
@@ -229,7 +231,7 @@ def test_polls_that_fail_come_less_and_less_often(receiver: Receiver, script: Sc
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_survived(data: bytes) -> None:
+def test_a_receiver_survives_any_bytes(data: bytes) -> None:
     script = Script()
     script.news = [data]
     assert Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0).step().messages == []

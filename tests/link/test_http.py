@@ -63,7 +63,7 @@ def test_one_connection_serves_many_requests(twin: FakeTwin, link: HttpTransport
     assert len(seen) == 1
 
 
-def test_a_connection_that_the_other_side_closed_is_opened_again(twin: FakeTwin, link: HttpTransport) -> None:
+def test_a_connection_that_the_server_closed_is_opened_again(twin: FakeTwin, link: HttpTransport) -> None:
     def close_after(handler: Handler, _: bytes) -> bool:
         handler.close_connection = True
         return False
@@ -74,7 +74,7 @@ def test_a_connection_that_the_other_side_closed_is_opened_again(twin: FakeTwin,
     assert len(twin.windows) == 3
 
 
-def test_what_the_twin_says_is_read_again_until_it_is_acknowledged(twin: FakeTwin, link: HttpTransport) -> None:
+def test_messages_of_the_twin_are_returned_until_they_are_acknowledged(twin: FakeTwin, link: HttpTransport) -> None:
     assert link.listen(0) == []
     for k in range(3):
         twin.say(Acknowledge("axis-1", "b0", k))
@@ -107,7 +107,7 @@ def test_a_wrong_token_is_a_refusal(twin: FakeTwin) -> None:
     [(200, b"<html>log in here</html>"), (200, b""), (200, b"\x90"), (404, b"<html>"), (302, b""), (502, b"{}"),
      (413, b'{"code": "no such code"}'), (200, b"x" * 100_000), (500, b"x" * 100_000)],
 )  # fmt: skip
-def test_whoever_answers_otherwise_is_not_the_twin(
+def test_a_response_that_is_not_the_twins_is_unreachable(
     twin: FakeTwin, link: HttpTransport, status: int, body: bytes
 ) -> None:
     def answer(handler: Handler, _: bytes) -> bool:
@@ -161,7 +161,7 @@ def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
     assert b"secret" not in heard[0]
 
 
-def test_nobody_there_is_unreachable() -> None:
+def test_a_missing_server_is_unreachable() -> None:
     with socket.create_server(("127.0.0.1", 0)) as closed:
         url = f"http://127.0.0.1:{closed.getsockname()[1]}"
     link = HttpTransport(url, "axis-1", "secret", timeout_s=1.0)
@@ -169,7 +169,7 @@ def test_nobody_there_is_unreachable() -> None:
         link.deliver(parcel(0))
 
 
-def test_closing_wakes_whoever_listens(twin: FakeTwin) -> None:
+def test_closing_ends_a_poll_under_way(twin: FakeTwin) -> None:
     link = HttpTransport(twin.url, "axis-1", "secret", wait_s=30.0)
     woken = []
 

@@ -167,7 +167,7 @@ def test_too_large_a_message_is_refused_before_it_is_sent_or_parsed(server: Mosq
         assert refusals(there) == {"too_large": 1}
 
 
-def test_what_is_no_question_is_counted_and_the_rest_goes_on(server: Mosquitto, store: Store) -> None:
+def test_bytes_that_are_no_request_are_counted_and_the_rest_goes_on(server: Mosquitto, store: Store) -> None:
     key = key_of(verifier_of(TOKENS["axis-1"]))
     good = wire.encode_request(key, "axis-1", 5, wire.PollRequest(0, 0.0))
     bad = [
@@ -213,7 +213,7 @@ def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitt
     deaf.close()
 
 
-def test_an_answer_belongs_to_its_question() -> None:
+def test_a_response_belongs_to_its_request() -> None:
     key = key_of(verifier_of("token"))
     data = wire.encode_response(key, "axis-1", 7, wire.RefusedResponse(Refusal.CONFLICT, "Another one is kept."))
     assert wire.decode_response(key, "axis-1", data) == (
@@ -239,7 +239,7 @@ def test_bytes_from_a_broker_never_do_more_than_be_refused(data: bytes) -> None:
     assert wire.encode_unknown_peer(data) is None or len(data) > 32
 
 
-def test_closing_wakes_whoever_waits(server: Mosquitto) -> None:
+def test_closing_ends_requests_under_way(server: Mosquitto) -> None:
     with edge(Broker(server.url), timeout_s=PATIENCE) as here, ThreadPoolExecutor(1) as pool:
         delivered = pool.submit(here.deliver, parcel(0))
         here.close()
@@ -249,6 +249,6 @@ def test_closing_wakes_whoever_waits(server: Mosquitto) -> None:
             here.listen(0)
 
 
-def test_no_broker_is_no_twin() -> None:
+def test_without_a_broker_the_twin_is_unreachable() -> None:
     with edge(Broker(f"mqtt://127.0.0.1:{free_port()}"), timeout_s=0.5) as here, pytest.raises(Unreachable):
         here.deliver(parcel(0))

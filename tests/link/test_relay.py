@@ -55,7 +55,7 @@ def all_of(connection: socket.socket, size: int) -> bytes:
     return bytes(taken)
 
 
-def test_what_goes_in_comes_out_in_order_however_late(echo: int) -> None:
+def test_a_relay_keeps_the_order_of_delayed_data(echo: int) -> None:
     sent = bytes(range(256)) * 2000
     with (
         Relay(echo, Weather(delay_s=(0.0, 0.05)), seed=1) as relay,

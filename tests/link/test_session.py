@@ -67,7 +67,7 @@ def test_a_full_outbox_drops_the_oldest_and_says_so() -> None:
         outbox.get(("b0", 0))
 
 
-def test_what_an_outbox_still_holds_after_a_restart_is_due_at_once() -> None:
+def test_windows_of_an_outbox_are_due_at_once_after_a_restart() -> None:
     outbox = MemoryOutbox()
     outbox.put(window(7))
     assert sent(Session(outbox), 0.0) == [7]

@@ -83,7 +83,7 @@ def test_one_setting_leaves_the_draws_of_the_others_alone() -> None:
     assert [(r.arrival, r.fate) for r in doubled.records if r.copy == 0] == [(r.arrival, r.fate) for r in plain.records]
 
 
-def test_outages_take_what_is_sent_and_what_would_arrive() -> None:
+def test_outages_lose_messages_sent_or_arriving_in_them() -> None:
     line, arrived = play(LinkSettings(delay_s=1.0, outages=((3.0, 4.0), (8.0, 8.1))), 0)
     lost = [record.sent for record in line.records if record.fate is Fate.OUTAGE]
     assert lost == [2.0, 2.5, 3.0, 3.5, 7.0, 8.0]

@@ -49,7 +49,7 @@ def sequences(box: SqliteOutbox) -> list[int]:
     return [sequence for _, sequence in box.pending()]
 
 
-def test_what_was_put_is_there_after_a_restart(outbox: SqliteOutbox, path: Path) -> None:
+def test_an_outbox_has_its_messages_after_a_restart(outbox: SqliteOutbox, path: Path) -> None:
     for k in range(3):
         assert outbox.put(window(k)) == []
     assert outbox.flushed
@@ -72,7 +72,7 @@ def test_what_was_put_is_there_after_a_restart(outbox: SqliteOutbox, path: Path)
     last.close()
 
 
-def test_it_serves_the_session(outbox: SqliteOutbox) -> None:
+def test_a_sqlite_outbox_works_with_a_session(outbox: SqliteOutbox) -> None:
     session = Session(outbox, Retry(1.0))
     outbox.put(window(0))
     (key,) = session.due(0.0)
@@ -82,13 +82,13 @@ def test_it_serves_the_session(outbox: SqliteOutbox) -> None:
     assert session.next_time == 1.0
 
 
-def test_the_same_window_again_is_one(outbox: SqliteOutbox) -> None:
+def test_a_window_put_twice_is_stored_once(outbox: SqliteOutbox) -> None:
     outbox.put(window(0))
     outbox.put(window(0))
     assert sequences(outbox) == [0]
 
 
-def test_a_full_one_drops_the_oldest_uninformative_window_first(outbox: SqliteOutbox, path: Path) -> None:
+def test_a_full_outbox_drops_the_oldest_uninformative_window_first(outbox: SqliteOutbox, path: Path) -> None:
     box = again(outbox, path, windows=3)
     for k, reason in enumerate(["reference", "periodic", "probe", "periodic, as every hour"]):
         drops = box.put(window(k, reason))
@@ -129,7 +129,7 @@ for k in range(100000):
 """
 
 
-def test_kill_9_loses_nothing_that_was_put(path: Path) -> None:
+def test_kill_9_loses_no_message_in_the_outbox(path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), *sys.path))}
     command = [sys.executable, "-c", PUT_UNTIL_KILLED, str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as child:
@@ -199,7 +199,7 @@ def test_a_read_only_file_is_counted_and_survived(
     fresh.close()
 
 
-def test_a_folder_that_is_not_there_yet_is_no_reason_to_stop(tmp_path: Path) -> None:
+def test_a_missing_folder_does_not_stop_the_outbox(tmp_path: Path) -> None:
     path = tmp_path / "later" / "outbox.sqlite"
     box = SqliteOutbox(path, "axis-1")
     box.put(window(0))
@@ -211,7 +211,7 @@ def test_a_folder_that_is_not_there_yet_is_no_reason_to_stop(tmp_path: Path) -> 
     fresh.close()
 
 
-def test_what_memory_holds_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritten_windows_in_memory_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("servotwin.link.sqlite_outbox.MOST_UNWRITTEN", 1000)
     box = SqliteOutbox(tmp_path / "never" / "outbox.sqlite", "axis-1")
     for k in range(50):
@@ -222,7 +222,7 @@ def test_what_memory_holds_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("wal", [False, True])
-def test_a_broken_file_is_put_aside(outbox: SqliteOutbox, path: Path, wal: bool) -> None:
+def test_a_corrupt_file_is_put_aside(outbox: SqliteOutbox, path: Path, wal: bool) -> None:
     outbox.put(window(0))
     outbox.close()
     path.write_bytes(b"no database at all" * 100)
@@ -238,9 +238,7 @@ def test_a_broken_file_is_put_aside(outbox: SqliteOutbox, path: Path, wal: bool)
     fresh.close()
 
 
-def test_a_file_that_breaks_while_it_is_open_is_put_aside_and_what_was_in_it_counted(
-    outbox: SqliteOutbox, path: Path
-) -> None:
+def test_a_file_corrupted_while_open_is_put_aside_and_its_windows_are_counted(outbox: SqliteOutbox, path: Path) -> None:
     for k in range(30):
         outbox.put(window(k, samples=3000))
     assert outbox._connection is not None

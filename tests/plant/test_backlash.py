@@ -114,7 +114,7 @@ def test_the_screw_stays_inside_the_gap_and_moves_only_when_pushed(theta_m: Arra
 
 
 @given(ANGLES, GAPS, STARTS, st.data())
-def test_semigroup(theta_m: Array, gap: float, start: float, data: st.DataObject) -> None:
+def test_play_can_be_cut_anywhere(theta_m: Array, gap: float, start: float, data: st.DataObject) -> None:
     cut = data.draw(st.integers(1, theta_m.size))
     first = play(theta_m[:cut], gap, start)
     whole = play(theta_m, gap, start)
@@ -124,7 +124,7 @@ def test_semigroup(theta_m: Array, gap: float, start: float, data: st.DataObject
 
 
 @given(ANGLES, GAPS, STARTS, st.integers(2, 7))
-def test_rate_independence(theta_m: Array, gap: float, start: float, refine: int) -> None:
+def test_play_does_not_depend_on_the_rate(theta_m: Array, gap: float, start: float, refine: int) -> None:
     """Passing through the same angles slower, or resting on the way, changes nothing."""
     fine = np.interp(np.arange((theta_m.size - 1) * refine + 1) / refine, np.arange(theta_m.size), theta_m)
     fine[::refine] = theta_m
@@ -133,25 +133,25 @@ def test_rate_independence(theta_m: Array, gap: float, start: float, refine: int
 
 
 @given(ANGLES, GAPS, STARTS, st.floats(-100.0, 100.0))
-def test_shift_equivariance(theta_m: Array, gap: float, start: float, shift: float) -> None:
+def test_shifting_the_motor_shifts_the_screw(theta_m: Array, gap: float, start: float, shift: float) -> None:
     np.testing.assert_allclose(play(theta_m + shift, gap, start + shift), play(theta_m, gap, start) + shift, atol=1e-12)
 
 
 @given(ANGLES, GAPS, STARTS, st.integers(-8, 8))
-def test_homogeneity_to_the_bit(theta_m: Array, gap: float, start: float, power: int) -> None:
+def test_play_is_homogeneous_to_the_bit(theta_m: Array, gap: float, start: float, power: int) -> None:
     s = 2.0**power
     expected = s * play(np.round(theta_m, 3), round(gap, 3), round(start, 3))
     np.testing.assert_array_equal(play(s * np.round(theta_m, 3), s * round(gap, 3), s * round(start, 3)), expected)
 
 
 @given(ANGLES, GAPS, STARTS, st.floats(0.0, 3.0), st.floats(0.0, 3.0))
-def test_monotone(theta_m: Array, gap: float, start: float, more: float, later: float) -> None:
+def test_play_is_monotone(theta_m: Array, gap: float, start: float, more: float, later: float) -> None:
     rise = np.linspace(0.0, more, theta_m.size)
     assert np.all(play(theta_m + rise, gap, start + later) >= play(theta_m, gap, start) - 1e-12)
 
 
 @given(ANGLES, GAPS, STARTS)
-def test_lipschitz_in_the_gap(theta_m: Array, gap: float, start: float) -> None:
+def test_play_changes_by_at_most_half_the_change_of_the_gap(theta_m: Array, gap: float, start: float) -> None:
     """d theta_d / d(half gap) is -1, 0 or +1: a little more gap never moves the screw by more than half of it."""
     difference = play(theta_m, gap + 1e-3, start) - play(theta_m, gap, start)
     assert np.max(np.abs(difference)) <= 0.5e-3 + 1e-12
@@ -189,6 +189,6 @@ def test_interpreted_and_compiled_step_agree() -> None:
         ([0.0, 1.0], 0.1, math.nan, "must be finite, in rad"),
     ],
 )
-def test_bad_input(theta_m: object, gap: object, start: float, message: str) -> None:
+def test_bad_play_input_is_refused(theta_m: object, gap: object, start: float, message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
         play(theta_m, gap, start)  # type: ignore[arg-type]

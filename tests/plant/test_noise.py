@@ -26,7 +26,7 @@ def test_the_paper_s_filter() -> None:
 
 
 @given(stop=st.floats(1.0, 50.0), ratio=st.floats(1.5, 10.0), rate=st.floats(1200.0, 20000.0))
-def test_noise_gain_against_the_impulse_response(stop: float, ratio: float, rate: float) -> None:
+def test_noise_gain_agrees_with_the_impulse_response(stop: float, ratio: float, rate: float) -> None:
     sections = Noise(1.0, (stop, stop * ratio)).filter(rate)
     impulse = np.zeros(200_000)
     impulse[0] = 1.0
@@ -35,7 +35,7 @@ def test_noise_gain_against_the_impulse_response(stop: float, ratio: float, rate
     assert noise_gain(sections) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_state_space_against_scipy() -> None:
+def test_state_space_agrees_with_scipy() -> None:
     sections = Noise(1.0).filter(RATE)
     A, B, C, D = state_space(sections)
     _, response = signal.dimpulse((A, B[:, None], C[None, :], D, 1.0 / RATE), n=400)
@@ -45,13 +45,13 @@ def test_state_space_against_scipy() -> None:
 
 
 @pytest.mark.parametrize("noise", [Noise(0.22e-3), Noise(0.22e-3, kind="white"), Noise(3.0, (100.0, 400.0))])
-def test_standard_deviation_of_long_samples(noise: Noise) -> None:
+def test_long_samples_have_the_stated_standard_deviation(noise: Noise) -> None:
     drawn = noise.samples(1_000_000, RATE, np.random.default_rng(7))
     assert np.std(drawn) == pytest.approx(noise.std, rel=5e-3)
     assert np.mean(drawn) == pytest.approx(0.0, abs=5e-3 * noise.std)
 
 
-def test_stationary_from_the_first_sample() -> None:
+def test_noise_is_stationary_from_the_first_sample() -> None:
     runs = np.array([Noise(1.0).samples(60, RATE, np.random.default_rng(seed)) for seed in range(4000)])
     np.testing.assert_allclose(np.std(runs, axis=0), 1.0, atol=5.0 / math.sqrt(2 * 4000))
 
@@ -63,14 +63,14 @@ def test_the_spectrum_is_the_filter_s() -> None:
 
 
 @given(st.lists(st.integers(0, 200), min_size=1, max_size=6), st.sampled_from(["highpass", "white"]))
-def test_blocks_make_no_difference(sizes: list[int], kind: str) -> None:
+def test_block_sizes_do_not_change_the_noise(sizes: list[int], kind: str) -> None:
     noise = Noise(0.22e-3, kind=kind)  # type: ignore[arg-type]
     source = noise.source(RATE, np.random.default_rng(5))
     pieces = np.concatenate([source.block(size) for size in sizes])
     np.testing.assert_array_equal(pieces, noise.samples(sum(sizes), RATE, np.random.default_rng(5)))
 
 
-def test_seeds_and_scale() -> None:
+def test_the_seed_decides_the_noise_and_std_scales_it() -> None:
     one = Noise(1.0).samples(100, RATE, np.random.default_rng(1))
     assert not np.array_equal(one, Noise(1.0).samples(100, RATE, np.random.default_rng(2)))
     np.testing.assert_array_equal(Noise(0.5).samples(100, RATE, np.random.default_rng(1)), 0.5 * one)
@@ -88,6 +88,6 @@ def test_seeds_and_scale() -> None:
         (lambda: Noise(1.0).filter(90.0), "below half the sample rate of 90.0 Hz"),
     ],
 )
-def test_bad_input(make, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_noise_settings_are_refused(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InvalidInput, match=message):
         make()

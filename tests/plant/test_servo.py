@@ -119,7 +119,7 @@ def test_tolerance_for_is_eq_21() -> None:
         ({"kp": 1.0}, r"servo has no value named 'kp' \(did you mean 'Kp'\?\)"),
     ],
 )
-def test_bad_values(changes: dict[str, object], message: str) -> None:
+def test_values_out_of_range_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
         Servo.preset("paper").replace(**changes)
 
@@ -147,7 +147,7 @@ def test_bad_values(changes: dict[str, object], message: str) -> None:
         ("kp_v_per_m = 1377.7", "sample_rate_hz = 20\nkp_v_per_m = 1377.7", "the controller with Kp = 1377.7 V/m, Ki"),
     ],
 )
-def test_bad_files(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_bad_servo_files_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in GOOD
     with pytest.raises(InvalidInput) as caught:
         load(tmp_path, GOOD.replace(old, new, 1))
@@ -155,7 +155,7 @@ def test_bad_files(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_preset() -> None:
+def test_an_unknown_preset_is_refused_with_a_hint() -> None:
     with pytest.raises(
         InvalidInput, match=r"preset 'papr' does not exist \(did you mean 'paper'\?\); give one of paper"
     ):

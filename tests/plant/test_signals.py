@@ -77,12 +77,12 @@ def test_numbers_are_constant_signals() -> None:
         (Samples([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 1.0, 0.0]), [1.0, 3.0]),
     ],
 )
-def test_reference_changes(signal, expected) -> None:  # type: ignore[no-untyped-def]
+def test_reference_changes_are_its_jumps(signal, expected) -> None:  # type: ignore[no-untyped-def]
     np.testing.assert_array_equal(reference_changes(signal, 200.0), expected)
 
 
 @given(cubics(), st.floats(0.0, 12.0))
-def test_minimum_against_dense_sampling(signal: PiecewiseCubic, duration: float) -> None:
+def test_the_minimum_agrees_with_dense_sampling(signal: PiecewiseCubic, duration: float) -> None:
     time, value = signal.minimum(duration)
     t = np.linspace(0.0, duration, 20001)
     assert 0.0 <= time <= duration
@@ -97,7 +97,7 @@ def test_minimum_at_the_root_of_the_derivative() -> None:
 
 
 @given(cubics(), st.floats(0.25, 4.0))
-def test_scaling(signal: PiecewiseCubic, factor: float) -> None:
+def test_a_scaled_signal_has_scaled_values(signal: PiecewiseCubic, factor: float) -> None:
     t = np.linspace(0.0, 5.0, 101)
     np.testing.assert_allclose(signal.scaled(factor).value(t), factor * signal.value(t), rtol=1e-12, atol=1e-9)
     np.testing.assert_array_equal(signal.scaled(2.0).jumps, signal.jumps)
@@ -162,7 +162,7 @@ def test_signals_are_values() -> None:
         (lambda: as_pieces(math.inf, 1.0), "must be finite"),
     ],
 )
-def test_bad_input(make, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_signals_are_refused(make, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InvalidInput, match=message):
         make()
 

@@ -69,7 +69,7 @@ def test_matrices_and_polynomials_against_an_independent_solve(parts: tuple[Arra
             np.testing.assert_allclose(force, k_d * (1.0 - expected[0]), rtol=1e-8, atol=1e-9 * k_d)
 
 
-def test_eq_13() -> None:
+def test_the_transfer_function_is_eq_13() -> None:
     m, k, c, p = 5.2, 1e4, 36.9, 1e-3 / math.pi
     G2 = Servo.preset("paper").G2()
     np.testing.assert_allclose(G2.numerator, p * np.array([k**2, 2 * c * k, c**2]), rtol=1e-14)
@@ -77,7 +77,7 @@ def test_eq_13() -> None:
     np.testing.assert_allclose(G2.denominator, expected, rtol=1e-14)
 
 
-def test_eq_10() -> None:
+def test_the_matrices_are_those_of_eq_10() -> None:
     m, k, c = 5.2, 1e4, 36.9
     links = Servo.preset("paper").chain()
     np.testing.assert_allclose(links.A[2:], [[-2 * k / m, k / m, -2 * c / m, c / m], [k / m, -k / m, c / m, -c / m]])
@@ -95,7 +95,7 @@ def test_first_mass_spring_and_damper_are_inert_with_a_rigid_screw(parts: tuple[
 
 @given(chains(), st.floats(-1e-2, 1e-2))
 @example((np.array([1.0, 1.0]), np.array([1e3, 3e3]), np.array([1.0, 1.0])), 5e-324)
-def test_equilibrium(parts: tuple[Array, Array, Array], d: float) -> None:
+def test_at_equilibrium_nothing_moves(parts: tuple[Array, Array, Array], d: float) -> None:
     rigid, elastic = chain(*parts), chain(*parts, 1e6)
     x = rigid.equilibrium(d)
     # The equilibrium is linear in d: below the smallest normal number digits are lost, and with them the ratio.

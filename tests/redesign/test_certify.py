@@ -150,7 +150,7 @@ def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
         )
 
 
-def test_what_hunts_is_not_settled_and_what_is_calm_is() -> None:
+def test_a_hunting_loop_is_not_settled_and_a_calm_one_is() -> None:
     members = draw(SERVO, Uncertainty(gap=gaps(9, 11)), 4, 4)
     own, calm = assess([Design(OWN), CALM], members, SHORT)
     assert not own.settled.any()
@@ -166,7 +166,7 @@ def test_a_feedforward_against_the_bias_leaves_the_unbiased_loop() -> None:
     assert np.allclose(plain.cost, fed.cost, rtol=1e-9)
 
 
-def test_a_met_voltage_limit_is_told() -> None:
+def test_a_reached_voltage_limit_is_reported() -> None:
     members = draw(SERVO, Uncertainty(gap=gaps(5, 6), step=(2e-3, 2.5e-3)), 2, 2)
     limited, free = assess(
         [Design(CALM.controller.replace(voltage_limit=limit)) for limit in (0.5, 50.0)], members, SHORT
@@ -225,7 +225,7 @@ def test_no_candidate_is_one_sentence() -> None:
         certify(SERVO, Uncertainty(), replace(SMALL, Ms=1.01), SHORT)
 
 
-def test_what_cannot_be_proved_is_refused_with_the_best_found() -> None:
+def test_without_a_verified_setting_the_best_candidate_is_reported() -> None:
     found = certify(SERVO, Uncertainty(gap=gaps(29, 31)), replace(SMALL, overshoot=1e-6), SHORT)
     assert isinstance(found, NotVerified)
     assert "candidates is verified: the best overshoots by" in found.reason
@@ -241,7 +241,7 @@ def policy() -> CertifiedPolicy:
     return CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), SMALL, SHORT)
 
 
-def test_the_proof_covers_the_interval_not_the_point(policy: CertifiedPolicy) -> None:
+def test_the_verification_covers_the_interval_not_the_point(policy: CertifiedPolicy) -> None:
     made = policy.redesign(Evidence(estimated(10.0, 0.5), at_rest(0.0)))
     assert made.certificate is not None
     low, high = made.certificate.gap
@@ -249,7 +249,7 @@ def test_the_proof_covers_the_interval_not_the_point(policy: CertifiedPolicy) ->
     assert low < 9.1 * DEG < 10.9 * DEG < high
 
 
-def test_a_bias_seen_at_rest_is_fed_forward(policy: CertifiedPolicy) -> None:
+def test_a_bias_estimated_at_rest_is_fed_forward(policy: CertifiedPolicy) -> None:
     made = policy.redesign(Evidence(estimated(10.0), at_rest(0.05, 1e-4)))
     assert made.setting is not None
     assert made.certificate is not None
@@ -270,7 +270,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
     assert "at most 60 deg are certified: nothing is sent" in made.reason
 
 
-def test_where_nothing_is_proved_the_fallback_set_goes_out_with_the_bias(policy: CertifiedPolicy) -> None:
+def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
     """The fallback set is proved for an unknown bias, where no overshoot is asked."""
     strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))
     made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
@@ -292,7 +292,7 @@ def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: Certifi
     assert made.certificate.gap[0] < 10.0 * DEG < made.certificate.gap[1]
 
 
-def test_what_is_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
+def test_a_setting_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
     evidence = Evidence(estimated(10.0), at_rest(0.05))
     made = policy.redesign(evidence)
     again = policy.redesign(replace(evidence, setting=made.setting))
@@ -300,7 +300,7 @@ def test_what_is_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
     assert "in force already" in again.reason
 
 
-def test_a_voltage_at_rest_that_moved_speaks_of_friction(policy: CertifiedPolicy) -> None:
+def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -> None:
     now = OWN.replace(Ki=0.0, feedforward=-0.05)
     evidence = Evidence(estimated(10.0), at_rest(0.01), None, Setting(0.0, gains_of(now)), tuned_for=10.0 * DEG)
     made = policy.redesign(evidence)

@@ -44,16 +44,16 @@ def asks(
     return [decision.ask for decision in run(settings, seen, state)]
 
 
-def test_a_longer_window_is_asked_for_first() -> None:
+def test_a_longer_window_is_requested_first() -> None:
     assert asks(ALLOWED, [SHORT] * 4) == [None, LongerWindow(2.0, 0.3), None, None]
 
 
-def test_a_lower_bound_is_want_of_information_too() -> None:
+def test_a_lower_bound_counts_as_too_little_information() -> None:
     assert asks(ALLOWED, [replace(SHORT, status=GapStatus.LOWER_BOUND), SHORT])[-1] == LongerWindow(2.0, 0.3)
 
 
 @pytest.mark.parametrize("status", [GapStatus.OK, GapStatus.MODEL_MISMATCH])
-def test_what_is_known_and_what_no_motion_cures_begin_the_count_anew(status: GapStatus) -> None:
+def test_an_estimate_and_a_model_mismatch_reset_the_count(status: GapStatus) -> None:
     assert asks(ALLOWED, [SHORT, replace(SHORT, status=status), SHORT]) == [None] * 3
     assert asks(ALLOWED, [replace(SHORT, status=status)] * 9) == [None] * 9
 
@@ -65,7 +65,7 @@ def test_a_probe_comes_only_after_long_windows_have_failed_as_often() -> None:
     assert found[2] == Probe(PITCH * 25.0 * DEG, 0.85, 1)
 
 
-def test_where_windows_are_long_already_nothing_else_is_asked_for_first() -> None:
+def test_with_long_windows_a_probe_is_requested_at_once_after_enough_misses() -> None:
     assert [type(ask) for ask in asks(ALLOWED, [LONG, LONG])] == [type(None), Probe]
 
 
@@ -85,7 +85,7 @@ def test_without_permission_there_is_no_probe_and_the_reason_says_so() -> None:
     assert found[-1].reason.endswith("and a probing move is not allowed")
 
 
-def test_a_limit_that_is_too_small_is_said_instead_of_probing_in_vain() -> None:
+def test_a_limit_that_is_too_small_gives_a_reason_and_no_probe() -> None:
     found = run(ExcitationSettings(probe=1e-4), [LONG] * 2)[-1]
     assert found.ask is None
     assert found.reason.endswith("a probing move must be 0.139 mm, and at most 0.1 mm are allowed")
@@ -100,14 +100,14 @@ def test_probes_keep_their_distance() -> None:
 
 
 @pytest.mark.parametrize("change", [{"upper": math.inf}, {"slack": math.nan}])
-def test_what_is_not_bounded_is_not_probed(change: dict[str, float]) -> None:
+def test_without_a_bounded_gap_and_dead_zone_there_is_no_probe(change: dict[str, float]) -> None:
     found = run(ALLOWED, [replace(LONG, **change)] * 2)[-1]
     assert found.ask is None
     assert "bounded" in found.reason
 
 
 @pytest.mark.parametrize("outcome", [RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE])
-def test_an_edge_that_refuses_is_not_asked_again_before_it_boots(outcome: RequestOutcome) -> None:
+def test_an_edge_that_refuses_gets_no_request_before_it_boots(outcome: RequestOutcome) -> None:
     late = replace(LONG, time=1e6)
     refused = run(ALLOWED, [LONG, LONG])[-1].state.answered(Probe(1e-4, 0.85), outcome)
     assert asks(ALLOWED, [late] * 5, refused) == [None] * 5
@@ -156,7 +156,7 @@ def test_whatever_comes_probes_keep_distance_and_come_last(history: list[tuple[G
             assert seen[k].long == isinstance(decision.ask, Probe)
 
 
-def test_which_windows_are_long_enough() -> None:
+def test_a_window_is_long_enough_with_the_requested_length_and_pre_trigger() -> None:
     assert long_enough(2.0, 0.3, ALLOWED)
     assert long_enough(2.0 - 1e-9, 0.3, ALLOWED)
     assert not long_enough(1.0, 0.3, ALLOWED)

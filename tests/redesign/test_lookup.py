@@ -109,7 +109,7 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
     st.floats(2e-4, 5e-2),
     st.sampled_from((0.0, 1e-7, 1e-4)),
 )
-def test_what_is_looked_up_is_proved_for_the_region(one, other, fed, left, noise) -> None:
+def test_a_looked_up_setting_is_verified_for_the_region(one, other, fed, left, noise) -> None:
     """The invariant that everything stands on: another draw of machines, from the region alone, says the same."""
     low, high = sorted((one, other))
     asked = region(low, high, fed, left, noise)
@@ -149,13 +149,13 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
         (region(feedforward=0.3), "a feedforward of 0.3 V"),
     ],
 )
-def test_what_no_cell_contains_is_not_covered(asked: Region, why: str) -> None:
+def test_a_region_that_no_cell_contains_is_not_covered(asked: Region, why: str) -> None:
     found = table().find(asked)
     assert isinstance(found, NotVerified)
     assert why in found.reason
 
 
-def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
+def test_a_wider_cell_replaces_one_without_a_certificate() -> None:
     asked = region(1.0, 2.0)
     cells = dict(table().cells)
     narrow = [key for key in cells if key.level == 0]
@@ -166,7 +166,7 @@ def test_a_cell_without_a_proof_gives_way_to_a_wider_one() -> None:
     assert isinstance(none, NotVerified)
 
 
-def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
+def test_the_running_setting_stays_where_a_somewhat_wider_cell_verifies_it() -> None:
     asked = region(1.0, 2.0, feedforward=0.03)
     narrow = table().find(asked)
     other = Design(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
@@ -180,7 +180,7 @@ def test_what_runs_is_kept_where_a_cell_somewhat_wider_proves_it() -> None:
     assert changed.find(asked, integral.setting()).setting == narrow.setting
 
 
-def test_what_runs_is_not_kept_for_a_cell_much_wider() -> None:
+def test_the_running_setting_does_not_stay_for_a_much_wider_cell() -> None:
     fine = Grid(2.0 * DEG, (1e-2,), (0.0,))
     narrow, wide = (table().cells[CellIndex(level, 0, 0, 0)] for level in (0, 1))
     other = Design(wide.setting.controller.replace(Kp=1e3), wide.setting.tolerance)
@@ -198,7 +198,7 @@ def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
     assert isinstance(replace(table(), cells=cells).find(region(left=2e-2)), Certificate)
 
 
-def test_a_cell_whose_voltage_meets_its_limit_is_not_proved() -> None:
+def test_a_cell_whose_voltage_reaches_its_limit_is_not_verified() -> None:
     """There a feedforward would leave less on one side."""
     tight = replace(POLICY, servo=SERVO.replace(voltage_limit=1.0))
     loose = replace(POLICY, servo=SERVO.replace(voltage_limit=40.0))
@@ -212,7 +212,7 @@ def test_a_cell_whose_voltage_meets_its_limit_is_not_proved() -> None:
 # --- the policy
 
 
-def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
+def test_the_table_decides_like_the_policy_and_leaves_the_exact_verification() -> None:
     exact, looked_up = POLICY.redesign(evidence()), TablePolicy(POLICY, table()).redesign(evidence())
     assert looked_up.setting is not None
     assert looked_up.setting.gains.feedforward == exact.setting.gains.feedforward == -0.05
@@ -222,14 +222,14 @@ def test_the_table_decides_like_the_policy_and_owes_the_exact_proof() -> None:
     assert isinstance(POLICY.confirm(looked_up.to_verify, looked_up.certificate.setting), Certificate)
 
 
-def test_what_is_not_covered_gets_the_fallback_set_and_owes_nothing() -> None:
+def test_a_region_without_a_cell_gets_the_fallback_set_and_no_verification() -> None:
     made = TablePolicy(POLICY, table()).redesign(replace(evidence(), disturbance=Disturbance(0, math.inf, 0.0, 0, 0)))
     assert "the fallback set is sent" in made.reason
     assert made.setting.gains == gains_of(table().fallback.setting.controller)
     assert made.to_verify is None
 
 
-def test_what_is_in_force_is_not_sent_again() -> None:
+def test_a_setting_in_force_is_not_sent_again() -> None:
     policy = TablePolicy(POLICY, table())
     made = policy.redesign(evidence())
     again = policy.redesign(evidence(10.1, setting=made.setting))
@@ -255,11 +255,11 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(tmp_path_factory.mktemp("tables") / "paper.table")
 
 
-def test_a_table_comes_back_from_its_file_as_it_was(file: Path) -> None:
+def test_a_table_survives_its_file_unchanged(file: Path) -> None:
     assert load(file, POLICY) == table()
 
 
-def test_a_table_goes_on_where_it_was_interrupted(file: Path, tmp_path: Path, monkeypatch) -> None:
+def test_an_interrupted_table_is_continued(file: Path, tmp_path: Path, monkeypatch) -> None:
     path = built(tmp_path / "part.table", cells=3)
     with pytest.raises(InvalidInput, match=r"part\.table: \d+ cells of this table are not verified yet"):
         load(path, POLICY)
@@ -296,13 +296,13 @@ def test_a_table_of_another_version_is_refused(file: Path, monkeypatch) -> None:
         load(file, POLICY)
 
 
-def test_a_table_on_another_grid_is_not_gone_on_with(file: Path) -> None:
+def test_a_table_on_another_grid_is_not_continued(file: Path) -> None:
     with pytest.raises(InvalidInput, match="another grid"):
         next(build(file, POLICY, Grid(30.0 * DEG)))
 
 
 @pytest.mark.parametrize("content", [b"", b"\x80", b"no table", b"\x81\xa4type\xa1x"])
-def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.table"
     path.write_bytes(content)
     with pytest.raises(InvalidInput, match=r"x\.table: is no table"):

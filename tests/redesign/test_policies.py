@@ -104,7 +104,7 @@ def test_ranges_and_demands_carry_their_units(tmp_path):
         ("[twin.demands]\nMs = 0.5", "twin.demands.Ms = 0.5 is not allowed; give a number, at least 1"),
     ],
 )
-def test_what_is_wrong_is_one_sentence(tmp_path, text, words):
+def test_a_wrong_setting_is_refused_in_one_sentence(tmp_path, text, words):
     with pytest.raises(InvalidInput) as caught:
         load(tmp_path, text)
     message = str(caught.value)
@@ -118,7 +118,7 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
         load(tmp_path, "[twin.demands]\nMs = 1.0")
 
 
-def test_a_range_for_which_nothing_is_proved_is_refused_before_anything_runs(tmp_path):
+def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"no fallback set for the servo's stated range: none of \d+ candidates"):
         load(tmp_path, "[twin.uncertainty]\ninput_bias_v = [0, 0]\n[twin.demands]\novershoot_percent = 0.5")
 
@@ -133,7 +133,7 @@ def test_margin_has_no_map_for_a_limited_voltage():
         policy_of(PAPER.replace(voltage_limit=24.0), TwinSettings(policy="margin"))
 
 
-def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path):
+def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_path):
     scenario = load(tmp_path, "")
     proved = certified_policy(scenario.model, scenario.twin).fallback()
     agent = scenario.agent_settings()
@@ -147,7 +147,7 @@ def test_the_loop_begins_on_the_set_that_is_proved_for_the_whole_range(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[controller]\nki_v_per_m_s = 100.0\n", "[edge]\nwatched = true\n"])
-def test_unless_the_scenario_says_what_it_begins_with(tmp_path, text):
+def test_the_loop_begins_on_the_controller_that_the_scenario_gives(tmp_path, text):
     scenario = load(tmp_path, text)
     assert scenario.start_law == scenario.law
     assert not scenario.agent_settings().parameters.fallback

@@ -50,7 +50,7 @@ def test_events_see_their_own_time_and_may_schedule_more() -> None:
     assert clock.next_time == 3.0
 
 
-def test_what_lies_later_stays() -> None:
+def test_events_after_the_end_stay_scheduled() -> None:
     clock, seen = VirtualClock(), []
     clock.schedule(2.0, lambda: seen.append(2))
     clock.run_until(1.0)

@@ -67,7 +67,7 @@ def test_a_directory_is_made_with_its_parents(tmp_path):
     assert files.make_directory(tmp_path / "a" / "b").is_dir()
 
 
-def test_what_the_system_refuses_is_one_sentence(tmp_path):
+def test_a_refusal_by_the_system_is_one_sentence(tmp_path):
     with pytest.raises(InvalidInput, match=r"a\.txt: cannot be written \(No space left on device\)"):
         write_half(tmp_path / "a.txt", OSError(errno.ENOSPC, "No space left on device"))
     assert names(tmp_path) == []

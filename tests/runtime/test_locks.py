@@ -18,7 +18,7 @@ with locked(pathlib.Path(sys.argv[1])):
 """
 
 
-def test_another_process_holds_it_until_it_is_killed(tmp_path: Path) -> None:
+def test_a_lock_is_held_until_its_process_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "file-lock"
     command = [sys.executable, "-c", HOLD, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
@@ -31,7 +31,7 @@ def test_another_process_holds_it_until_it_is_killed(tmp_path: Path) -> None:
         assert os.fstat(descriptor).st_mode & 0o777 == 0o600
 
 
-def test_it_is_free_again_after_the_block(tmp_path: Path) -> None:
+def test_a_lock_is_released_after_the_block(tmp_path: Path) -> None:
     for _ in range(2):
         with locked(tmp_path / "file-lock"):
             pass

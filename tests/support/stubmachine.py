@@ -1,4 +1,4 @@
-"""A machine for tests of the gateway: the simulated drive's protocol, a position that follows the voltage, no numpy."""
+"""A machine for tests of the edge process: the simulated drive's protocol, and a position that follows the voltage."""
 
 import contextlib
 import socket

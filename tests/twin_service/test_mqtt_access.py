@@ -12,7 +12,7 @@ from selfsigned import self_made
 
 from servotwin.config.table import parse_toml
 from servotwin.edge_process.config import password_of
-from servotwin.edge_process.config_file import load as gateway_config
+from servotwin.edge_process.config_file import load as load_edge_config
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import Broker
 from servotwin.link.mqtt import MqttTransport
@@ -41,7 +41,7 @@ def test_the_files_that_the_guide_shows_are_read(tmp_path: Path) -> None:
         write_private(tmp_path / name, "secret")
     text = 'servo = "axis-1"\nrole = "supervise"\nsample_rate_hz = 100.0\n[drive]\nkind = "simulated"\n'
     (tmp_path / "edge.toml").write_text(text + shown("[twin]"))
-    config = gateway_config(tmp_path / "edge.toml")
+    config = load_edge_config(tmp_path / "edge.toml")
     assert config.twin is not None
     assert (config.twin.over_mqtt, password_of(config.twin, tmp_path)) == (True, "secret")
     (tmp_path / "tokens").touch(0o600)

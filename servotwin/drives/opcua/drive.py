@@ -1,4 +1,4 @@
-"""The drive: samples from ring buffers, parameters committed as one."""
+"""OPC UA drive: it reads samples from ring buffers, and commits parameters as one."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 
-CHANGES = 8
-"""Versions whose first sample is remembered: more are never between two looks at the samples."""
+_MOST_CHANGES = 8
+"""Number of versions whose first sample is stored: between two polls there are never more."""
 
-_ASKING = 0.01  # s between two looks whether parameters were taken
+_DECISION_POLL_S = 0.01
+"""Time between two polls for the drive's decision about parameters."""
 
 
 class OpcUaDrive:
     """`edge.drive.SupervisedDrive` of OPC UA nodes.
 
-    Samples written over before they were read show as a hole in the blocks' numbers; reconnected to the same run of the
+    Samples overwritten before they were read leave a gap in the blocks' numbers. Reconnected to the same run of the
     machine it goes on with the sample that is due, as long as the ring buffers hold it.
 
     Parameters
     ----------
     settings : OpcUaSettings
     clock, sleep : callable
-        Monotonic seconds, and how to wait for some.
+        Returns monotonic seconds; waits for so many seconds.
     """
 
     can_move = patient = False
@@ -48,13 +49,13 @@ class OpcUaDrive:
         self._settings, self._clock, self._sleep = settings, clock, sleep
         self._session: OpcUaSession | None = None
         self._ready: deque[Block] = deque()
-        self._changes: deque[ring.VersionChange] = deque(maxlen=CHANGES)
+        self._changes: deque[ring.VersionChange] = deque(maxlen=_MOST_CHANGES)
         self._next: int | None = None
-        self._looked = -inf
+        self._polled = -inf
         self._margin, self.rate, self.machine = 0, 0.0, ""
 
     def connect(self) -> None:
-        """Reach the server, at first or again; in a new run of the machine samples count from the present one."""
+        """Connect to the server, at first or again; in a new run of the machine reading begins with the next sample."""
         self.close()
         self._session = OpcUaSession(self._settings)
         self.rate, self._margin, machine, count, version, since = self._session.read(
@@ -66,15 +67,15 @@ class OpcUaDrive:
             self.machine, self._next = machine, count
             self._ready.clear()
             self._changes.clear()
-        self._learn(ring.VersionChange(since, version))
+        self._note_change(ring.VersionChange(since, version))
 
     def read(self, most: int = 0) -> Block | None:
-        """The next samples; never None, since a drive's run does not end."""
+        """Return the next samples; never None, since the drive's run does not end."""
         deadline = self._clock() + self._settings.silence_s
         while not self._ready:
-            self._sleep(max(0.0, self._looked + self._settings.poll_s - self._clock()))
-            self._looked = self._clock()
-            self._look(self._connected)
+            self._sleep(max(0.0, self._polled + self._settings.poll_s - self._clock()))
+            self._polled = self._clock()
+            self._poll(self._connected)
             if not self._ready and self._clock() > deadline:
                 raise self._lost(f"no new sample for {self._settings.silence_s:g} s")
         block = self._ready.popleft()
@@ -95,7 +96,7 @@ class OpcUaDrive:
         self._wait_for(session, commit)
 
     def move(self, _offset: float) -> None:
-        """Nothing: the model has no probing moves."""
+        """Do nothing: the model has no probing moves."""
 
     def close(self) -> None:
         """End the session."""
@@ -109,26 +110,26 @@ class OpcUaDrive:
             raise DriveLost(f"drive {self._settings.url}: not connected")
         return self._session
 
-    def _look(self, session: OpcUaSession) -> None:
-        """Take what is new in the rings."""
+    def _poll(self, session: OpcUaSession) -> None:
+        """Read the new samples of the rings."""
         machine, before, *signals, version, since, after = session.read(model.STATE)
         if machine != self.machine:
             raise self._lost("the machine began anew")
         reading = ring.RingReading(before, after, tuple(signals))
         if not ring.is_valid(reading) or type(version) is not int or type(since) is not int:
             raise self._lost("its variables do not hold what the model says")
-        self._learn(ring.VersionChange(since, version))
+        self._note_change(ring.VersionChange(since, version))
         due = before if self._next is None else self._next
         first, fresh = ring.whole(reading, due, self._margin)
         self._next = before
         self._ready.extend(ring.blocks(first, fresh, list(self._changes)) if len(fresh[0]) else ())
 
-    def _learn(self, change: ring.VersionChange) -> None:
+    def _note_change(self, change: ring.VersionChange) -> None:
         if not self._changes or self._changes[-1] != change:
             self._changes.append(change)
 
     def _wait_for(self, session: OpcUaSession, commit: int) -> None:
-        """Until the drive has decided."""
+        """Wait until the drive has decided about a commit; raise where it refuses."""
         deadline = self._clock() + self._settings.silence_s
         while True:
             committed, refused, version, since = session.read((*model.DECISION, "Version", "Since"))
@@ -136,10 +137,10 @@ class OpcUaDrive:
                 break
             if self._clock() > deadline:
                 raise self._lost(f"parameters were not decided about for {self._settings.silence_s:g} s")
-            self._sleep(_ASKING)
+            self._sleep(_DECISION_POLL_S)
         if refused:
             raise DriveRefused(f"drive {self._settings.url}: {refused}")
-        self._learn(ring.VersionChange(since, version))
+        self._note_change(ring.VersionChange(since, version))
 
     def _lost(self, why: str) -> DriveLost:
         self.close()

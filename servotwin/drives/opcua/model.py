@@ -1,9 +1,9 @@
 """The information model: one object with these variables, in one namespace (docs/howto/write-a-drive.md).
 
-Sample k of every signal is at place k modulo the arrays' length. The drive writes samples first and raises `Count`
-afterwards, by at most `Block` samples at a time; so whoever reads `Count`, the arrays, and `Count` again knows which
-places hold what they should. Parameters are written first, `Commit` after them: the drive looks at them when `Commit`
-changes, takes all or none, and then says so in `Committed` and `Refused`.
+Sample k of every signal is at index k modulo the arrays' length. The drive writes samples first and raises `Count`
+afterwards, by at most `Block` samples at a time; so a reader of `Count`, the arrays, and `Count` again knows which
+samples were not overwritten. The client writes the parameters first, then `Commit`: the drive reads them when `Commit`
+changes, accepts all or none, and reports that in `Committed` and `Refused`.
 """
 
 NAMESPACE = "urn:servotwin:drive:1"

@@ -1,4 +1,4 @@
-"""An OPC UA session in a thread of its own, behind plain calls that wait."""
+"""An OPC UA session in a thread of its own, behind blocking calls."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from servotwin.errors import InvalidInput
 from servotwin.runtime.extras import missing_extra
 
 _Result = TypeVar("_Result")
-_CLOSING = 2.0  # s
+_CLOSING_S = 2.0
 
-NEVER = (
+_PERMANENT_ERRORS = (
     "BadCertificate",
     "BadIdentityToken",
     "BadNoMatch",
@@ -26,7 +26,7 @@ NEVER = (
     "BadUserAccess",
     "BadUserSignature",
 )
-"""How the names of errors begin that trying again does not mend."""
+"""First parts of the names of errors that another try does not resolve."""
 
 
 class OpcUaSession:
@@ -39,9 +39,9 @@ class OpcUaSession:
     Raises
     ------
     DriveLost
-        There is no answer.
+        The server does not answer.
     InvalidInput
-        asyncua is not installed, the server does not let us in, or it has no such drive.
+        asyncua is not installed, the server refuses access, or it has no such drive.
     """
 
     def __init__(self, settings: OpcUaSettings) -> None:
@@ -66,7 +66,7 @@ class OpcUaSession:
             raise
 
     def read(self, names: Sequence[str]) -> list[Any]:
-        """Values of variables, in one request."""
+        """Read the values of variables in one request."""
         return self._wait(self._client.read_values([self._nodes[name] for name in names]))
 
     def write(self, values: Mapping[str, Any]) -> None:
@@ -75,7 +75,7 @@ class OpcUaSession:
         Raises
         ------
         DriveRefused
-            The server does not take one of them.
+            The server refuses one of them.
         """
         nodes = [self._nodes[name] for name in values]
         typed = [self._typed(name, value) for name, value in values.items()]
@@ -89,7 +89,7 @@ class OpcUaSession:
         if self._loop.is_closed():
             return
         asyncio.run_coroutine_threadsafe(self._end(), self._loop)
-        self._thread.join(2.0 * _CLOSING)
+        self._thread.join(2.0 * _CLOSING_S)
         if not self._thread.is_alive():
             self._loop.close()
 
@@ -101,9 +101,11 @@ class OpcUaSession:
         if s.certificate is not None and s.private_key is not None and s.server_certificate is not None:
             from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-            files = str(s.certificate), str(s.private_key)
             await client.set_security(
-                SecurityPolicyBasic256Sha256, *files, server_certificate=str(s.server_certificate)
+                SecurityPolicyBasic256Sha256,
+                str(s.certificate),
+                str(s.private_key),
+                server_certificate=str(s.server_certificate),
             )
         await client.connect()
         place = await client.get_namespace_index(model.NAMESPACE)
@@ -116,7 +118,7 @@ class OpcUaSession:
         return self._ua.DataValue(self._ua.Variant(value, self._types[name]))
 
     def _wait(self, work: Coroutine[Any, Any, _Result]) -> _Result:
-        """The result of something in the loop's thread."""
+        """Run a coroutine in the loop's thread and return its result."""
         waiting = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return waiting.result(2.0 * self._settings.silence_s)
@@ -129,12 +131,12 @@ class OpcUaSession:
         name, url = type(error).__name__, self._settings.url
         message = f"drive {url}: {name}" + (f" ({error})" if str(error) else "")
         missing = isinstance(error, ValueError) and not isinstance(error, OSError)
-        return InvalidInput(message) if missing or name.startswith(NEVER) else DriveLost(message)
+        return InvalidInput(message) if missing or name.startswith(_PERMANENT_ERRORS) else DriveLost(message)
 
     async def _end(self) -> None:
-        """Leave in order if the server lets us, and let no task go on."""
+        """Disconnect, and cancel the tasks that are left."""
         with suppress(*self._failures):
-            await asyncio.wait_for(self._client.disconnect(), _CLOSING)
+            await asyncio.wait_for(self._client.disconnect(), _CLOSING_S)
         rest = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
         for task in rest:
             task.cancel()

@@ -1,4 +1,4 @@
-"""How an OPC UA drive is reached."""
+"""Address and credentials of an OPC UA drive."""
 
 import os
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 @dataclass(frozen=True)
 class OpcUaSettings:
-    """How an OPC UA drive is reached.
+    """Address and credentials of an OPC UA drive.
 
     Parameters
     ----------

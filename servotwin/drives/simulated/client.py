@@ -18,15 +18,15 @@ _NO_GAINS = (0.0,) * len(Gains.__struct_fields__)
 
 
 @dataclass(frozen=True)
-class Welcome:
-    """A machine's answer to a connection."""
+class _Welcome:
+    """Rate (Hz) and run of a machine, as it reports them to a new client."""
 
     rate: float
     machine: str
 
 
-class MachineConnection:
-    """The connection to a machine in one role.
+class _MachineConnection:
+    """Connection to a machine in one role.
 
     Parameters
     ----------
@@ -35,16 +35,16 @@ class MachineConnection:
     role : str
         "control" or "supervise".
     silence : float
-        s without an answer after which the machine counts as lost; 0: never.
+        Time without an answer after which the machine counts as lost, s; 0: never.
     """
 
     def __init__(self, address: str, role: str, silence: float) -> None:
         self._address, self._role, self._silence = wire.address_of(address), role, silence
         self._socket: socket.socket | None = None
-        self.welcome = Welcome(0.0, "")
+        self.welcome = _Welcome(0.0, "")
 
     def connect(self) -> None:
-        """Reach the machine, at first or again."""
+        """Connect to the machine, at first or again."""
         self.close()
         self._socket = wire.new_socket(self._address)
         wire.patient(self._socket, self._silence)
@@ -55,26 +55,26 @@ class MachineConnection:
             answer = wire.receive(self._socket, wire.WELCOME.size)
         except OSError as error:
             raise self.lost(error) from None
-        self.welcome = self._welcomed(answer)
+        self.welcome = self._decode_welcome(answer)
 
-    def _welcomed(self, answer: bytes) -> Welcome:
+    def _decode_welcome(self, answer: bytes) -> _Welcome:
         magic, version, role, run, rate = wire.WELCOME.unpack(answer)
         if magic != wire.MAGIC or version != wire.VERSION or role != wire.ROLES[self._role]:
             self.close()
-            spoken = "" if magic != wire.MAGIC else f" (its role is {role}, its protocol {version})"
-            wanted = f"the role {self._role} in protocol {wire.VERSION}"
-            raise InvalidInput(f"machine address {self._address}: does not offer {wanted}{spoken}")
-        return Welcome(rate, run.hex())
+            offered = "" if magic != wire.MAGIC else f" (its role is {role}, its protocol {version})"
+            required = f"the role {self._role} in protocol {wire.VERSION}"
+            raise InvalidInput(f"machine address {self._address}: does not offer {required}{offered}")
+        return _Welcome(rate, run.hex())
 
     def send(self, data: bytes) -> None:
-        """Send all of it, or lose the machine."""
+        """Send all bytes; raises `DriveLost`."""
         try:
             self._connected.sendall(data)
         except OSError as error:
             raise self.lost(error) from None
 
     def receive(self, size: int) -> bytes:
-        """So many bytes, or lose the machine."""
+        """Receive `size` bytes; raises `DriveLost`."""
         try:
             return wire.receive(self._connected, size)
         except OSError as error:
@@ -87,23 +87,31 @@ class MachineConnection:
         return self._socket
 
     def lost(self, error: OSError) -> DriveLost:
-        """Make the error to raise when it is gone."""
+        """Close the connection, and make the error to raise."""
         self.close()
         reason = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
         return DriveLost(f"machine {self._address}: {reason}")
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 class SimulatedControl:
-    """`edge.drive.ControlDrive` of a simulated machine; the parameters are those of `MachineConnection`."""
+    """`edge.drive.ControlDrive` of a simulated machine.
+
+    Parameters
+    ----------
+    address : str
+        "unix:PATH" or "127.0.0.1:PORT".
+    silence : float
+        Time without an answer after which the machine counts as lost, s; 0: never.
+    """
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
-        self._connection = MachineConnection(address, "control", silence)
+        self._connection = _MachineConnection(address, "control", silence)
         self._voltage_due = False
         self._lag = 0.0
 
@@ -123,12 +131,12 @@ class SimulatedControl:
         return self._lag
 
     def connect(self) -> None:
-        """Reach the machine; its voltage is what it was left with until the first `write`."""
+        """Connect to the machine; its last voltage holds until the first `write`."""
         self._connection.connect()
         self._voltage_due = False
 
     def read(self) -> DriveSample | None:
-        """The next sample; one that was not answered lets the voltage hold."""
+        """Return the next sample; where the last one was not answered the voltage holds."""
         if self._voltage_due:
             self.write(nan)
         number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._connection.receive(wire.SAMPLE.size))
@@ -138,7 +146,7 @@ class SimulatedControl:
         return DriveSample(number, reference, theta_m, position)
 
     def write(self, voltage: float) -> None:
-        """Answer the last sample, once."""
+        """Answer the last sample with a voltage (V), once."""
         if self._voltage_due:
             self._voltage_due = False
             self._connection.send(wire.VOLTAGE.pack(voltage))
@@ -149,7 +157,7 @@ class SimulatedControl:
 
 
 class SimulatedSupervised:
-    """`edge.drive.SupervisedDrive` of a simulated machine; the parameters are those of `MachineConnection`.
+    """`edge.drive.SupervisedDrive` of a simulated machine; parameters as of `SimulatedControl`.
 
     Reconnected to the same run of the machine it goes on with the sample that is due, as long as the machine has it.
     """
@@ -157,7 +165,7 @@ class SimulatedSupervised:
     can_move, patient = True, False
 
     def __init__(self, address: str, silence: float = 5.0) -> None:
-        self._connection = MachineConnection(address, "supervise", silence)
+        self._connection = _MachineConnection(address, "supervise", silence)
         self._next = wire.NOW
         self._lag = 0.0
 
@@ -177,16 +185,16 @@ class SimulatedSupervised:
         return self._lag
 
     def connect(self) -> None:
-        """Reach the machine; in a new run samples count from the present one."""
+        """Connect to the machine; in a new run of it reading begins with the present sample."""
         before = self.machine
         self._connection.connect()
         if self.machine != before:
             self._next = wire.NOW
 
     def read(self, most: int = 0) -> Block | None:
-        """The next samples."""
-        over, count, first, version = self._ask(wire.READ, self._next, most=most)
-        if over == wire.OVER:
+        """Return the next samples; None: the run is over."""
+        status, count, first, version = self._request(wire.READ, self._next, most=most)
+        if status == wire.OVER:
             return None
         signals = [array("d") for _ in range(4)]
         data = self._connection.receive(32 * count) if count else b""
@@ -198,25 +206,31 @@ class SimulatedSupervised:
         return Block(first, version, *signals)
 
     def write(self, parameters: Parameters) -> None:
-        """Run on these from the next sample on."""
+        """Put parameters in force from the next sample on."""
         gains = _NO_GAINS if parameters.setting.gains is None else msgspec.structs.astuple(parameters.setting.gains)
         numbers = parameters.setting.tolerance, *gains
-        status, count, _, _ = self._ask(wire.WRITE, parameters.version, numbers, parameters.setting.gains is not None)
+        has_gains = parameters.setting.gains is not None
+        status, count, _, _ = self._request(wire.WRITE, parameters.version, numbers, has_gains)
         if status == wire.REFUSED:
             raise DriveRefused(self._connection.receive(count).decode("utf-8", "replace"))
 
     def move(self, offset: float) -> None:
-        """Add this (m) to the reference from the next sample on."""
-        self._ask(wire.MOVE, 0, (offset, *_NO_GAINS))
+        """Add `offset` (m) to the reference from the next sample on."""
+        self._request(wire.MOVE, 0, (offset, *_NO_GAINS))
 
     def close(self) -> None:
         """Let go of it."""
         self._connection.close()
 
-    def _ask(
-        self, kind: int, number: int, numbers: tuple[float, ...] = (0.0, *_NO_GAINS), gains: bool = False, most: int = 0
+    def _request(
+        self,
+        kind: int,
+        number: int,
+        numbers: tuple[float, ...] = (0.0, *_NO_GAINS),
+        has_gains: bool = False,
+        most: int = 0,
     ) -> tuple[int, int, int, int]:
-        """Send one request; returns the head of its reply."""
-        self._connection.send(wire.REQUEST.pack(kind, gains, most, number, *numbers))
+        """Send one request; return status, count, first sample and version of its reply."""
+        self._connection.send(wire.REQUEST.pack(kind, has_gains, most, number, *numbers))
         status, count, first, version, self._lag = wire.REPLY.unpack(self._connection.receive(wire.REPLY.size))
         return status, count, first, version

@@ -1,10 +1,10 @@
-"""Pacing of a machine by the clock, whose time (s) comes from outside."""
+"""Pacing of a simulated machine by the clock, whose time (s) the caller gives."""
 
 import math
 
 
 class Pace:
-    """Samples at `speed` times real time; what is late is caught up, as far as `slack`, the rest is given up.
+    """Schedule of samples at `speed` times real time; a delay up to `slack` is caught up, the rest is skipped.
 
     Parameters
     ----------
@@ -13,9 +13,9 @@ class Pace:
     speed : float
         Seconds of machine time per second.
     slack : float
-        s by the clock.
+        Longest delay that is caught up, s by the clock.
     now : float
-        When sample `first` is due, s.
+        Time at which sample `first` is due, s.
     first : int
     """
 
@@ -25,7 +25,7 @@ class Pace:
         self._zero = now - first * self._every
 
     def change(self, speed: float, now: float) -> None:
-        """Another speed from now on."""
+        """Change the speed from now on."""
         passed = (now - self._zero) / self._every
         self._every, self._speed = 1.0 / (self._rate * speed), speed
         self._zero = now - passed * self._every
@@ -35,11 +35,11 @@ class Pace:
         return self._zero + number * self._every
 
     def reached(self, now: float) -> int:
-        """The last sample that is due."""
+        """Number of the last sample that is due."""
         return math.floor((now - self._zero) / self._every)
 
     def keep(self, number: int, now: float) -> float:
-        """Machine time (s) by which a sample taken now is late; time beyond the slack is given up."""
+        """Shift the schedule by a delay beyond the slack; return the delay of a sample taken now, s of machine time."""
         late = now - self.due(number)
         if late > self._slack:
             self._zero += late - self._slack

@@ -1,4 +1,4 @@
-"""What the tests of the gateway's parts share: a configuration, and the far end of its pipe."""
+"""Configuration of an edge process for tests, and the link process's end of its pipe."""
 
 import socket
 from array import array
@@ -25,19 +25,19 @@ def cut(sequence: int = 0, samples: int = 10) -> Cut:
     return Cut(7, sequence, "reference", 3, 0.0, signals, 0.1, None)
 
 
-class Far:
-    """The link process's end of an outlet, spoken to by the test."""
+class LinkEnd:
+    """The link process's end of an outlet, driven by the test."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         self.pipe = FrameSocket(theirs)
         self.near = FrameSocket(ours)
 
-    def heard(self) -> list[frames.ToLink]:
+    def received(self) -> list[frames.ToLink]:
         return [frames.to_link(data) for data in self.pipe.receive()]
 
-    def say(self, *said: frames.ToControl) -> None:
-        for frame in said:
+    def send(self, *sent: frames.ToControl) -> None:
+        for frame in sent:
             self.pipe.post(frames.encode(frame))
         while self.pipe.backlog:
             self.pipe.send()
@@ -47,6 +47,6 @@ class Far:
         self.near.close()
 
 
-def pumped(box: PipeOutlet) -> None:
+def exchange_all(box: PipeOutlet) -> None:
     for _ in range(20):
         box.exchange()

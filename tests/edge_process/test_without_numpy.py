@@ -1,4 +1,4 @@
-"""The edge's half runs where numpy, scipy and numba are absent."""
+"""The edge runs where numpy, scipy and numba are absent."""
 
 import subprocess
 import sys
@@ -50,7 +50,7 @@ print("controlled, recorded, sent, acknowledged, updated")
 """
 
 
-def test_control_record_send_and_update_without_numbers_libraries() -> None:
+def test_the_edge_runs_without_numpy() -> None:
     root = Path(servotwin.__file__).parents[1]
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(PROGRAM)],
@@ -63,7 +63,7 @@ def test_control_record_send_and_update_without_numbers_libraries() -> None:
     assert done.stdout.strip() == "controlled, recorded, sent, acknowledged, updated", done.stderr
 
 
-def test_nothing_of_the_edge_imports_them_even_late() -> None:
+def test_no_module_of_the_edge_imports_numpy_even_late() -> None:
     package = Path(servotwin.__file__).parent
     parts = ("messages", "control", "link", "edge", "runtime", "edge_process")
     files = [file for part in parts for file in (package / part).rglob("*.py")]

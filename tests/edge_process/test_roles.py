@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-from gateway_parts import CONFIG, LAW, RATE, Far, cut, pumped
+from edge_process_parts import CONFIG, LAW, RATE, LinkEnd, cut, exchange_all
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,8 +36,8 @@ from servotwin.messages import (
 
 
 @pytest.fixture
-def far() -> Iterator[Far]:
-    made = Far()
+def far() -> Iterator[LinkEnd]:
+    made = LinkEnd()
     yield made
     made.close()
 
@@ -46,9 +46,7 @@ POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e
 
 
 @given(st.lists(st.tuples(POSITIONS, POSITIONS), max_size=30), st.booleans())
-def test_the_law_never_gives_what_is_no_number_and_forgets_it(
-    samples: list[tuple[float, float]], limited: bool
-) -> None:
+def test_the_law_never_gives_a_voltage_that_is_not_finite(samples: list[tuple[float, float]], limited: bool) -> None:
     controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
     guarded = GuardedLaw(controller.law(1e-5), 2, 0.0)
     for reference, position in samples:
@@ -70,7 +68,7 @@ def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
 
 
 class ScriptedDrive:
-    """Both drives: gives what it is told, notes what it is given."""
+    """A drive of both roles, with scripted samples; it records what is written to it."""
 
     machine, lag, can_move, patient, rate = "m", 0.0, True, False, RATE
 
@@ -129,8 +127,8 @@ def samples(first: int, count: int, reference: float = 1e-3) -> list[DriveSample
     return [DriveSample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
 
 
-def letters(far: Far, kind: type | tuple[type, ...]) -> list[object]:
-    found = [decode(frame.body) for frame in far.heard() if isinstance(frame, frames.LetterFrame)]
+def letters(far: LinkEnd, kind: type | tuple[type, ...]) -> list[object]:
+    found = [decode(frame.body) for frame in far.received() if isinstance(frame, frames.LetterFrame)]
     return [message for message in found if isinstance(message, kind)]
 
 
@@ -139,7 +137,7 @@ def update(version: int, tolerance: float, sequence: int = 0, boot: str = "b0") 
     return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", Setting(tolerance), 1e6)
 
 
-def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> None:
+def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box)
@@ -147,18 +145,18 @@ def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: Far) -> No
     role = ControlRole(edge, drive)
     for _ in range(15):
         role.step()
-    far.say(frames.MessageFrame(1, encode(update(1, 5e-3 / 10))))
+    far.send(frames.MessageFrame(1, encode(update(1, 5e-3 / 10))))
     for _ in range(10):
         role.step()
     assert edge.agent.parameters.version == 1
     assert drive.voltages[16] == pytest.approx(drive.voltages[15], rel=1e-6)
-    pumped(box)
+    exchange_all(box)
     (receipt,) = letters(far, Receipt)
     assert isinstance(receipt, Receipt)
     assert receipt.applied
 
 
-def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
+def test_parameters_in_force_are_carried_into_a_new_boot(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box)
@@ -166,7 +164,7 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
     role = ControlRole(edge, drive)
     for _ in range(14):
         role.step()
-    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
+    far.send(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(10):
         role.step()
     assert (edge.agent.settings.boot, edge.agent.parameters.version) == ("b0.1", 1)
@@ -177,14 +175,16 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: Far) -> None:
 
 
 @pytest.mark.parametrize("then", [samples(1000, 3), [DriveSample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])
-def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far: Far, then: list[DriveSample]) -> None:
+def test_an_update_that_arrives_with_the_last_sample_before_a_gap_is_in_force_after_it(
+    far: LinkEnd, then: list[DriveSample]
+) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     edge = edge_of(box)
     role = ControlRole(edge, ScriptedDrive([*samples(0, 15), *then]))
     for _ in range(14):
         role.step()
-    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
+    far.send(frames.MessageFrame(1, encode(update(1, 1e-4))))
     role.step()
     assert (edge.agent.parameters.version, role.law.law) == (1, CONFIG.law(None, 0.0))
     voltage = role.law.voltage
@@ -194,7 +194,7 @@ def test_what_came_with_the_last_sample_before_a_gap_is_what_the_law_runs_on(far
     assert role.law.voltage == pytest.approx(voltage)
 
 
-def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: Far) -> None:
+def test_a_lost_drive_is_connected_again_and_the_law_begins_anew(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)
     edge, stop = edge_of(box), StopSignal()
@@ -259,7 +259,7 @@ def block(first: int, count: int, reference: float = 1e-3) -> Block:
 SUPERVISED = replace(CONFIG, role="supervise")
 
 
-def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, EdgeRuntime, ScriptedDrive, SupervisingRole]:
+def supervising(far: LinkEnd, blocks: int) -> tuple[PipeOutlet, EdgeRuntime, ScriptedDrive, SupervisingRole]:
     """A connected edge that has supervised a first block."""
     box = PipeOutlet(True)
     box.connect(far.near)
@@ -270,18 +270,18 @@ def supervising(far: Far, blocks: int) -> tuple[PipeOutlet, EdgeRuntime, Scripte
     return box, edge, drive, role
 
 
-def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far) -> None:
+def test_supervising_records_writes_parameters_and_moves_the_reference(far: LinkEnd) -> None:
     box, _, drive, role = supervising(far, 12)
     assert [p.version for p in drive.voltages] == [0]
-    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
+    far.send(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
         role.step()
     assert [p.version for p in drive.voltages] == [0, 1]
-    far.say(frames.MessageFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
+    far.send(frames.MessageFrame(2, encode(Request("axis-1", "b0", 1, Probe(5e-4, 0.05), 1e6))))
     for _ in range(2):
         role.step()
     assert "move 0.0005" in drive.log
-    pumped(box)
+    exchange_all(box)
     (answer,) = letters(far, Answer)
     assert isinstance(answer, Answer)
     assert answer.taken
@@ -289,11 +289,11 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Far)
     assert drive.log[-1] == "move 0.0"
 
 
-def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> None:
+def test_parameters_that_a_supervised_drive_refuses_are_restored_and_reported(far: LinkEnd) -> None:
     """The agent runs on what the drive runs on, under a version of its own; the twin hears of it after the receipt."""
     box, edge, drive, role = supervising(far, 40)
     drive.refuse = True
-    far.say(frames.MessageFrame(1, encode(update(1, 1e-4))))
+    far.send(frames.MessageFrame(1, encode(update(1, 1e-4))))
     for _ in range(5):
         role.step()
     drive.refuse = False
@@ -302,7 +302,7 @@ def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> Non
     in_force = edge.agent.parameters
     assert (in_force.version, in_force.setting.tolerance) == (2, drive.voltages[0].setting.tolerance)
     assert [p.version for p in drive.voltages] == [0]
-    pumped(box)
+    exchange_all(box)
     receipt, fallback = letters(far, (Receipt, Fallback))
     assert isinstance(receipt, Receipt)
     assert receipt.applied
@@ -313,7 +313,7 @@ def test_what_a_supervised_drive_refuses_is_taken_back_and_told(far: Far) -> Non
     assert drive.voltages[-1] == in_force
 
 
-def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: LinkEnd, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outlet, "MOST", 2000)
     dropped = {}
     for patient in (False, True):
@@ -333,7 +333,7 @@ def test_a_log_waits_for_the_link_process_and_a_machine_does_not(far: Far, monke
     assert dropped[True] == 0
 
 
-def test_the_end_waits_while_the_link_process_takes_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_edge_ends_after_the_link_process_has_taken_all_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     box = PipeOutlet(True)
     edge = edge_of(box)
     for k in range(50):
@@ -351,7 +351,7 @@ def test_the_end_waits_while_the_link_process_takes_what_is_left(monkeypatch: py
     assert 47.0 < clock.now < 55.0
 
 
-def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: Far) -> None:
+def test_a_supervised_drive_that_refuses_or_misses_is_counted(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     edge = edge_of(box, SUPERVISED)
     drive = ScriptedDrive([block(0, 5), block(8, 5), block(13, 0), block(500, 5), None])

@@ -1,4 +1,4 @@
-"""What must not take the controller, or a window, along when it fails: disk, judge, log, drive, an old file."""
+"""Failures that cost neither the control loop nor a window: disk, window filter, log, drive, an old file."""
 
 import math
 import os
@@ -68,7 +68,7 @@ def handler(outbox: SqliteOutbox, tmp_path: Path) -> FrameHandler:
     return FrameHandler(replace(CONFIG, folder=tmp_path), outbox)
 
 
-def test_what_is_not_on_the_disk_stays_with_the_control_process_too(handler: FrameHandler, tmp_path: Path) -> None:
+def test_an_unwritten_window_is_not_confirmed(handler: FrameHandler, tmp_path: Path) -> None:
     assert handler.handle(cut(0)) == []
     assert handler.handle(frames.LetterFrame(20, b"letter")) == []
     assert handler.retry() == []
@@ -77,19 +77,19 @@ def test_what_is_not_on_the_disk_stays_with_the_control_process_too(handler: Fra
     assert handler.handle(cut(1)) == [11]
 
 
-def test_what_the_twin_has_need_not_be_on_the_disk(handler: FrameHandler, outbox: SqliteOutbox) -> None:
+def test_a_window_that_the_twin_has_is_confirmed_without_the_disk(handler: FrameHandler, outbox: SqliteOutbox) -> None:
     handler.handle(cut(0))
     handler.handle(cut(1))
     outbox.remove(("b1", 0))
     assert handler.retry() == [10]
 
 
-def test_what_waits_for_the_disk_is_bounded(handler: FrameHandler, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritten_frames_are_bounded(handler: FrameHandler, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frame_handler, "MOST_UNWRITTEN", 3 * 64)
     assert [handler.handle(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
 
 
-def test_a_window_that_cannot_be_judged_is_sent(
+def test_a_window_whose_filter_fails_is_sent(
     handler: FrameHandler, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
@@ -98,7 +98,7 @@ def test_a_window_that_cannot_be_judged_is_sent(
     assert handler.faults == {UNFILTERED: 1}
 
 
-def test_a_window_with_a_bad_sample_is_not_news(
+def test_a_window_with_a_bad_sample_is_not_filtered_and_not_sent(
     handler: FrameHandler, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
@@ -108,17 +108,17 @@ def test_a_window_with_a_bad_sample_is_not_news(
     assert not handler.faults
 
 
-def test_an_edge_hears_that_nothing_is_owed_any_more() -> None:
-    """A window that was delivered before its link process died: the next one only says that it is done."""
+def test_an_acknowledged_frame_ends_the_wait_for_the_twin() -> None:
+    """The window was delivered before its link process died: the next one only acknowledges the frame."""
     box = PipeOutlet(True)
     box.offer(cut(0).cut, 0.0)
     assert box.unacknowledged
-    heard = box._receive([frames.encode(frames.AckFrame(1))])
-    assert heard.pending_changed
+    received = box._receive([frames.encode(frames.AckFrame(1))])
+    assert received.pending_changed
     assert not box.unacknowledged
 
 
-def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logging_to_a_full_pipe_does_not_block(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as out, os.fdopen(writer, "w", encoding="utf-8") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
@@ -129,17 +129,17 @@ def test_a_log_that_nobody_reads_is_not_waited_for(monkeypatch: pytest.MonkeyPat
         monkeypatch.undo()
 
 
-def test_without_a_standard_error_nothing_is_said(
+def test_without_a_standard_error_nothing_is_logged(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monitoring.log("heard")
     with monkeypatch.context() as context:
         context.setattr(sys, "stderr", None)
         monitoring.log("unheard")
-    out, said = capfd.readouterr()
+    out, logged = capfd.readouterr()
     assert out == ""
-    assert "heard" in said
-    assert "unheard" not in said
+    assert "heard" in logged
+    assert "unheard" not in logged
 
 
 class Failing:
@@ -160,14 +160,14 @@ class Failing:
 
 
 @pytest.mark.parametrize(("error", "stopped"), [(RuntimeError("a bug"), 1), (DriveLost("gone"), 0)])
-def test_whatever_ends_the_loop_the_drive_gets_the_safe_voltage(error: Exception, stopped: int) -> None:
+def test_an_error_in_the_loop_leaves_the_drive_safe(error: Exception, stopped: int) -> None:
     role = Failing(error)
     with pytest.raises(type(error), match=str(error)):
         run_role(StopSignal(), role)
     assert role.stopped == stopped
 
 
-def test_parameters_from_before_hold_where_todays_limits_allow_them() -> None:
+def test_stored_parameters_hold_where_todays_limits_allow_them() -> None:
     gains = gains_of(LAW)
     good = Parameters(3, Setting(1e-3, gains))
     assert permitted(good, SETTINGS) is good

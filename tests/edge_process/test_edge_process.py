@@ -40,7 +40,7 @@ sys.meta_path.insert(0, Absent())
 """
 
 
-class Gateway:
+class RunningEdge:
     """A folder with an edge.toml, and the process that runs it."""
 
     def __init__(self, folder: Path, machine: StubMachine, twin: TwinLink | None) -> None:
@@ -106,8 +106,8 @@ def twin() -> Iterator[FakeTwin]:
 
 
 @pytest.fixture
-def gateway(tmp_path: Path, machine: StubMachine, twin: FakeTwin) -> Iterator[Gateway]:
-    made = Gateway(tmp_path, machine, TwinLink(twin.url, "token", timeout_s=5.0, wait_s=1.0))
+def edge(tmp_path: Path, machine: StubMachine, twin: FakeTwin) -> Iterator[RunningEdge]:
+    made = RunningEdge(tmp_path, machine, TwinLink(twin.url, "token", timeout_s=5.0, wait_s=1.0))
     yield made
     made.kill()
 
@@ -126,83 +126,83 @@ def sequences(twin: FakeTwin) -> dict[str, list[int]]:
     return found
 
 
-def whole(sequence: list[int]) -> bool:
+def is_complete(sequence: list[int]) -> bool:
     return sequence == list(range(len(sequence)))
 
 
-def test_it_controls_records_and_sends_without_numbers_libraries(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+def test_an_edge_controls_records_and_sends_without_numpy(
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
-    gateway.start()
-    until(lambda: len(twin.windows) >= 4 and gateway.status().get("samples", 0) > 0)
-    assert gateway.signal(signal.SIGTERM) == 0
+    edge.start()
+    until(lambda: len(twin.windows) >= 4 and edge.status().get("samples", 0) > 0)
+    assert edge.signal(signal.SIGTERM) == 0
     (found,) = sequences(twin).values()
-    left = {sequence for _, sequence in gateway.outbox()}
-    assert whole(sorted({*found, *left}))
+    left = {sequence for _, sequence in edge.outbox()}
+    assert is_complete(sorted({*found, *left}))
     window = next(iter(twin.windows.values()))
     assert (window.samples, window.rate, window.reason) == (100, RATE, "reference")
     assert isinstance(twin.letters[0], Hello)
     assert max(machine.voltages) > 0.1
     assert machine.voltages[-1] == 0.0
-    status = gateway.status()
+    status = edge.status()
     assert (status["servo"], status["role"], status["version"]) == ("axis-1", "control", 0)
     assert status["tick"]["number"] == status["samples"]
-    assert "secret" not in gateway.log()
+    assert "secret" not in edge.log()
 
 
 def test_the_link_process_is_killed_again_and_again_and_the_controller_ticks_on(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
-    gateway.start()
+    edge.start()
     for _ in range(3):
-        until(lambda: gateway.status().get("link_process", 0) > 0)
-        os.kill(gateway.status()["link_process"], signal.SIGKILL)
-        (gateway.folder / "status.json").unlink()
+        until(lambda: edge.status().get("link_process", 0) > 0)
+        os.kill(edge.status()["link_process"], signal.SIGKILL)
+        (edge.folder / "status.json").unlink()
         machine.wait_for(machine.number + 300)
     count = len(twin.windows)
     until(lambda: len(twin.windows) >= count + 3)
-    assert gateway.signal(signal.SIGINT) == 0
+    assert edge.signal(signal.SIGINT) == 0
     (found,) = sequences(twin).values()  # one boot: no sample was missed
-    assert whole(found)
+    assert is_complete(found)
     assert machine.clients == 1
-    assert gateway.log().count("link process gone") == 3
+    assert edge.log().count("link process gone") == 3
 
 
 def test_kill_9_of_the_whole_edge_loses_at_most_the_window_being_cut(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
     twin.fault = lambda handler, _: bool(handler.refuse(503, Refusal.UNAVAILABLE)) or True
     for _ in range(3):
-        gateway.start()
-        before = len(gateway.outbox())
-        until(lambda: len(gateway.outbox()) >= before + 3)  # noqa: B023
-        gateway.kill()
-    kept = gateway.outbox()
+        edge.start()
+        before = len(edge.outbox())
+        until(lambda: len(edge.outbox()) >= before + 3)  # noqa: B023
+        edge.kill()
+    kept = edge.outbox()
     twin.fault = None
-    gateway.start()
+    edge.start()
     until(lambda: set(kept) <= set(twin.windows))
     until(lambda: len(sequences(twin)) == 4)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     assert len({boot.split("-")[0] for boot in sequences(twin)}) == 4
-    assert all(map(whole, sequences(twin).values()))
+    assert all(map(is_complete, sequences(twin).values()))
 
 
-def test_without_a_twin_it_controls_and_keeps(gateway: Gateway, machine: StubMachine) -> None:
-    gateway.write(twin=None)
-    gateway.start()
-    until(lambda: len(gateway.outbox()) >= 3)
-    assert gateway.signal(signal.SIGTERM) == 0
-    assert "up" not in gateway.status()
+def test_without_a_twin_an_edge_controls_and_stores_windows(edge: RunningEdge, machine: StubMachine) -> None:
+    edge.write(twin=None)
+    edge.start()
+    until(lambda: len(edge.outbox()) >= 3)
+    assert edge.signal(signal.SIGTERM) == 0
+    assert "up" not in edge.status()
 
 
-def test_a_terminal_that_is_closed_leaves_the_safe_voltage(gateway: Gateway, machine: StubMachine) -> None:
-    gateway.start()
-    until(lambda: gateway.status().get("samples", 0) > 0)
-    assert gateway.process is not None
-    os.killpg(gateway.process.pid, signal.SIGHUP)
-    assert gateway.process.wait(60) == 0
+def test_a_terminal_that_is_closed_leaves_the_safe_voltage(edge: RunningEdge, machine: StubMachine) -> None:
+    edge.start()
+    until(lambda: edge.status().get("samples", 0) > 0)
+    assert edge.process is not None
+    os.killpg(edge.process.pid, signal.SIGHUP)
+    assert edge.process.wait(60) == 0
     assert machine.voltages[-1] == 0.0
-    assert "link process gone" not in gateway.log()
+    assert "link process gone" not in edge.log()
 
 
 def update(window: WindowMessage, version: int) -> Update:
@@ -212,7 +212,7 @@ def update(window: WindowMessage, version: int) -> Update:
 
 
 def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
     """Answers fail before or after the twin has the window; updates come twice, sealed by others, and again later."""
     chance, versions = random.Random(1), iter(range(1, 1000))
@@ -228,144 +228,144 @@ def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
     def answer(window: WindowMessage) -> None:
         if (window.boot, window.sequence) not in answered:
             answered.add((window.boot, window.sequence))
-            said = update(window, next(versions))
-            serial = twin.say(said)
-            twin.say(said, serial)  # the same serial once more
-            twin.say(said)  # the same update under another one
-            twin.say(said, token="another servo's")
+            message = update(window, next(versions))
+            serial = twin.say(message)
+            twin.say(message, serial)  # the same serial once more
+            twin.say(message)  # the same update under another one
+            twin.say(message, token="another servo's")
 
     answered: set[tuple[str, int]] = set()
     twin.fault, twin.on_window = fault, answer
-    gateway.start()
+    edge.start()
     until(lambda: len(twin.windows) >= 8)
     twin.fault = None
     until(lambda: len([x for x in twin.letters if isinstance(x, Receipt) and x.applied]) >= 3)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     (found,) = sequences(twin).values()
-    assert whole(found)
+    assert is_complete(found)
     receipts = {receipt.version: receipt for receipt in twin.letters if isinstance(receipt, Receipt)}
     applied = sorted(version for version, receipt in receipts.items() if receipt.applied)
     assert applied == list(range(1, len(applied) + 1))
     samples = [receipts[version].sample for version in applied]
     assert samples == sorted(samples)
-    assert gateway.status()["down"]["broken seal"] > 0
+    assert edge.status()["down"]["broken seal"] > 0
 
 
-def test_a_wrong_token_costs_no_window(gateway: Gateway, machine: StubMachine, twin: FakeTwin) -> None:
+def test_a_wrong_token_costs_no_window(edge: RunningEdge, machine: StubMachine, twin: FakeTwin) -> None:
     twin.token = "changed"
-    gateway.start()
-    until(lambda: gateway.status().get("up", {}).get("refused: bad_token", 0) > 1)
+    edge.start()
+    until(lambda: edge.status().get("up", {}).get("refused: bad_token", 0) > 1)
     assert len(twin.windows) == 0
     twin.token = "secret"
     until(lambda: len(twin.windows) >= 3)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     (found,) = sequences(twin).values()
-    assert whole(found)
+    assert is_complete(found)
 
 
-def test_samples_that_are_no_numbers_hold_the_voltage_then_make_it_safe(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+def test_samples_that_are_not_finite_hold_the_voltage_then_make_it_safe(
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
     bad = range(300, 340)
     machine.spoil = lambda n, *rest: (n, rest[0], float("nan"), float("nan")) if n in bad else (n, *rest)
-    gateway.start()
+    edge.start()
     machine.wait_for(500)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     hold = round(0.01 * RATE)
     assert machine.voltages[300 : 300 + hold] == [machine.voltages[299]] * hold
     assert machine.voltages[300 + hold : 340] == [0.0] * (40 - hold)
     assert machine.voltages[340] != 0.0
-    assert gateway.status()["bad samples"] == 40
-    assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
+    assert edge.status()["bad samples"] == 40
+    assert edge.status()["windows"]["dropped"] == {"sample not finite": 1}
 
 
-def test_a_few_missing_samples_cost_their_window_only(gateway: Gateway, machine: StubMachine, twin: FakeTwin) -> None:
+def test_a_few_missing_samples_cost_their_window_only(edge: RunningEdge, machine: StubMachine, twin: FakeTwin) -> None:
     machine.spoil = lambda n, *rest: (n if n < 300 else n + 7, *rest)
-    gateway.start()
+    edge.start()
     until(lambda: len(twin.windows) >= 4)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     (found,) = sequences(twin).values()
     assert sorted({*found, 1}) == list(range(len(found) + 1))  # cut from sample 250 on
-    assert gateway.status()["samples missed"] == 7
-    assert gateway.status()["windows"]["dropped"] == {"sample not finite": 1}
+    assert edge.status()["samples missed"] == 7
+    assert edge.status()["windows"]["dropped"] == {"sample not finite": 1}
     assert twin.windows[next(reversed(twin.windows))].start * RATE % machine.every == 7
 
 
 def test_many_missing_samples_begin_a_new_boot_and_the_law_goes_on(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
     machine.spoil = lambda n, *rest: (n if n < 300 else n + 700, *rest)
-    gateway.start()
+    edge.start()
     until(lambda: len(sequences(twin)) == 2)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
     first, second = sequences(twin)
     assert second == f"{first}.1"
-    assert gateway.status()["boot: samples missing"] == 1
+    assert edge.status()["boot: samples missing"] == 1
     assert machine.voltages[300] == pytest.approx(machine.voltages[299], rel=0.2)
 
 
-def test_a_wrong_configuration_ends_with_one_sentence(gateway: Gateway, machine: StubMachine) -> None:
-    (gateway.folder / "token").chmod(0o644)
-    gateway.start()
-    assert gateway.process is not None
-    assert gateway.process.wait(60) == 2
-    assert "mode 0600" in gateway.log()
-    assert "Traceback" not in gateway.log()
+def test_a_wrong_configuration_ends_with_one_sentence(edge: RunningEdge, machine: StubMachine) -> None:
+    (edge.folder / "token").chmod(0o644)
+    edge.start()
+    assert edge.process is not None
+    assert edge.process.wait(60) == 2
+    assert "mode 0600" in edge.log()
+    assert "Traceback" not in edge.log()
 
 
 def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
-    gateway: Gateway, machine: StubMachine
+    edge: RunningEdge, machine: StubMachine
 ) -> None:
-    gateway.start()
+    edge.start()
     until(lambda: len(machine.voltages) > 100)
-    command = [sys.executable, "-m", "servotwin.edge_process", str(gateway.folder / "edge.toml")]
+    command = [sys.executable, "-m", "servotwin.edge_process", str(edge.folder / "edge.toml")]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (second.returncode, second.stderr.count("\n")) == (2, 1)
     assert "another edge runs on its files" in second.stderr
-    other = replace(gateway.config, keeping=replace(gateway.config.keeping, parameters="other.json"))
-    (gateway.folder / "other.toml").write_text(edge_toml(other))
-    third = subprocess.run([*command[:-1], str(gateway.folder / "other.toml")], timeout=60, check=False)
+    other = replace(edge.config, keeping=replace(edge.config.keeping, parameters="other.json"))
+    (edge.folder / "other.toml").write_text(edge_toml(other))
+    third = subprocess.run([*command[:-1], str(edge.folder / "other.toml")], timeout=60, check=False)
     assert third.returncode == 2
     before = len(machine.voltages)
     until(lambda: len(machine.voltages) > before + 100)
-    gateway.kill()
-    gateway.start()
+    edge.kill()
+    edge.start()
     until(lambda: len(machine.voltages) > before + 300)
-    assert gateway.signal(signal.SIGTERM) == 0
+    assert edge.signal(signal.SIGTERM) == 0
 
 
 def test_a_full_disk_stops_neither_the_controller_nor_the_link(
-    gateway: Gateway, machine: StubMachine, twin: FakeTwin
+    edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
     """A limit on the size of the link process's files stands for the disk; later there is room again."""
-    gateway.start()
-    until(lambda: gateway.status().get("link_process", 0) > 0)
-    link, count = gateway.status()["link_process"], len(twin.windows)
+    edge.start()
+    until(lambda: edge.status().get("link_process", 0) > 0)
+    link, count = edge.status()["link_process"], len(twin.windows)
     before = resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
-    until(lambda: not gateway.status()["disk"]["safe"])
+    until(lambda: not edge.status()["disk"]["safe"])
     until(lambda: len(twin.windows) >= count + 4)
-    assert gateway.status()["disk"]["faults"]["disk not writable"] > 0
+    assert edge.status()["disk"]["faults"]["disk not writable"] > 0
     resource.prlimit(link, resource.RLIMIT_FSIZE, before)
-    until(lambda: gateway.status()["disk"]["safe"])
-    assert gateway.signal(signal.SIGTERM) == 0
+    until(lambda: edge.status()["disk"]["safe"])
+    assert edge.signal(signal.SIGTERM) == 0
     (found,) = sequences(twin).values()
-    assert whole(found)
-    assert gateway.status()["windows"]["dropped"] == {}
-    assert gateway.status()["link_process"] == link
+    assert is_complete(found)
+    assert edge.status()["windows"]["dropped"] == {}
+    assert edge.status()["link_process"] == link
 
 
 def test_a_link_process_that_is_killed_on_a_full_disk_takes_no_window_along(
-    gateway: Gateway, machine: StubMachine
+    edge: RunningEdge, machine: StubMachine
 ) -> None:
-    gateway.write(twin=None)
-    gateway.start()
-    until(lambda: gateway.status().get("link_process", 0) > 0)
-    link = gateway.status()["link_process"]
+    edge.write(twin=None)
+    edge.start()
+    until(lambda: edge.status().get("link_process", 0) > 0)
+    link = edge.status()["link_process"]
     resource.prlimit(link, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
-    until(lambda: not gateway.status()["disk"]["safe"])
+    until(lambda: not edge.status()["disk"]["safe"])
     machine.wait_for(machine.number + 500)
     os.kill(link, signal.SIGKILL)
-    until(lambda: gateway.status()["link_process"] != link and gateway.status()["disk"]["safe"])
-    assert gateway.signal(signal.SIGTERM) == 0
-    assert whole([sequence for _, sequence in gateway.outbox()])
-    assert len(gateway.outbox()) >= 4
+    until(lambda: edge.status()["link_process"] != link and edge.status()["disk"]["safe"])
+    assert edge.signal(signal.SIGTERM) == 0
+    assert is_complete([sequence for _, sequence in edge.outbox()])
+    assert len(edge.outbox()) >= 4
