@@ -19,7 +19,7 @@ NAME = "estimator"
 def accuracy(
     date: str = "", output: Path | None = None, size: float = 1.0, console: Console | None = None
 ) -> tuple[Figure, ...]:
-    """Measure, show as it comes, and write JSON when asked to.
+    """Measure, show as it comes, and write JSON if `output` is given.
 
     Parameters
     ----------

@@ -31,12 +31,12 @@ class Options:
 
     @property
     def wear(self) -> WearWorkload:
-        """In full 200 s with 10 reference steps; small 8 s with 4."""
+        """The wearing servo: in full 200 s with 10 reference steps; small 8 s with 4."""
         return WearWorkload(duration=8.0, period=4.0) if self.quick else WearWorkload()
 
     @property
     def sweep(self) -> SweepWorkload:
-        """In full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
+        """The ensemble: in full 16 x 16 runs of 20 s; small 3 x 3 of 1 s."""
         return SweepWorkload(side=3, duration=1.0) if self.quick else SweepWorkload()
 
 
@@ -44,7 +44,7 @@ Build: TypeAlias = Callable[[Options], Workload]
 
 
 def w1(options: Options) -> Workload:
-    """One long run."""
+    """W1: one long run."""
     wear = options.wear
     slow = (solver.wearing(wear),) if options.slow else ()
     return Workload(
@@ -66,13 +66,13 @@ def _against_file(options: Options) -> tuple[Check, ...]:
         return ()
     if options.quick:
         raise InvalidInput("--reference belongs to the full W1; leave out --quick")
-    wear, wanted = options.wear, read_reference(options.reference)
-    every, rest = divmod(wear.samples - 1, wanted.size - 1)
+    wear, expected = options.wear, read_reference(options.reference)
+    every, rest = divmod(wear.samples - 1, expected.size - 1)
     if rest or every == 0:
         raise InvalidInput(
-            f"reference {options.reference}: q3 has {wanted.size} samples, which do not lie on W1's {wear.samples}"
+            f"reference {options.reference}: q3 has {expected.size} samples, which do not lie on W1's {wear.samples}"
         )
-    return (Check("to reference", MILLIMETRE, lambda q: _largest(q[::every] - wanted)),)
+    return (Check("to reference", MILLIMETRE, lambda q: _largest(q[::every] - expected)),)
 
 
 def read_reference(path: Path) -> Array:
@@ -85,16 +85,16 @@ def read_reference(path: Path) -> Array:
     """
     try:
         with np.load(path) as file:
-            wanted = np.asarray(file["q3"], dtype=float)
+            expected = np.asarray(file["q3"], dtype=float)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise InvalidInput(f"reference {path}: is not an npz file with positions q3 in m") from None
-    if wanted.ndim != 1 or wanted.size < 2:
-        raise InvalidInput(f"reference {path}: q3 has shape {wanted.shape}; it must be (n,) with n of at least 2")
-    return wanted
+    if expected.ndim != 1 or expected.size < 2:
+        raise InvalidInput(f"reference {path}: q3 has shape {expected.shape}; it must be (n,) with n of at least 2")
+    return expected
 
 
 def w2(options: Options) -> Workload:
-    """An ensemble of short runs."""
+    """W2: an ensemble of short runs."""
     sweep, threads = options.sweep, cores()
     runs = sweep.side**2
 
@@ -121,7 +121,7 @@ def _sweepers(sweep: SweepWorkload, threads: int) -> tuple[Contestant, ...]:
 
 
 def w3(options: Options) -> Workload:
-    """The gap from windows."""
+    """W3: the gap from windows."""
     wear = options.wear
     return Workload(
         "W3",
@@ -159,13 +159,13 @@ def decision(options: Options) -> Workload:
         "decision",
         f"settings verified on {size} each",
         decisions.decisions(options.quick),
-        (Check("not settled", "%", lambda found: 100.0 * (1.0 - float(found[0]))),),
+        (Check("not settled", "%", lambda result: 100.0 * (1.0 - float(result[0]))),),
         lambda _: "",
     )
 
 
 def start(options: Options) -> Workload:
-    """A process's first run."""
+    """The first run of a fresh process."""
     return Workload(
         "start", "a fresh process to the end of its first run of 1 s", startup.starters(options.slow), (), lambda _: ""
     )
@@ -188,8 +188,8 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
             hint = did_you_mean(name, (*WORKLOADS, *ALONE))
             known_ones = f"{', '.join(WORKLOADS)}, or {' or '.join(ALONE)} alone"
             raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {known_ones}")
-    wanted = {known[name.lower()] for name in names} or set(WORKLOADS)
-    return tuple(name for name in WORKLOADS if name in wanted)
+    selected = {known[name.lower()] for name in names} or set(WORKLOADS)
+    return tuple(name for name in WORKLOADS if name in selected)
 
 
 def _largest(difference: Array) -> float:

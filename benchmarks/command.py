@@ -59,17 +59,23 @@ def bench(
     workloads = [WORKLOADS[name](options) for name in chosen(names)]
     rounds = runs or (QUICK_RUNS if options.quick else RUNS)
     results = tuple(_measured(w, rounds, 0.0 if options.quick else BLOCK, clock, console) for w in workloads)
-    found = machine()
-    console.print(f"{found['cpu']}, {found['cores']} cores, {found['python']}", highlight=False)
+    host = machine()
+    console.print(f"{host['cpu']}, {host['cores']} cores, {host['python']}", highlight=False)
     if json is not None:
-        files.write_and_say(json, dumps(results, found, date, options.quick), console.print)
+        files.write_and_say(json, dumps(results, host, date, options.quick), console.print)
     return results
 
 
 def _measured(workload: Workload, runs: int, block: float, clock: Clock, console: Console) -> WorkloadResult:
-    """One workload, under a progress bar that goes when the table comes."""
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as progress:
+    """Measure one workload under a transient progress bar, then print its table."""
+    with Progress(
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        console=console,
+        transient=True,
+    ) as progress:
         bar = progress.add_task(workload.name, total=turns(workload, runs))
 
         def notice(activity: str) -> None:

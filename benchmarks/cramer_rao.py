@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound of the gap, by code of its own: nothing here is the estimator's.
+"""The Cramer-Rao bound of the gap, by code independent of the estimator.
 
 The structure runs through scipy's lsim, the play operator is differenced numerically, the noise is whitened by the
 Cholesky factor of its covariance.
@@ -87,7 +87,7 @@ def bound(
     return _spread(by_gap, others, root)
 
 
-def motor_unknowns(servo: Servo, voltage: Array, rate: float, held: bool) -> Array:
+def motor_unknowns(servo: Servo, voltage: Array, rate: float, zero_order_hold: bool) -> Array:
     """(3, n) derivatives of theta_m (rad) by the logarithm of k_B, the current (A) and the speed (rad/s) at first.
 
     Parameters
@@ -105,7 +105,7 @@ def motor_unknowns(servo: Servo, voltage: Array, rate: float, held: bool) -> Arr
     def angle(model: Servo, start: Sequence[float], drive: Array) -> Array:
         electric, mechanic = [-model.R / model.L, -model.k_B / model.L, 0.0], [model.k_T / model.J, 0.0, 0.0]
         system = ([electric, mechanic, [0.0, 1.0, 0.0]], [[1.0 / model.L], [0.0], [0.0]], [[0.0, 0.0, 1.0]], [[0.0]])
-        return np.asarray(lsim(system, drive, times, X0=start, interp=not held)[1])
+        return np.asarray(lsim(system, drive, times, X0=start, interp=not zero_order_hold)[1])
 
     speed = float(voltage[0]) / servo.k_B
     here, step = angle(servo, (0.0, speed, 0.0), voltage), 1e-4
@@ -115,7 +115,7 @@ def motor_unknowns(servo: Servo, voltage: Array, rate: float, held: bool) -> Arr
 
 
 def _scaled(servo: Servo, name: str) -> Servo:
-    """With one of its numbers larger by the step."""
+    """Increase one number of the servo by the step."""
     value = getattr(servo, name)
     larger = tuple((1.0 + _STEP) * one for one in value) if isinstance(value, tuple) else (1.0 + _STEP) * value
     changes: dict[str, Any] = {name: larger}

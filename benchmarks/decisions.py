@@ -34,8 +34,8 @@ def _decision(name: str, gap_deg: tuple[float, float], bias: tuple[float, float]
     known = Uncertainty(gap=(math.radians(gap_deg[0]), math.radians(gap_deg[1])), input_bias=bias)
 
     def job() -> Array:
-        found = certify(servo, known, demands, trial)
-        settled = found.settled if isinstance(found, Certificate) else 0.0
-        return np.array([settled, found.members if isinstance(found, Certificate) else 0.0])
+        result = certify(servo, known, demands, trial)
+        settled = result.settled if isinstance(result, Certificate) else 0.0
+        return np.array([settled, result.members if isinstance(result, Certificate) else 0.0])
 
     return Contestant(name, lambda: job)

@@ -59,8 +59,8 @@ def endurance(
         # A process whose caches have grown is replaced by another; its jobs are not lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
         running = track(shared(endured, tasks), "enduring", len(tasks), console=console, transient=True)
-        found = dict(running)
-    outcomes = tuple(found[task] for task in tasks)
+        result = dict(running)
+    outcomes = tuple(result[task] for task in tasks)
     console.print(shown(outcomes))
     console.print(verdict(outcomes), highlight=False)
     report.write(output, dumps(outcomes, date), console)
@@ -68,13 +68,13 @@ def endurance(
 
 
 def endured(task: EnduranceTask) -> HostileOutcome:
-    """One machine with its twin."""
+    """Run one machine with its twin."""
     seed, kind, friction = task
     return hostile.endured(seed, kind, friction=friction)
 
 
 def verdict(outcomes: Sequence[HostileOutcome]) -> str:
-    """One sentence."""
+    """Sum up all outcomes in one sentence."""
     stated = [outcome for outcome in outcomes if not outcome.case.friction]
     band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in stated)
     limit = f"{band.error * 1e3:.3f} mm from {band.settling:g} s after each step on"

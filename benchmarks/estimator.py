@@ -1,4 +1,4 @@
-"""How right the default and the joint estimator are, how well they know that, how fast: the figures of the docs."""
+"""Accuracy, calibration and speed of the default and the joint estimator: the figures of the docs."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ def table(size: float = 1.0, seed: int = 2026) -> Iterator[Figure]:
 
 def noise_free(count: int, seed: int) -> list[Figure]:
     """Two-contact windows at random, gaps up to 60 deg."""
-    found = answers(random_cases(np.random.default_rng(seed), count, math.radians(60.0), True, constant=True))
-    wrong = np.nanmax(np.abs(found.errors))
-    refused = int(np.count_nonzero(np.logical_not(found.accepted)))
-    right = float(np.mean(np.abs(np.nan_to_num(found.errors, nan=1.0)) <= 1e-3))
+    results = answers(random_cases(np.random.default_rng(seed), count, math.radians(60.0), True, constant=True))
+    wrong = np.nanmax(np.abs(results.errors))
+    refused = int(np.count_nonzero(np.logical_not(results.accepted)))
+    right = float(np.mean(np.abs(np.nan_to_num(results.errors, nan=1.0)) <= 1e-3))
     return [
         Figure("noise-free: within 1e-3 deg, share", right, (1.0, 1.0), count, f"{refused} refused"),
         Figure("noise-free: largest error of an accepted window, deg", float(wrong), (0.0, 1e-3), count),
@@ -81,16 +81,16 @@ def noise_free(count: int, seed: int) -> list[Figure]:
 def in_the_papers_noise(per_gap: int, seed: int, floor: float = FLOOR) -> list[Figure]:
     """The paper's loop, 0.22 mm high-passed and a white floor; beside the paper's estimator and the bound."""
     cases = paper_noise_cases(per_gap, seed, floor)
-    found = answers(cases, settings=OPEN_MINDED)
-    errors, label = found.errors[found.accepted], f"paper noise, floor {1e6 * floor:g} um"
+    results = answers(cases, settings=OPEN_MINDED)
+    errors, label = results.errors[results.accepted], f"paper noise, floor {1e6 * floor:g} um"
     limits = _bounds(cases, floor, PAPER_NOISE)
     judged = floor == FLOOR
     figures = [
         Figure(f"{label}: bias, deg", float(errors.mean()), (-0.005, 0.005) if judged else ANY, errors.size),
         Figure(f"{label}: std, deg", float(errors.std()), (0.0, 0.01) if judged else ANY, errors.size),
-        Figure(f"{label}: std over Cramer-Rao bound", _ratio(found, limits), ANY, errors.size),
+        Figure(f"{label}: std over Cramer-Rao bound", _ratio(results, limits), ANY, errors.size),
         Figure(f"{label}: Cramer-Rao bound, deg", float(np.sqrt(np.mean(limits**2))), ANY, errors.size),
-        Figure(f"{label}: coverage of std", found.coverage(), ANY, errors.size),
+        Figure(f"{label}: coverage of std", results.coverage(), ANY, errors.size),
     ]
     return [*figures, against_the_paper(cases, errors)] if judged else figures
 
@@ -115,11 +115,11 @@ def in_white_noise(per_gap: int, seed: int) -> list[Figure]:
     """The paper's loop without noise in it, 1 um of white noise on the position."""
     rng = np.random.default_rng(seed)
     cases = [on_floor(c, FLOOR, rng) for c in paper_loop_cases(eight_gaps(), per_gap, seed, None)]
-    found = answers(cases)
-    ratio, size = _ratio(found, _bounds(cases, FLOOR, None)), int(found.accepted.sum())
+    results = answers(cases)
+    ratio, size = _ratio(results, _bounds(cases, FLOOR, None)), int(results.accepted.sum())
     return [
         Figure("white noise: std over Cramer-Rao bound", ratio, (0.8, 1.1), size),
-        Figure("white noise: coverage of std", found.coverage(), (0.92, 0.98), size),
+        Figure("white noise: coverage of std", results.coverage(), (0.92, 0.98), size),
     ]
 
 
@@ -128,11 +128,11 @@ def random_windows(count: int, seed: int) -> list[Figure]:
     rng = np.random.default_rng(seed)
     drawn = random_cases(rng, count, math.radians(25.0), False)
     cases = [on_floor(case, FLOOR, rng) if number % 2 else case for number, case in enumerate(drawn)]
-    found = answers(cases)
-    errors = np.abs(np.nan_to_num(found.errors, nan=0.0))
+    results = answers(cases)
+    errors = np.abs(np.nan_to_num(results.errors, nan=0.0))
     both = np.array([case.two_contacts for case in cases])
     worst = cases[int(np.argmax(errors))].words
-    statuses = {status.value: sum(e.status is status for e in found.estimates) for status in GapStatus}
+    statuses = {status.value: sum(e.status is status for e in results.estimates) for status in GapStatus}
     return [
         Figure(
             "random windows: accepted and off by more than 0.1 deg",
@@ -144,17 +144,17 @@ def random_windows(count: int, seed: int) -> list[Figure]:
         Figure("random windows: largest error accepted, deg", float(errors.max()), (0.0, 0.1), count, worst),
         Figure(
             "random windows: share of two-contact windows accepted",
-            float(found.accepted[both].mean()),
+            float(results.accepted[both].mean()),
             (0.9, 1.0),
             int(both.sum()),
         ),
-        _bounds_kept(found),
+        _bounds_kept(results),
     ]
 
 
-def _bounds_kept(found: Answers) -> Figure:
-    """How many lower bounds are above the gap: at 95 %, one side, a fortieth may be."""
-    pairs = zip(found.cases, found.estimates, strict=True)
+def _bounds_kept(results: Answers) -> Figure:
+    """Share of lower bounds above the gap: one-sided at 95 %, a fortieth may be."""
+    pairs = zip(results.cases, results.estimates, strict=True)
     excess = [math.degrees(e.gap - c.gap) for c, e in pairs if e.status is GapStatus.LOWER_BOUND]
     above = [x for x in excess if x > 0.0]
     share, remark = len(above) / max(1, len(excess)), f"by up to {max(above, default=0.0):.2g} deg"
@@ -177,16 +177,16 @@ def speed(count: int, seed: int, clock: Clock = time.perf_counter) -> list[Figur
 
 
 def _times(jobs: Sequence[Callable[[], object]], clock: Clock) -> list[float]:
-    """ms: the shorter of two runs of each."""
-    found = []
+    """Times of jobs, ms: the shorter of two runs of each."""
+    times = []
     for job in jobs:
         runs = []
         for _ in range(2):
             begin = clock()
             job()
             runs.append(1e3 * (clock() - begin))
-        found.append(min(runs))
-    return found
+        times.append(min(runs))
+    return times
 
 
 def _bounds(cases: Sequence[WindowCase], floor: float, noise: Noise | None) -> Array:
@@ -197,6 +197,6 @@ def _bounds(cases: Sequence[WindowCase], floor: float, noise: Noise | None) -> A
     return np.degrees([bound(c.servo, angle, RATE, c.gap, c.theta_d0, root) for c, angle in pairs])
 
 
-def _ratio(found: Answers, limits: Array) -> float:
+def _ratio(results: Answers, limits: Array) -> float:
     """Root mean square of error over bound."""
-    return float(np.sqrt(np.mean((found.errors / limits)[found.accepted] ** 2)))
+    return float(np.sqrt(np.mean((results.errors / limits)[results.accepted] ** 2)))

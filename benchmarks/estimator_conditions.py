@@ -29,9 +29,9 @@ def in_coloured_noise(per_gap: int, seed: int, memory: float, judged: bool = Tru
     """First-order autoregressive noise of 1 um, its memory that from one sample to the next."""
     rng = np.random.default_rng(seed)
     cases = [c.noisy(_autoregressive(c.window.position.size, memory, rng)) for c in clean_cases(per_gap, seed)]
-    found = answers(cases)
-    size, target = int(found.accepted.sum()), (0.92, 0.98) if judged else ANY
-    return [Figure(f"AR(1) noise, {memory:g}: coverage of std", found.coverage(), target, size)]
+    results = answers(cases)
+    size, target = int(results.accepted.sum()), (0.92, 0.98) if judged else ANY
+    return [Figure(f"AR(1) noise, {memory:g}: coverage of std", results.coverage(), target, size)]
 
 
 def quantised(per_gap: int, seed: int, step: float = 5e-6) -> list[Figure]:
@@ -39,11 +39,11 @@ def quantised(per_gap: int, seed: int, step: float = 5e-6) -> list[Figure]:
     rng = np.random.default_rng(seed)
     cases = []
     for case in clean_cases(per_gap, seed):
-        seen = case.window.position + 0.3 * step * rng.standard_normal(case.window.position.size)
-        cases.append(case.noisy(np.round(seen / step) * step - case.window.position))
-    found = answers(cases)
+        windows = case.window.position + 0.3 * step * rng.standard_normal(case.window.position.size)
+        cases.append(case.noisy(np.round(windows / step) * step - case.window.position))
+    results = answers(cases)
     name = f"position in steps of {1e6 * step:g} um: coverage of std"
-    return [Figure(name, found.coverage(), (0.92, 0.98), int(found.accepted.sum()))]
+    return [Figure(name, results.coverage(), (0.92, 0.98), int(results.accepted.sum()))]
 
 
 def coarse_encoder(per_gap: int, seed: int, counts: int = 8192) -> list[Figure]:
@@ -54,22 +54,22 @@ def coarse_encoder(per_gap: int, seed: int, counts: int = 8192) -> list[Figure]:
     for case in clean_cases(per_gap, seed):
         assert case.window.theta_m is not None
         angle = np.round(case.window.theta_m / resolution) * resolution
-        seen = on_floor(case, FLOOR, rng)
+        windows = on_floor(case, FLOOR, rng)
         cases.append(
-            seen.replaced(seen.window.replace(theta_m=angle), case.servo.replace(encoder_resolution=resolution))
+            windows.replaced(windows.window.replace(theta_m=angle), case.servo.replace(encoder_resolution=resolution))
         )
-    found = answers(cases)
-    errors = found.errors[found.accepted]
+    results = answers(cases)
+    errors = results.errors[results.accepted]
     name = f"encoder of {counts} counts"
     return [
         Figure(f"{name}: rms error, deg", float(np.sqrt(np.mean(errors**2))), ANY, errors.size),
-        Figure(f"{name}: coverage of std", found.coverage(), ANY, errors.size),
-        Figure(f"{name}: coverage of std_total", found.coverage("std_total"), (0.95, 1.0), errors.size),
+        Figure(f"{name}: coverage of std", results.coverage(), ANY, errors.size),
+        Figure(f"{name}: coverage of std_total", results.coverage("std_total"), (0.95, 1.0), errors.size),
     ]
 
 
 def wrong_model(per_gap: int, seed: int) -> list[Figure]:
-    """k off by 1 %, c by 20 %, and both: what is accepted, and whether std_total covers it if nothing is refused."""
+    """k off by 1 %, c by 20 %, and both: accepted windows, and coverage of std_total if nothing is refused."""
     rng = np.random.default_rng(seed)
     cases = [on_floor(c, FLOOR, rng) for c in clean_cases(per_gap, seed)]
     figures = []
@@ -99,9 +99,9 @@ def skewed(per_gap: int, seed: int, samples: Sequence[int] = (-5, -2, -1, 1, 3, 
         size = window.position.size - abs(shift)
         moved = Window(window.position[early : early + size], window.theta_m[late : late + size], sample_rate=RATE)
         cases.append(case.replaced(moved, case.servo))
-    found = answers(cases)
-    errors = np.abs(np.nan_to_num(found.errors, nan=1.0))
-    refused = int(np.count_nonzero(np.logical_not(found.accepted)))
+    results = answers(cases)
+    errors = np.abs(np.nan_to_num(results.errors, nan=1.0))
+    refused = int(np.count_nonzero(np.logical_not(results.accepted)))
     return [
         Figure(
             "skew up to 1 ms: largest error, deg", float(errors.max()), (0.0, 0.02), errors.size, f"{refused} refused"
@@ -110,7 +110,7 @@ def skewed(per_gap: int, seed: int, samples: Sequence[int] = (-5, -2, -1, 1, 3, 
 
 
 def compliant_screw(seed: int, stiffnesses: Sequence[float] = (1e7, 3e6, 1e6, 3e5, 1e5)) -> list[Figure]:
-    """A plant with an elastic screw, a model with a rigid one: the bias if nothing were refused, and what is said."""
+    """A plant with an elastic screw, a model with a rigid one: the bias if nothing were refused, and the statuses."""
     figures = []
     rng = np.random.default_rng(seed)
     for k_d in stiffnesses:

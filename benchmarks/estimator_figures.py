@@ -1,4 +1,4 @@
-"""What the estimator's bench measures, and the windows and noises that its experiments share."""
+"""Figures of the estimator's bench, and the windows and noises that its experiments share."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Figure:
 
     @property
     def met(self) -> bool:
-        """Whether the value is what it must be."""
+        """True: the value lies within its limits."""
         return self.target[0] <= self.value <= self.target[1]
 
 
@@ -59,12 +59,12 @@ class Answers:
 
     @property
     def accepted(self) -> Flags:
-        """(n,) of bool."""
+        """(n,) bool: the estimate is OK."""
         return np.array([estimate.ok for estimate in self.estimates], dtype=bool)
 
     @property
     def errors(self) -> Array:
-        """(n,) deg; NaN where refused."""
+        """(n,) errors, deg; NaN where refused."""
         pairs = zip(self.cases, self.estimates, strict=True)
         return np.array([math.degrees(e.gap - c.gap) if e.ok else math.nan for c, e in pairs])
 
@@ -78,13 +78,13 @@ class Answers:
 def answers(
     cases: Iterable[WindowCase], servo: Servo | None = None, settings: WhitenedSettings | None = None
 ) -> Answers:
-    """The default estimator's, with another model where one is given."""
+    """Run the default estimator on all cases, with another model where one is given."""
     known = list(cases)
     return Answers(known, [estimate_gap(c.window, servo or c.servo, settings=settings) for c in known])
 
 
 def eight_gaps() -> Array:
-    """rad: 4 .. 18 deg."""
+    """Eight gaps from 4 to 18 deg, rad."""
     return np.radians(np.linspace(4.0, 18.0, 8))
 
 

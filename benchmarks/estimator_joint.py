@@ -30,7 +30,7 @@ OFF = {"k": 1.05, "c": 1.2, "p": 1.01}
 
 @dataclass(frozen=True)
 class JointLoop:
-    """Where windows come from, and how long they are (s); each begins `before` (s) ahead of its step."""
+    """Origin and length (s) of windows; each begins `before` (s) ahead of its step."""
 
     name: str
     sampled: bool = False
@@ -91,28 +91,28 @@ def windows(loop: JointLoop, preset: str, runs: int, seed: int, floor: float = F
 
 
 def noise_free(groups: Sequence[Sequence[WindowCase]], loop: JointLoop, preset: str, voltage: bool) -> Figure:
-    """Largest error where only rounding and sampling are left."""
-    found = Errors.of(groups, [estimates(group, loop, voltage, together=False) for group in groups])
+    """Largest error without noise, from rounding and sampling alone."""
+    results = Errors.of(groups, [estimates(group, loop, voltage, together=False) for group in groups])
     name = f"{_words(loop, preset, voltage)}, noise-free: largest error, deg"
-    return Figure(name, found.largest, (0.0, LIMITS[voltage]), found.errors.size, f"{found.refused} refused")
+    return Figure(name, results.largest, (0.0, LIMITS[voltage]), results.errors.size, f"{results.refused} refused")
 
 
 def judged(
     groups: Sequence[Sequence[WindowCase]], loop: JointLoop, preset: str, voltage: bool, together: bool = False
 ) -> list[Figure]:
     """Errors beside the bound; the largest has to keep its target where three times the bound does."""
-    found = Errors.of(groups, [estimates(group, loop, voltage, together) for group in groups])
+    results = Errors.of(groups, [estimates(group, loop, voltage, together) for group in groups])
     bounds = limit([case for group in groups for case in group], loop, voltage)
-    name, most, size = _words(loop, preset, voltage), LIMITS[voltage], found.errors.size
+    name, most, size = _words(loop, preset, voltage), LIMITS[voltage], results.errors.size
     if together:
         name = f"{name}, {PER_RUN} windows together"
-    remark = f"{found.refused} refused, {np.mean(np.abs(found.errors) <= most):.0%} within {most:g} deg"
+    remark = f"{results.refused} refused, {np.mean(np.abs(results.errors) <= most):.0%} within {most:g} deg"
     target = (0.0, most) if together or 3.0 * bounds <= most else ANY
     return [
-        Figure(f"{name}: largest error, deg", found.largest, target, size, remark),
-        Figure(f"{name}: rms error, deg", float(np.sqrt(np.mean(found.errors**2))), ANY, size),
+        Figure(f"{name}: largest error, deg", results.largest, target, size, remark),
+        Figure(f"{name}: rms error, deg", float(np.sqrt(np.mean(results.errors**2))), ANY, size),
         *([] if together else [Figure(f"{name}: Cramer-Rao bound, deg", bounds, ANY, size)]),
-        Figure(f"{name}: coverage of std", found.coverage, ANY, size),
+        Figure(f"{name}: coverage of std", results.coverage, ANY, size),
     ]
 
 
@@ -125,16 +125,16 @@ class Errors:
     refused: int
 
     @classmethod
-    def of(cls, groups: Sequence[Sequence[WindowCase]], found: Sequence[Sequence[GapEstimate]]) -> Errors:
-        """Of the windows of some groups."""
-        pairs = [pair for each in zip(groups, found, strict=True) for pair in zip(*each, strict=True)]
+    def of(cls, groups: Sequence[Sequence[WindowCase]], results: Sequence[Sequence[GapEstimate]]) -> Errors:
+        """Collect the errors of some groups of windows."""
+        pairs = [pair for each in zip(groups, results, strict=True) for pair in zip(*each, strict=True)]
         known = [(one.gap - case.gap, one.std) for case, one in pairs if one.ok]
         errors, stds = np.degrees(np.array(known).reshape(-1, 2).T)
         return cls(errors, stds, len(pairs) - len(known))
 
     @property
     def largest(self) -> float:
-        """Of the sizes, deg; 0 when all are refused."""
+        """Largest absolute error, deg; 0 when all are refused."""
         return float(np.abs(self.errors).max(initial=0.0))
 
     @property
@@ -148,19 +148,19 @@ def _words(loop: JointLoop, preset: str, voltage: bool) -> str:
 
 
 def estimates(group: Sequence[WindowCase], loop: JointLoop, voltage: bool, together: bool) -> tuple[GapEstimate, ...]:
-    """Of the windows of one machine, whose description is wrong."""
-    servo, seen = group[0].servo, [case.window for case in group]
+    """Estimate the windows of one machine whose description is wrong."""
+    servo, windows = group[0].servo, [case.window for case in group]
     wrong, free = described(servo, OFF), None
     if voltage:
-        seen = [Window(one.position, voltage=one.voltage, sample_rate=RATE, start=one.start) for one in seen]
+        windows = [Window(one.position, voltage=one.voltage, sample_rate=RATE, start=one.start) for one in windows]
         wrong, free = described(servo, {"k_B": 1.02}).replace(sample_rate=RATE if loop.sampled else None), ("k_B",)
     if together:
-        return estimate_jointly(seen, wrong, free).gaps
-    return tuple(estimate_jointly(one, wrong, free).gap for one in seen)
+        return estimate_jointly(windows, wrong, free).gaps
+    return tuple(estimate_jointly(one, wrong, free).gap for one in windows)
 
 
 def described(servo: Servo, factors: Mapping[str, float]) -> Servo:
-    """As a data sheet would have it that is wrong by these factors."""
+    """Servo as a data sheet that is wrong by these factors describes it."""
     changes: dict[str, Any] = {}
     for name, factor in factors.items():
         value = np.multiply(factor, getattr(servo, name)).tolist()
@@ -175,9 +175,9 @@ def limit(cases: Sequence[WindowCase], loop: JointLoop, voltage: bool) -> float:
 
 
 def _bound(case: WindowCase, loop: JointLoop, voltage: bool, root: Array) -> float:
-    seen, at = case.window, (RATE, case.gap, case.theta_d0, root)
-    assert seen.theta_m is not None
-    assert seen.voltage is not None
+    window, at = case.window, (RATE, case.gap, case.theta_d0, root)
+    assert window.theta_m is not None
+    assert window.voltage is not None
     if not voltage:
-        return bound(case.servo, seen.theta_m, *at, free=("k", "c", "p"))
-    return bound(case.servo, seen.theta_m, *at, angles=motor_unknowns(case.servo, seen.voltage, RATE, loop.sampled))
+        return bound(case.servo, window.theta_m, *at, free=("k", "c", "p"))
+    return bound(case.servo, window.theta_m, *at, angles=motor_unknowns(case.servo, window.voltage, RATE, loop.sampled))

@@ -36,9 +36,9 @@ class WindowCase:
     theta_d0 : float
         rad, the screw at the first sample.
     forwards, backwards : float
-        rad: how far the screw moved, but for the end of the window, which the last mass does not see.
+        rad, travel of the screw, without the end of the window, which does not reach the last mass.
     words : str
-        How to make it again.
+        Recipe of the case in words.
     """
 
     window: Window
@@ -51,7 +51,7 @@ class WindowCase:
 
     @property
     def two_contacts(self) -> bool:
-        """Whether the screw was pushed both ways by what the gate asks for."""
+        """True: the screw was pushed both ways as far as the gate demands."""
         return min(self.forwards, self.backwards) >= _TRAVEL
 
     def noisy(self, noise: Array) -> WindowCase:
@@ -119,9 +119,9 @@ def random_cases(
         run, words = random_run(rng, float(rng.uniform(0.0, largest)), 20.0, loop)
         starts = rng.uniform(0.0, 18.9, 12)
         cases = [cut(run, float(start), 1.0, words) for start in starts]
-        kept = [case for case in cases if case.two_contacts or not two_contacts][:per_run]
-        yield from kept[: count - made]
-        made += len(kept)
+        selected = [case for case in cases if case.two_contacts or not two_contacts][:per_run]
+        yield from selected[: count - made]
+        made += len(selected)
 
 
 def paper_loop_cases(

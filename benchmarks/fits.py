@@ -53,8 +53,8 @@ def ours(workload: WearWorkload, method: str = "paper") -> Contestant:
         given, servo = cases(workload), workload.servo
 
         def gap(case: FitWindow) -> float:
-            found = estimate_gap(case.window, servo, method=method, prior=case.prior)
-            return found.gap if found.ok else math.nan
+            results = estimate_gap(case.window, servo, method=method, prior=case.prior)
+            return results.gap if results.ok else math.nan
 
         return lambda: np.array([gap(case) for case in given])
 

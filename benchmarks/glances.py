@@ -58,7 +58,7 @@ class GlanceRow(NamedTuple):
 def triage(
     date: str = "", output: Path | None = None, gaps: int = GAPS, console: Console | None = None
 ) -> tuple[GlanceRow, ...]:
-    """Glance at windows of the paper's loop whose gap has moved by some amounts; show, and write JSON when asked to.
+    """Glance at windows of the paper's loop whose gap has moved; print, and write JSON if `output` is given.
 
     Parameters
     ----------
@@ -90,10 +90,10 @@ def _row(name: str, floor: float | None, gaps: int) -> GlanceRow:
     usual = 1.5 * float(np.median([fit.misfit for fit in fits]))
     rng = np.random.default_rng(1)
     messages = [_message(case) for case in cases]
-    seen = tuple(_estimated_share(cases, messages, moved, usual, rng) for moved in MOVED_DEG)
+    shares = tuple(_estimated_share(cases, messages, moved, usual, rng) for moved in MOVED_DEG)
     times = [_glance_time(case, message, usual) for case, message in zip(cases, messages, strict=True)]
     error, std = float(np.sqrt(np.mean(errors**2))), math.degrees(float(np.median([fit.std for fit in fits])))
-    return GlanceRow(name, len(cases), error, std, seen, min(times), float(np.median(times)))
+    return GlanceRow(name, len(cases), error, std, shares, min(times), float(np.median(times)))
 
 
 def _cases(floor: float | None, gaps: int) -> Iterator[WindowCase]:
@@ -109,13 +109,13 @@ def _estimated_share(
     cases: Sequence[WindowCase], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
 ) -> float:
     """Share of windows that would be estimated, the gap having moved by so much (deg) to either side."""
-    found = []
+    decisions = []
     for case, message in zip(cases, messages, strict=True):
         for side in (1.0, -1.0):
             before = case.gap + math.radians(side * moved + KNOWN_DEG * float(rng.standard_normal()))
             if before > 0.0:
-                found.append(glance(message, case.window, case.servo, _watch(before, usual)).moved)
-    return float(np.mean(found))
+                decisions.append(glance(message, case.window, case.servo, _watch(before, usual)).moved)
+    return float(np.mean(decisions))
 
 
 def _glance_time(case: WindowCase, message: WindowMessage, usual: float) -> float:
@@ -150,7 +150,14 @@ def _table(rows: Sequence[GlanceRow]) -> Table:
         "gap moved by", "windows", "error deg", "stated", *heads, "ms, least", "median", box=None, pad_edge=False
     )
     for row in rows:
-        seen = [f"{100.0 * share:.1f} %" for share in row.seen]
-        numbers = f"{row.windows}", f"{row.error:.3f}", f"{row.std:.3f}"
-        table.add_row(row.condition, *numbers, *seen, f"{row.least:.2f}", f"{row.median:.2f}")
+        shares = [f"{100.0 * share:.1f} %" for share in row.seen]
+        table.add_row(
+            row.condition,
+            f"{row.windows}",
+            f"{row.error:.3f}",
+            f"{row.std:.3f}",
+            *shares,
+            f"{row.least:.2f}",
+            f"{row.median:.2f}",
+        )
     return table

@@ -1,4 +1,4 @@
-"""Endurance of the edge: random machines with twins that are silent, wrong, repeat themselves or send anything.
+"""Endurance of the edge: random machines with twins that are silent, wrong, repetitive or random.
 
 The machines are those that the certified policy's default uncertainty stands for: stiffness within 15 %, damping 50 %,
 back-EMF and masses 10 % of the model, gaps from 0 to 60 deg, steps of 0.1 to 2.5 mm, input bias up to 0.1 V either way.
@@ -62,7 +62,7 @@ class HostileMachine:
 
 
 def model() -> Servo:
-    """Make the model that edge and twin know."""
+    """Make the model that edge and twin use."""
     return Servo.preset("paper").replace(sample_rate=RATE)
 
 

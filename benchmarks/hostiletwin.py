@@ -99,7 +99,7 @@ class HostileTwin:
         return [*repeated, *answer]
 
     def next_wake(self) -> float | None:
-        """None: it only answers."""
+        """No wake-up: this twin only answers."""
         return None
 
     def wake(self, _now: float) -> list[Message]:
@@ -118,8 +118,8 @@ class HostileTwin:
         return self.version
 
     def _wanton(self, window: WindowMessage) -> list[Message]:
-        """Each value by itself anywhere in its range and a little beyond; its prediction cannot be held against it."""
-        draw, own, none = self.draw, self.own, (None, None)
+        """Draw each value anywhere in its range and a little beyond; state no gap to check it against."""
+        draw, own = self.draw, self.own
         kp, kd, tf = (
             own.Kp * draw.uniform(0.66, 1.04),
             own.Kd * draw.uniform(0.66, 1.04),
@@ -129,13 +129,24 @@ class HostileTwin:
         setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
         version, identity = self._next(), (window.boot, window.sequence)
         end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
-        known = (None, None, none, "OK", Setting(tolerance, setting, UNBOUNDED), end)
-        update = Update(window.servo, version, self.in_force, identity, window.start, *known)
+        update = Update(
+            servo=window.servo,
+            version=version,
+            base_version=self.in_force,
+            window=identity,
+            data_time=window.start,
+            gap=None,
+            std=None,
+            interval=(None, None),
+            status="OK",
+            setting=Setting(tolerance, setting, UNBOUNDED),
+            not_after=end,
+        )
         self.sent.append(update)
         return [Acknowledge(window.servo, window.boot, window.sequence), update]
 
 
 def gains(scenario: Scenario) -> Gains:
-    """The servo's own."""
+    """The servo's own gains."""
     own = scenario.law
     return Gains(own.Kp, own.Ki, own.Kd, own.Tf)

@@ -68,7 +68,7 @@ class _Runner:
     rounds: list[tuple[float, ...]]
 
     def run(self, clock: Clock) -> None:
-        """One round."""
+        """Measure one round."""
         times = []
         for _ in range(self.repeats):
             begin = clock()

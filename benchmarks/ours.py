@@ -1,4 +1,4 @@
-"""servotwin as a contestant, and its finer runs that all answers are compared with."""
+"""servotwin as a contestant, and its finer runs as the reference of all answers."""
 
 from __future__ import annotations
 

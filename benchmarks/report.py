@@ -47,7 +47,7 @@ def machine() -> dict[str, str | int]:
         "cores": cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": f"{platform.python_implementation()} {platform.python_version()}",
-        **{name: found for name, found in versions.items() if found},
+        **{name: host for name, host in versions.items() if host},
     }
 
 

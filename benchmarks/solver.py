@@ -16,7 +16,7 @@ NAME = "scipy LSODA, events"
 RELATIVE, ABSOLUTE = 1e-10, 1e-14
 SPEED, ANGLE, INTEGRAL, LAGGED, CHAIN = 1, 2, 3, 4, 5
 STATES = 9
-BLIND = 1e-8  # s after a restart in which no event is looked for, or the one just left is found again
+BLIND = 1e-8  # s after a restart without a search for events: the event just handled would be detected again
 Guard: TypeAlias = Callable[[float, Array], float]
 
 
@@ -72,13 +72,13 @@ class SwitchedLoop:
         """Positive as long as the mode holds: first the dead zone's, then the gap's."""
         sign = 1.0 if self.on else -1.0
         reference, row, tolerance = self.reference, self.model.position, self.workload.tolerance
-        found: list[Guard] = [lambda _, x: sign * (abs(reference - float(row @ x[CHAIN:])) - tolerance)]
+        guards: list[Guard] = [lambda _, x: sign * (abs(reference - float(row @ x[CHAIN:])) - tolerance)]
         if self.contact:
-            found.append(lambda t, x: self.contact * x[SPEED] - self.half_gap_rate(t))
-            return found
-        found.append(lambda t, x: self.half_gap(t) - (x[ANGLE] - self.screw))
-        found.append(lambda t, x: self.half_gap(t) + (x[ANGLE] - self.screw))
-        return found
+            guards.append(lambda t, x: self.contact * x[SPEED] - self.half_gap_rate(t))
+            return guards
+        guards.append(lambda t, x: self.half_gap(t) - (x[ANGLE] - self.screw))
+        guards.append(lambda t, x: self.half_gap(t) + (x[ANGLE] - self.screw))
+        return guards
 
     def switch(self, guard: int) -> None:
         """Enter the next mode."""
@@ -92,7 +92,7 @@ class SwitchedLoop:
 
 
 def run(loop: SwitchedLoop, end: float, times: Array, out: Array) -> None:
-    """Go on to `end`; positions at those of `times` (n,) that are passed."""
+    """Integrate to `end`; return the positions at the `times` (n,) on the way."""
     from scipy.integrate import solve_ivp
 
     while loop.time < end:
@@ -116,7 +116,7 @@ def run(loop: SwitchedLoop, end: float, times: Array, out: Array) -> None:
         if answer.status != 1:
             loop.time, loop.state = end, np.asarray(answer.y[:, -1])
             return
-        guard = next(i for i, found in enumerate(answer.t_events) if len(found))
+        guard = next(i for i, events in enumerate(answer.t_events) if len(events))
         loop.time, loop.state = float(answer.t_events[guard][0]), np.asarray(answer.y_events[guard][0])
         loop.switch(guard)
 

@@ -28,9 +28,9 @@ BATCH = 8  # runs in one integrator: the fastest of 1, 2, 4, 8 and 16
 CLOSED, SIDE, SCREW, ON, REFERENCE, DEAD, C0, C2, C3 = range(9)
 CURRENT, SPEED, ANGLE, INTEGRAL, LAGGED, CHAIN = range(6)
 STATES = 9
-# The screw is let go this far inside the gap, rad, or the contact just left would be found again and again.
+# rad: the screw is released this far inside the gap, or the contact just left would be detected again and again.
 MARGIN = 1e-12
-# s in which an event is not found again. What heyoka derives from the guard's slope grows beyond all bounds when the
+# s in which an event is not detected again. What heyoka derives from the guard's slope grows beyond all bounds when the
 # motor comes to rest against the gap, and later releases are missed.
 COOLDOWN = 1e-9
 # At rest with a gap that opens from zero, "the motor turns back" holds at once and means nothing.

@@ -1,4 +1,4 @@
-"""`servotwin bench tick`: how fast and regularly the gateway's control loop ticks, and what keeps it from better."""
+"""`servotwin bench tick`: speed and regularity of the edge's control loop, and the limits of this system."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Case = tuple[float, bool, bool]
 
 
 def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, console: Console | None = None) -> None:
-    """Measure every case, show, and write JSON when asked to.
+    """Measure every case, show, and write JSON if `output` is given.
 
     Parameters
     ----------
@@ -53,26 +53,26 @@ def ticks(date: str = "", output: Path | None = None, seconds: float = SECONDS, 
     cases = [(rate, busy, hurried) for hurried in (False, True) for rate in RATES for busy in (False, True)]
     runs = [measured(case, seconds) for case in track(cases, "ticking", console=console, transient=True)]
     console.print(shown(runs))
-    for line in said(runs):
+    for line in summary_lines(runs):
         console.print(line, highlight=False, soft_wrap=True)
     report.write(output, report.text(SCHEMA, date, seconds=seconds, runs=runs), console)
 
 
 def measured(case: Case, seconds: float) -> dict[str, Any]:
-    """One run, in a process that imports what a gateway does."""
+    """Run one case in a process that imports only what an edge does."""
     rate, busy, hurried = case
     priority = PRIORITY if hurried else 0
     with tempfile.TemporaryDirectory() as folder:
         arguments = [str(rate), str(seconds), str(int(busy)), str(priority), folder]
         command = [sys.executable, "-m", "benchmarks.tickloop", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def shown(runs: Sequence[dict[str, Any]]) -> Table:
     """A row for each run and kind of time, in microseconds."""
-    result = Table(title="tick: the gateway's control loop, µs", title_justify="left", box=None, pad_edge=False)
+    result = Table(title="tick: the edge's control loop, µs", title_justify="left", box=None, pad_edge=False)
     for head in ("kHz", "priority", "windows", "time", "median", "p99", "p99.9", "max", "overruns", "missed"):
         result.add_column(head, justify="left" if head in ("priority", "time") else "right")
     for run in runs:
@@ -84,7 +84,7 @@ def shown(runs: Sequence[dict[str, Any]]) -> Table:
     return result
 
 
-def said(runs: Sequence[dict[str, Any]]) -> list[str]:
+def summary_lines(runs: Sequence[dict[str, Any]]) -> list[str]:
     """Explain the columns and their limits."""
     slowest = max(runs, key=lambda run: (run["rate_hz"], -run["pack_s"]))
     handling = f"{slowest['pack_s'] * 1e3:.1f} ms to pack and {slowest['put_s'] * 1e3:.1f} ms to put on disk"

@@ -1,6 +1,6 @@
-"""The gateway's real control loop against a drive that keeps to the clock, in a process of its own; prints JSON.
+"""The edge's real control loop against a drive that keeps to the clock, in a process of its own; prints JSON.
 
-`python -m benchmarks.tickloop RATE SECONDS MOVING PRIORITY FOLDER`: nothing of numpy is imported, as at a gateway.
+`python -m benchmarks.tickloop RATE SECONDS MOVING PRIORITY FOLDER`: numpy is not imported, as on a real edge.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class PacedDrive:
         Hz.
     seconds : float
     moving : bool
-        Whether the reference always moves, so that windows are cut one after the other; or steps now and then.
+        True: the reference always moves, so that windows are cut one after the other. False: it steps now and then.
     """
 
     machine, lag = "paced", 0.0
@@ -58,11 +58,11 @@ class PacedDrive:
         self._number, self._position, self._zero, self._woken = 0, 0.0, 0.0, 0.0
 
     def connect(self) -> None:
-        """The clock starts."""
+        """Start the clock."""
         self._zero = time.perf_counter()
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Release nothing."""
 
     def read(self) -> DriveSample | None:
         """Wait for the next instant."""
@@ -80,15 +80,17 @@ class PacedDrive:
         number = self._number + late
         self._number = number + 1
         return (
-            None if number >= self._end else DriveSample(number, self._wanted(number), self._position, self._position)
+            None
+            if number >= self._end
+            else DriveSample(number, self._reference(number), self._position, self._position)
         )
 
     def write(self, voltage: float) -> None:
-        """A machine that follows its voltage."""
+        """Move the simulated machine with its voltage."""
         self.answer.add(time.perf_counter() - self._woken)
         self._position += 1e-6 * voltage
 
-    def _wanted(self, number: int) -> float:
+    def _reference(self, number: int) -> float:
         time_s = number / self.rate
         return 1e-3 * sin(time_s) if self._moving else 1e-3 * (int(time_s / STEP_S) % 2)
 
@@ -102,7 +104,7 @@ def config(rate: float, folder: Path) -> EdgeConfig:
 
 
 def measured(rate: float, seconds: float, moving: bool, priority: int, folder: Path) -> dict[str, Any]:
-    """One run."""
+    """Measure one run."""
     settings = config(rate, folder)
     file = folder / "edge.toml"
     file.write_text(edge_toml(settings), encoding="utf-8")
@@ -120,18 +122,18 @@ def measured(rate: float, seconds: float, moving: bool, priority: int, folder: P
     edge.finish(10.0)
     child.close()
     windows = edge.agent.windows_cut
-    told = {"rate_hz": rate, "moving": moving, "realtime": hurried, "windows": windows}
-    return {**told, **_result(drive, edge), "load": os.getloadavg()[0]}
+    conditions = {"rate_hz": rate, "moving": moving, "realtime": hurried, "windows": windows}
+    return {**conditions, **_result(drive, edge), "load": os.getloadavg()[0]}
 
 
 def _result(drive: PacedDrive, edge: EdgeRuntime) -> dict[str, Any]:
     times = {"wake": drive.wake, "answer": drive.answer, "whole": drive.whole}
-    told = {name: summarise(counts.dumps(), counts.longest) for name, counts in times.items()}
-    return {**told, "overruns": drive.overruns, "missed": drive.missed, "dropped": dict(edge.agent.dropped)}
+    summaries = {name: summarise(counts.dumps(), counts.longest) for name, counts in times.items()}
+    return {**summaries, "overruns": drive.overruns, "missed": drive.missed, "dropped": dict(edge.agent.dropped)}
 
 
 def handling(rate: float, folder: Path) -> dict[str, float]:
-    """Median times, s, of what the link process does with a window of 1 s."""
+    """Median times (s) of packing and storing a window of 1 s in the link process."""
     settings = config(rate, folder)
     samples = round(rate)
     values = {

@@ -14,7 +14,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 
-UNIT = 1e-3  # m: what errors of a position are divided by
+UNIT = 1e-3  # m: unit of position errors
 PRESET = "table1"
 
 
@@ -73,7 +73,7 @@ class WearWorkload:
 
     @property
     def samples(self) -> int:
-        """Of the output, both ends included."""
+        """Number of samples of the output, both ends included."""
         return round(self.duration * self.sample_rate) + 1
 
     @property
@@ -122,7 +122,7 @@ class SweepWorkload:
 
     @property
     def samples(self) -> int:
-        """Of each member's output, both ends included."""
+        """Number of samples of each member's output, both ends included."""
         return round(self.duration * self.sample_rate) + 1
 
 
@@ -137,12 +137,12 @@ class NoisyWorkload:
 
     @property
     def noise(self) -> Noise:
-        """The paper's, high-passed."""
+        """The paper's noise, high-passed."""
         return Noise(std=self.noise_std)
 
     @property
     def controller(self) -> Controller:
-        """The servo's own, sampled at the rate of the output."""
+        """The servo's own controller, sampled at the rate of the output."""
         servo, rate = self.wear.servo, self.wear.sample_rate
         return servo.controller.replace(sample_rate=rate, loop_filter_hz=self.loop_filter_hz)
 

@@ -1,4 +1,4 @@
-"""`servotwin bench fleet`: how large a fleet one twin on this machine looks after, with real processes."""
+"""`servotwin bench fleet`: size of the fleet that one twin on this machine can serve, with real processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from benchmarks import report
 from benchmarks.fleet import runs
 from benchmarks.fleet.processes import check_system
-from benchmarks.fleet.setting import TABLE, FleetScale, prove
+from benchmarks.fleet.setting import TABLE, FleetScale, build_table
 from benchmarks.fleet.stock import WindowSource, stock
 from benchmarks.fleet.tables import document, show
 from benchmarks.fleet.watch import ResourceSample
@@ -27,7 +27,7 @@ NAME = "fleet"
 def fleet(
     date: str = "", output: Path | None = None, scale: FleetScale | None = None, console: Console | None = None
 ) -> tuple[runs.FleetRun, runs.FleetRun]:
-    """Measure ingest alone, then a fleet at its cadence with an outage; show, and write JSON when asked to.
+    """Measure ingest alone, then a fleet at its cadence with an outage; show, and write JSON if `output` is given.
 
     Everything lies in a folder of its own in the system's temporary one, which is removed at the end, as are all
     processes: 20 kB for every window.
@@ -61,11 +61,11 @@ def fleet(
 
 
 def _prepared(folder: Path, scale: FleetScale, progress: Progress) -> list[WindowSource]:
-    """The stock of windows, and the table of proofs."""
+    """Make the stock of windows and the table of certificates."""
     bar = progress.add_task("simulating windows", total=None)
     places = stock(scale.places, scale.windows)
-    progress.update(bar, description="proving settings")
-    prove(folder, scale)
+    progress.update(bar, description="verifying settings")
+    build_table(folder, scale)
     progress.remove_task(bar)
     return places
 
@@ -75,10 +75,10 @@ def _ingest(folder: Path, scale: FleetScale, places: list[WindowSource], progres
     apart.mkdir()
     shutil.copy(folder / TABLE, apart / TABLE)
     bar = progress.add_task("ingest alone", total=scale.ingest)
-    found = runs.ingest(apart, scale, places, lambda sample: progress.update(bar, completed=sample.time))
+    run = runs.ingest(apart, scale, places, lambda sample: progress.update(bar, completed=sample.time))
     progress.remove_task(bar)
     shutil.rmtree(apart)
-    return found
+    return run
 
 
 def _fleet(folder: Path, scale: FleetScale, places: list[WindowSource], progress: Progress) -> runs.FleetRun:
@@ -88,9 +88,9 @@ def _fleet(folder: Path, scale: FleetScale, places: list[WindowSource], progress
         phase = _phase(scale, sample.time)
         progress.update(bar, completed=sample.time, description=f"{phase}: {sample.waiting} windows wait")
 
-    found = runs.fleet(folder, scale, places, tell)
+    run = runs.fleet(folder, scale, places, tell)
     progress.remove_task(bar)
-    return found
+    return run
 
 
 def _phase(scale: FleetScale, time: float) -> str:
@@ -111,6 +111,7 @@ def _folder() -> Iterator[Path]:
 
 @contextmanager
 def _progress(console: Console) -> Iterator[Progress]:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True
+    ) as progress:
         yield progress

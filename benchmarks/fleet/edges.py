@@ -1,7 +1,7 @@
 """The edges of a whole fleet in one process: windows fall due, go out, and updates are answered.
 
-`python -m benchmarks.fleet.edges LOAD` does what the file says, writes what it did to its output, and ends. It
-knows nothing of numbers libraries, as an edge.
+`python -m benchmarks.fleet.edges LOAD` runs the plan in the file, writes a report to its output, and ends. Like an
+edge, it imports no numerical library.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LoadEdge:
     ----------
     name : str
     place : int
-        Which gap it has.
+        Index of its gap in the stock.
     version, sequence, serial : int
         Of the parameters in force, of its next window, of the last message that it took.
     receipts : list of Receipt
@@ -86,30 +86,30 @@ class EdgeLoad:
         self.edges = [LoadEdge(f"ax-{n:05d}", n % count, plan.version, plan.sequence) for n in range(plan.servos)]
         self.counts = LoadCounts()
         self._issued = 0
-        self._kept: deque[tuple[LoadEdge, float]] = deque()
+        self._pending: deque[tuple[LoadEdge, float]] = deque()
 
     @property
     def waiting(self) -> int:
         """Windows that are due and not sent."""
-        return len(self._kept)
+        return len(self._pending)
 
     def add_due(self, now: float) -> None:
-        """Keep the windows whose time has come."""
+        """Queue the windows whose time has come."""
         plan, since = self.plan, now - self.begin
         most = min(int(since * plan.rate) + 1, round(plan.duration * plan.rate)) if plan.rate > 0.0 else 0
         while self._issued < most:
             edge = self.edges[self._issued % plan.servos]
-            self._kept.append((edge, self.begin + self._issued / plan.rate))
+            self._pending.append((edge, self.begin + self._issued / plan.rate))
             self._issued += 1
-        self.counts.waited = max(self.counts.waited, len(self._kept))
+        self.counts.waited = max(self.counts.waited, len(self._pending))
 
     def take(self, now: float) -> tuple[LoadEdge, float] | None:
-        """The next window to be sent, and when it fell due; None: not now."""
+        """Take the next window to be sent, and its due time; None: not now."""
         plan, since = self.plan, now - self.begin
         if self.cut(now):
             return None
-        if self._kept:
-            return self._kept.popleft()
+        if self._pending:
+            return self._pending.popleft()
         if plan.rate == 0.0:
             if since >= plan.duration:
                 return None
@@ -122,8 +122,8 @@ class EdgeLoad:
         return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
 
     def requeue(self, edge: LoadEdge, due: float) -> None:
-        """One that was put off."""
-        self._kept.appendleft((edge, due))
+        """Put a postponed window back."""
+        self._pending.appendleft((edge, due))
 
     def window(self, edge: LoadEdge, due: float) -> bytes:
         """Encoded window of the edge's source, readdressed; sometimes of the next source, which shows a changed gap."""
@@ -148,16 +148,16 @@ class EdgeLoad:
         )
 
     def apply_messages(self, edge: LoadEdge, body: bytes) -> None:
-        """Messages of the twin: an update is applied at once, and answered."""
+        """Handle messages of the twin: apply an update at once, and queue its receipt."""
         for each in _sealed.decode(body):
-            found = msgspec.msgpack.decode(each, type=Sealed)
-            edge.serial = max(edge.serial, found.serial)
-            message = decode(found.body)
+            sealed = msgspec.msgpack.decode(each, type=Sealed)
+            edge.serial = max(edge.serial, sealed.serial)
+            message = decode(sealed.body)
             if isinstance(message, Update) and message.version > edge.version:
                 edge.version = message.version
                 self.counts.updates += 1
-                told = Receipt(edge.name, message.version, True, 1, Reason.APPLIED, message.version, self.plan.boot)
-                edge.receipts.append(told)
+                receipt = Receipt(edge.name, message.version, True, 1, Reason.APPLIED, message.version, self.plan.boot)
+                edge.receipts.append(receipt)
 
     def undisturbed(self, now: float) -> bool:
         """Test that no outage has begun by `now`."""
@@ -228,7 +228,7 @@ class EdgeTurn:
 
 
 async def run(load: LoadStart) -> LoadReport:
-    """Everything that a plan says.
+    """Run a plan.
 
     Raises
     ------
@@ -252,13 +252,13 @@ async def run(load: LoadStart) -> LoadReport:
 
 
 async def _connected(fleet: EdgeLoad, failed: list[str]) -> EdgeTurn:
-    """A connection, and whose turn it is there."""
+    """Open a connection for one turn at a time."""
     done = asyncio.Event()
     return EdgeTurn(fleet, await _line(fleet.plan, done, failed), done, failed)
 
 
 async def _line(plan: LoadPlan, done: asyncio.Event, failed: list[str]) -> HttpConnection:
-    """A connection to the twin; where it breaks while an answer is due, everything ends."""
+    """Open a connection to the twin; the run ends if it breaks while an answer is due."""
 
     def broken(why: str) -> None:
         failed.append(why)
@@ -275,7 +275,7 @@ async def _ticks(fleet: EdgeLoad) -> None:
 
 
 async def _serve(turn: EdgeTurn) -> None:
-    """One connection, until nothing is left to do."""
+    """Use one connection until nothing is left to do."""
     fleet, plan = turn.fleet, turn.fleet.plan
     while not turn.failed:
         now = time.monotonic()
@@ -304,8 +304,19 @@ async def _serve(turn: EdgeTurn) -> None:
 
 def _report(counts: LoadCounts, seconds: float) -> LoadReport:
     used = time.process_time()
-    done = counts.windows, counts.news, counts.polls, counts.updates, counts.later, counts.bytes
-    return LoadReport(seconds, *done, used, shares(counts.latency), shares(counts.late), counts.waited)
+    return LoadReport(
+        seconds=seconds,
+        windows=counts.windows,
+        news=counts.news,
+        polls=counts.polls,
+        updates=counts.updates,
+        later=counts.later,
+        bytes=counts.bytes,
+        cpu=used,
+        latency=shares(counts.latency),
+        late=shares(counts.late),
+        waited=counts.waited,
+    )
 
 
 def _window(body: bytes) -> WindowMessage:

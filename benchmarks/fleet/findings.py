@@ -12,12 +12,12 @@ from benchmarks.fleet.plan import shares
 
 
 class ProcessedWork(NamedTuple):
-    """Of windows that came in some time.
+    """Work on the windows that came within some time.
 
     Attributes
     ----------
     windows, undone : int
-        How many came, and how many of these were not worked on when it was looked.
+        Windows that came, and those of them without an outcome at the time of the query.
     age : tuple of float
         s from a window's commit to that of its outcome: median, 99 % and largest.
     """
@@ -29,7 +29,7 @@ class ProcessedWork(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[sqlite3.Connection]:
-    """The store's file, to be read beside the twin."""
+    """Open the store's file read-only, beside the twin."""
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True, timeout=60.0)) as connection:
         yield connection
 
@@ -49,7 +49,7 @@ def stored(connection: sqlite3.Connection) -> int:
 
 
 def done(connection: sqlite3.Connection, since: float, until: float) -> ProcessedWork:
-    """Of the windows that came between two times (s since the epoch)."""
+    """Query the work on the windows that came between two times (s since the epoch)."""
     query = "SELECT received, done FROM messages WHERE kind = 'window' AND received >= ? AND received < ?"
     rows = connection.execute(query, (since, until)).fetchall()
     ages = [end - begin for begin, end in rows if end is not None]

@@ -1,4 +1,4 @@
-"""One connection to the twin: a request at a time, raw, so that the load costs little beside what it loads."""
+"""One raw connection to the twin, one request at a time: the load itself must cost little processor time."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import asyncio
 from collections.abc import Callable
 
 Answered = Callable[[int, bytes], None]
-"""Told status and body."""
+"""Handler of a response: (status, body)."""
 _HEAD_END = b"\r\n\r\n"
 _LENGTH = b"content-length:"
 
 
 class HttpConnection(asyncio.Protocol):
-    """Sends a request, and tells who sent it what the answer is.
+    """Send requests and hand each response to its handler.
 
     Parameters
     ----------
     broken : callable
-        Told why, when the connection ends while something is expected of it.
+        Called with the reason when the connection ends while a response is due.
     """
 
     def __init__(self, broken: Callable[[str], None]) -> None:
         self._broken = broken
         self._transport: asyncio.Transport | None = None
         self._answered: Answered | None = None
-        self._got = bytearray()
-        self._wanted = -1
+        self._buffer = bytearray()
+        self._expected = -1
 
     @property
     def closed(self) -> bool:
@@ -39,7 +39,7 @@ class HttpConnection(asyncio.Protocol):
         self._transport.write(b"%bContent-Length: %d\r\n\r\n%b" % (head, len(body), body))
 
     def close(self) -> None:
-        """No more requests."""
+        """Close the connection; no more requests."""
         self._answered = None
         if self._transport is not None:
             self._transport.close()
@@ -54,25 +54,25 @@ class HttpConnection(asyncio.Protocol):
             self._broken(f"the twin closed a connection ({exc or 'at its end'})")
 
     def data_received(self, data: bytes) -> None:
-        self._got += data
-        if self._wanted < 0:
-            end = self._got.find(_HEAD_END)
+        self._buffer += data
+        if self._expected < 0:
+            end = self._buffer.find(_HEAD_END)
             if end < 0:
                 return
-            self._wanted = end + len(_HEAD_END) + _length(bytes(self._got[:end]).lower())
-        if len(self._got) >= self._wanted:
+            self._expected = end + len(_HEAD_END) + _length(bytes(self._buffer[:end]).lower())
+        if len(self._buffer) >= self._expected:
             self._finish()
 
     def _finish(self) -> None:
-        whole, answered = bytes(self._got[: self._wanted]), self._answered
-        del self._got[: self._wanted]
-        self._wanted, self._answered = -1, None
+        whole, answered = bytes(self._buffer[: self._expected]), self._answered
+        del self._buffer[: self._expected]
+        self._expected, self._answered = -1, None
         if answered is not None:
             answered(int(whole[9:12]), whole[whole.find(_HEAD_END) + len(_HEAD_END) :])
 
 
 def _length(head: bytes) -> int:
-    """Of the body that a response announces."""
+    """Length of the body that a response announces."""
     begin = head.find(_LENGTH)
     if begin < 0:
         return 0

@@ -1,4 +1,4 @@
-"""The twin as a process of its own, and what each process costs, as the system counts it: time and memory."""
+"""The twin as a process of its own, and the processor time and memory of each process, as the system counts them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ProcessUsage(NamedTuple):
 
 
 class ServiceProcess(NamedTuple):
-    """A twin that runs.
+    """Running service of the twin.
 
     Attributes
     ----------
@@ -41,14 +41,16 @@ class ServiceProcess(NamedTuple):
 
 
 def check_system() -> None:
-    """Refuse where processes cannot be looked at.
+    """Check that the system has /proc.
 
     Raises
     ------
     InvalidInput
     """
     if not Path("/proc/self/stat").exists():
-        raise InvalidInput("bench fleet reads processor times from /proc, which this system has not: run it on Linux")
+        raise InvalidInput(
+            "bench fleet reads processor times from /proc, which this system does not have: run it on Linux"
+        )
 
 
 @contextmanager
@@ -58,7 +60,7 @@ def service(folder: Path) -> Iterator[ServiceProcess]:
     Raises
     ------
     RuntimeError
-        It does not start.
+        The service does not start.
     """
     command = [sys.executable, "-m", "servotwin", "twin", "--config", str(folder / "twin.toml"), "--port", "0"]
     with (folder / "twin.log").open("wb") as log:
@@ -82,7 +84,7 @@ def used(pid: int) -> ProcessUsage | None:
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started and that run."""
+    """Running children of a process."""
     try:
         tasks = Path(f"/proc/{pid}/task").iterdir()
         return [int(each) for task in tasks for each in (task / "children").read_text(encoding="ascii").split()]
@@ -95,17 +97,17 @@ def _port(process: subprocess.Popen[str], folder: Path) -> int:
     assert process.stdout is not None
     end = time.monotonic() + _BEGIN_S
     while time.monotonic() < end:
-        found = _ADDRESS.search(process.stdout.readline())
-        if found:
-            return int(found[1])
+        match = _ADDRESS.search(process.stdout.readline())
+        if match:
+            return int(match[1])
         if process.poll() is not None:
             break
-    said = (folder / "twin.log").read_text(encoding="utf-8", errors="replace")[-2000:]
-    raise RuntimeError(f"the twin did not start: {said}")
+    log = (folder / "twin.log").read_text(encoding="utf-8", errors="replace")[-2000:]
+    raise RuntimeError(f"the twin did not start: {log}")
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Ask it to end; its whole group is ended where it does not."""
+    """Terminate the service; kill its whole process group if it does not end."""
     process.terminate()
     try:
         process.wait(_END_S)

@@ -24,25 +24,24 @@ from servotwin.messages import encode
 from servotwin.store.store import open_store
 
 LOOK_S = 1.0
-LONGEST_DRAIN = 1800.0
-"""s that a twin is given to work off what waits at the end."""
-_RAMP = 0.1  # of the steady time that is not counted: caches fill, code is compiled
+LONGEST_DRAIN = 1800.0  # s that the twin may take for the windows that wait at the end
+_RAMP = 0.1  # share of the steady time that is left out: caches fill, code is compiled
 
 
 class FleetRun(NamedTuple):
-    """A run as it was seen.
+    """Measurements of a run.
 
     Attributes
     ----------
     report : LoadReport
-        The edges' own.
+        Report of the edges.
     watch : ResourceWatch
     steady : ProcessedWork
-        Of the windows that came in undisturbed time.
+        Work on the windows that came in undisturbed time.
     made : dict of str to int
         Evidence by kind.
     behind : float
-        Windows that waited when the link came back: kept by the edges, and at the twin.
+        Windows that waited when the link came back, at the edges and at the twin.
     drained : float
         s from then until no more than a second's windows waited; NaN: never.
     """
@@ -58,7 +57,7 @@ class FleetRun(NamedTuple):
 def ingest(
     folder: Path, scale: FleetScale, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
 ) -> FleetRun:
-    """Windows as fast as they are taken, into a twin that estimates nothing."""
+    """Send windows as fast as the twin takes them; it estimates nothing."""
     write_file(folder, scale, enabled=False)
     open_store(f"sqlite:///{folder / STORE}").close()
     plan = LoadPlan(0, scale.servos, BOOT, scale.connections, scale.ingest, start=COMMISSIONED)
@@ -68,7 +67,7 @@ def ingest(
 def fleet(
     folder: Path, scale: FleetScale, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
 ) -> FleetRun:
-    """Steady time, an outage, and time after it."""
+    """Run a fleet: steady time, an outage, and time after it."""
     known = write_file(folder, scale)
     version = commission(folder, known, scale, places)
     begin = scale.steady
@@ -100,11 +99,11 @@ def _run(
             behind = _watched(edges, watch, plan, tell, lambda: findings.stored(store) - before)
             report = _reported(edges)
         steady = plan.outage[0] or plan.duration
-        found = findings.done(store, since + _RAMP * steady, since + steady)
+        work = findings.done(store, since + _RAMP * steady, since + steady)
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        return FleetRun(report, watch, found, findings.made(store, since), *behind)
+        return FleetRun(report, watch, work, findings.made(store, since), *behind)
 
 
 def _watched(
@@ -114,7 +113,7 @@ def _watched(
     tell: Callable[[ResourceSample], None],
     stored: Callable[[], int],
 ) -> tuple[float, float]:
-    """Look on until the edges are done and nothing waits; (windows behind when the link came back, s until not)."""
+    """Wait until the edges are done and nothing waits; (windows behind when the link came back, s until drained)."""
     behind, drained, back = 0.0, float("nan"), plan.outage[1]
     quiet = max(plan.rate * LOOK_S, 1.0)
     while True:
@@ -134,7 +133,7 @@ def _watched(
 
 @contextmanager
 def _edges(folder: Path, plan: LoadPlan, places: Sequence[WindowSource]) -> Iterator[subprocess.Popen[bytes]]:
-    """The edges' process, at work."""
+    """Run the edges' process."""
     load = LoadStart(plan, tuple(tuple(encode(window) for window in place.windows) for place in places))
     path = folder / "edges.load"
     path.write_bytes(encode_load(load))
@@ -148,7 +147,7 @@ def _edges(folder: Path, plan: LoadPlan, places: Sequence[WindowSource]) -> Iter
 
 
 def _reported(edges: subprocess.Popen[bytes]) -> LoadReport:
-    said, complaint = edges.communicate()
+    output, complaint = edges.communicate()
     if edges.returncode != 0:
         raise RuntimeError(f"the edges failed: {complaint.decode(errors='replace').strip().splitlines()[-1:]}")
-    return msgspec.json.decode(said, type=LoadReport)
+    return msgspec.json.decode(output, type=LoadReport)

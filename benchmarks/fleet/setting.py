@@ -62,18 +62,18 @@ class FleetScale:
     ----------
     servos : int
     rate : float
-        Windows/s of all of them: each one's turn comes every servos / rate s.
+        Windows/s of all of them: each servo sends one every servos / rate s.
     news : float
         Share of windows with which the gap has moved.
     steady, outage, after : float
-        s: how long it goes on undisturbed, without the link, and with it again.
+        s, length of the phases: undisturbed, without the link, and with it again.
     ingest : float
         s, for the rate of ingest alone.
     places, windows : int
         Of the stock: gaps, and windows of each.
     workers, connections : int
     proofs : float
-        Per minute at most.
+        Verifications per minute, at most.
     every : int
         At least every so many windows of a servo one is estimated.
     """
@@ -93,15 +93,15 @@ class FleetScale:
     every: int = 50
 
     def full(self) -> FleetScale:
-        """Five minutes, and an outage of ten."""
+        """The full bench: five minutes, and an outage of ten."""
         return replace(self, steady=300.0, outage=600.0, after=600.0)
 
 
 QUICK = FleetScale(200, 20.0, 0.1, 3.0, 1.0, 2.0, 1.0, 2, 2, 1, 4)
 
 
-def prove(folder: Path, scale: FleetScale) -> None:
-    """Write the table of proofs that every twin of the bench looks up."""
+def build_table(folder: Path, scale: FleetScale) -> None:
+    """Write the table of certificates that every twin of the bench uses."""
     text = _text(scale, enabled=True)
     (model,) = models_of(parse_toml(text, "twin.toml"), folder, checked=False)
     for _ in build(folder / TABLE, certified_policy(model.servo, model.settings), GRID):
@@ -109,16 +109,16 @@ def prove(folder: Path, scale: FleetScale) -> None:
 
 
 def write_file(folder: Path, scale: FleetScale, enabled: bool = True) -> ModelRegistry:
-    """Write the twin's file, beside the table; the fleet that it says."""
+    """Write the twin's file beside the table; return the models in it."""
     text = _text(scale, enabled)
     (folder / "twin.toml").write_text(text, encoding="utf-8")
     return ModelRegistry.loads(text, "twin.toml", folder)
 
 
 def commission(folder: Path, fleet: ModelRegistry, scale: FleetScale, places: Sequence[WindowSource]) -> int:
-    """A store in which every servo's twin knows it already; the version of the parameters that all run.
+    """Fill a store with twins that know their servos; return the version of the parameters that all run.
 
-    One twin of each place learns; the others are told what it knows.
+    One twin of each place learns; the others get a copy of its state.
     """
     known = [commissioned(fleet, "ax-00000", place) for place in places]
     version = max(one.version for one in known)
@@ -132,7 +132,7 @@ def commission(folder: Path, fleet: ModelRegistry, scale: FleetScale, places: Se
 
 
 def _introduce(store: Store, numbers: range, scale: FleetScale, known: Sequence[CommissionedTwin]) -> None:
-    """Some servos say hello, and their twins know them."""
+    """Store the hello of some servos and the states of their twins."""
     now = time.time()
     states = {f"ax-{n:05d}": known[n % len(known)].state for n in numbers}
     ages = _ages(scale, numbers)
@@ -160,7 +160,7 @@ def _ages(scale: FleetScale, numbers: range) -> dict[str, int]:
 
 
 def _named(state: TwinState, servo: str, glances: int) -> bytes:
-    """A twin's state as another servo's."""
+    """Copy a twin's state for another servo."""
     assert state.triage is not None
     triage = msgspec.structs.replace(state.triage, glances=glances)
     return msgspec.msgpack.encode(msgspec.structs.replace(state, servo=servo, triage=triage))
@@ -173,5 +173,5 @@ def _hello(servo: str, now: float) -> Incoming:
 
 
 def _text(scale: FleetScale, enabled: bool) -> str:
-    told = {"store": STORE, "table": TABLE, "workers": scale.workers, "proofs": scale.proofs, "every": scale.every}
-    return _FILE.format(**told, enabled=str(enabled).lower())
+    values = {"store": STORE, "table": TABLE, "workers": scale.workers, "proofs": scale.proofs, "every": scale.every}
+    return _FILE.format(**values, enabled=str(enabled).lower())

@@ -1,4 +1,4 @@
-"""Windows made beforehand, of the deployed loop at several gaps; and what a twin knows of a servo by then."""
+"""Windows simulated beforehand, of the deployed loop at several gaps, and the twin's state after some of them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SETTLED = 4
 NOISE = Noise(1e-6, (1.0, 400.0))
 BOOT = "boot-1"
 COMMISSIONED = 10 * PERIOD
-"""s of sample time, at which a servo joins the bench; its twin is told of the windows before."""
+"""s of sample time, at which a servo joins the bench; its twin has worked on the windows before."""
 
 
 class WindowSource(NamedTuple):
@@ -67,12 +67,12 @@ def _place(number: int, windows: int, seed: int) -> WindowSource:
         twin=base.twin.replace(triage=TriageSettings()),
         name="axis",
     )
-    found = cosimulate(scenario).windows
-    return WindowSource(gap, tuple(found[:SETTLED]), tuple(found[SETTLED : SETTLED + windows]))
+    recorded = cosimulate(scenario).windows
+    return WindowSource(gap, tuple(recorded[:SETTLED]), tuple(recorded[SETTLED : SETTLED + windows]))
 
 
 def readdressed(window: WindowMessage, servo: str, sequence: int, start: float, version: int) -> WindowMessage:
-    """The same measurements as another servo's, at another time; the checksum is over the channels, and stays."""
+    """Readdress measurements to another servo and time; the checksum, over the channels only, stays valid."""
     shift = start - window.start
     return msgspec.structs.replace(
         window,
@@ -93,7 +93,7 @@ class CommissionedTwin(NamedTuple):
 
 
 def commissioned(fleet: ModelRegistry, servo: str, place: WindowSource) -> CommissionedTwin:
-    """A twin's state after the first windows of a servo at a place, its updates applied, its proofs done."""
+    """Compute a twin's state after a servo's first windows, with its updates applied and verifications done."""
     state, version = b"", 0
     learnt = (*place.first, *place.windows)[: SETTLED + 2]
     for number, recorded in enumerate(learnt):
@@ -102,10 +102,10 @@ def commissioned(fleet: ModelRegistry, servo: str, place: WindowSource) -> Commi
         outcome = work(fleet, _claim(servo, state, number, MessageKind.WINDOW, encode(window)), start)
         state = outcome.state
         sent = [decode(body) for body in outcome.outgoing]
-        # That the next window is cut under an update tells the twin as much as its receipt.
+        # No receipt is needed: the next window, cut under the update, confirms it to the twin.
         version = max([version, *(update.version for update in sent if isinstance(update, Update))])
-        for asked in outcome.enqueue:
-            state = work(fleet, _claim(servo, state, number, MessageKind.VERIFICATION, asked.body), start).state
+        for request in outcome.enqueue:
+            state = work(fleet, _claim(servo, state, number, MessageKind.VERIFICATION, request.body), start).state
     return CommissionedTwin(msgspec.msgpack.decode(state, type=TwinState), version)
 
 

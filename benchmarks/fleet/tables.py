@@ -28,7 +28,7 @@ class ReportLine(NamedTuple):
 
 
 def lines(scale: FleetScale, alone: FleetRun, whole: FleetRun) -> Iterator[ReportLine]:
-    """Everything, in the order of the issue's demands."""
+    """Yield all lines: ingest, cadence, outage, memory."""
     yield from _of_ingest(alone)
     yield from _of_cadence(scale, whole)
     yield from _of_outage(scale, whole)
@@ -38,31 +38,37 @@ def lines(scale: FleetScale, alone: FleetRun, whole: FleetRun) -> Iterator[Repor
 
 
 def _of_ingest(alone: FleetRun) -> Iterator[ReportLine]:
-    told = alone.report
+    report = alone.report
     yield ReportLine(
-        "windows/s committed, nobody estimates", f">= {ASKED_INGEST:g}", f"{told.windows / told.seconds:.0f}"
+        "windows/s committed, nobody estimates", f">= {ASKED_INGEST:g}", f"{report.windows / report.seconds:.0f}"
     )
-    yield ReportLine("... of bytes", "20 kB", f"{told.bytes / max(1, told.windows) / 1e3:.1f} kB")
-    yield ReportLine("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
+    yield ReportLine("... of bytes", "20 kB", f"{report.bytes / max(1, report.windows) / 1e3:.1f} kB")
+    yield ReportLine(
+        "... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.latency))
+    )
     yield ReportLine("... cores kept busy: edges, twin, workers", "2", _cores(alone))
 
 
 def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
-    told, steady = whole.report, whole.steady
+    report, steady = whole.report, whole.steady
     seconds = 0.9 * scale.steady
     yield ReportLine(f"{scale.servos} servos, windows/s", f"{scale.rate:g}", f"{steady.windows / seconds:.0f}")
-    yield ReportLine("... with news", f"{100.0 * scale.news:g} %", f"{100.0 * told.news / max(1, told.windows):.1f} %")
+    yield ReportLine(
+        "... with news", f"{100.0 * scale.news:g} %", f"{100.0 * report.news / max(1, report.windows):.1f} %"
+    )
     estimated, glances = whole.made.get("estimate", 0), max(1, whole.made.get("glance", 0))
     yield ReportLine("... estimated, the others glanced at", "", f"{100.0 * estimated / glances:.1f} %")
-    proofs = whole.made.get("proof", 0)
-    yield ReportLine("... updates, proofs by now", "", f"{whole.made.get('update', 0)}, {proofs}")
+    verifications = whole.made.get("proof", 0)  # the store's word
+    yield ReportLine("... updates, verifications by now", "", f"{whole.made.get('update', 0)}, {verifications}")
     yield ReportLine("... queue age: median, 99 %, most", "", _numbers("s", *steady.age))
-    yield ReportLine("... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.latency)))
     yield ReportLine(
-        "... behind schedule at the edges: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in told.late))
+        "... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.latency))
+    )
+    yield ReportLine(
+        "... behind schedule at the edges: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.late))
     )
     yield ReportLine("... cores kept busy: edges, twin, workers", "2", _cores(whole))
-    spent = [1e3 * whole.watch.spent(role) / max(1, told.windows) for role in ROLES]
+    spent = [1e3 * whole.watch.spent(role) / max(1, report.windows) for role in ROLES]
     allowed = 1e3 * cores() / scale.rate
     yield ReportLine("... processor time per window: the same", f"< {allowed:.3g} ms", _numbers("ms", *spent))
 
@@ -79,17 +85,17 @@ def _of_outage(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
 
 
 def show(scale: FleetScale, alone: FleetRun, whole: FleetRun, console: Console) -> None:
-    """The table, and what it was measured on."""
+    """Print the table, and the machine that it was measured on."""
     table = Table("what", "asked", "measured", box=None, pad_edge=False)
     for line in lines(scale, alone, whole):
         table.add_row(*line)
     console.print(table, highlight=False)
-    found = machine()
-    console.print(f"{found['cpu']}, {found['cores']} cores, {found['python']}", highlight=False)
-    console.print(_says(whole), highlight=False)
+    host = machine()
+    console.print(f"{host['cpu']}, {host['cores']} cores, {host['python']}", highlight=False)
+    console.print(_load_share(whole), highlight=False)
 
 
-def _says(whole: FleetRun) -> str:
+def _load_share(whole: FleetRun) -> str:
     """Sentence about the load that shares the machine with the twin."""
     spent = {role: whole.watch.spent(role) for role in ROLES}
     share = spent[EDGES] / max(1e-9, sum(spent.values()))
@@ -97,7 +103,7 @@ def _says(whole: FleetRun) -> str:
 
 
 def document(scale: FleetScale, alone: FleetRun, whole: FleetRun) -> dict[str, Any]:
-    """The same for machines to read."""
+    """Make the content of the JSON file."""
     return {
         "lines": [line._asdict() for line in lines(scale, alone, whole)],
         "samples": [

@@ -1,4 +1,4 @@
-"""Resource use during a run, seen from outside: processor time, memory, and the backlog."""
+"""Resource use during a run, read from /proc and the store: processor time, memory, backlog."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ EDGES, TWIN, WORKERS = "edges", "twin", "workers"
 
 
 class ResourceSample(NamedTuple):
-    """One look.
+    """One sample.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class ResourceSample(NamedTuple):
 
 @dataclass
 class ResourceWatch:
-    """Looks at processes.
+    """Sample the resource use of processes.
 
     Parameters
     ----------
@@ -52,26 +52,26 @@ class ResourceWatch:
     _begin: float = field(default_factory=time.monotonic)
 
     def look(self) -> ResourceSample:
-        """Once."""
-        workers = [found for pid in children(self.twin) if (found := used(pid))]
+        """Take one sample."""
+        workers = [usage for pid in children(self.twin) if (usage := used(pid))]
         roles = {EDGES: used(self.edges), TWIN: used(self.twin)}
-        now = {role: found for role, found in roles.items() if found is not None}
+        now = {role: usage for role, usage in roles.items() if usage is not None}
         now[WORKERS] = ProcessUsage(sum(each.cpu for each in workers), sum(each.memory for each in workers))
         sample = ResourceSample(time.monotonic() - self._begin, now, *self.waiting())
         self.samples.append(sample)
         return sample
 
     def spent(self, role: str) -> float:
-        """s of processor time between the first and the last look at a role."""
-        seen = [sample.used[role].cpu for sample in self.samples if role in sample.used] or [0.0]
-        return seen[-1] - seen[0]
+        """Processor time of a role between the first and the last sample, s."""
+        times = [sample.used[role].cpu for sample in self.samples if role in sample.used] or [0.0]
+        return times[-1] - times[0]
 
     def cores(self, role: str) -> float:
-        """Cores that a role kept busy meanwhile."""
+        """Cores that a role kept busy meanwhile, on average."""
         times = [sample.time for sample in self.samples if role in sample.used]
         return self.spent(role) / (times[-1] - times[0]) if len(times) > 1 else 0.0
 
     def memory(self, role: str) -> tuple[int, int, int]:
-        """Bytes at the first look, half-way and at most."""
-        seen = [sample.used[role].memory for sample in self.samples if role in sample.used] or [0]
-        return seen[0], seen[len(seen) // 2], max(seen)
+        """Memory in the first sample, half-way and at most, bytes."""
+        sizes = [sample.used[role].memory for sample in self.samples if role in sample.used] or [0]
+        return sizes[0], sizes[len(sizes) // 2], max(sizes)

@@ -20,7 +20,16 @@ from benchmarks.estimator_figures import ANY, Figure
 from benchmarks.novelty import loops
 from benchmarks.novelty.loops import Account, LoopCase
 from benchmarks.novelty.sequences import Delays, delays, one_window, run_length, wearing
-from benchmarks.novelty.windows import CONDITIONS, RATE, TOLD, NoveltyCondition, PoolTask, ScorePool, pools, recorded
+from benchmarks.novelty.windows import (
+    CONDITIONS,
+    KNOWN_GAP,
+    RATE,
+    NoveltyCondition,
+    PoolTask,
+    ScorePool,
+    pools,
+    recorded,
+)
 from servotwin.analysis.maps.pool import workplace
 from servotwin.novelty.score import model_of, score
 from servotwin.novelty.settings import NoveltyRules
@@ -52,7 +61,7 @@ Clock = Callable[[], float]
 def novelty(
     date: str = "", output: Path | None = None, size: Size | None = None, console: Console | None = None
 ) -> tuple[Figure, ...]:
-    """Measure, show, and write JSON when asked to.
+    """Measure, print, and write JSON if `output` is given.
 
     Parameters
     ----------
@@ -86,7 +95,7 @@ def novelty(
 
 def charted(condition: NoveltyCondition, size: Size, seed: int = 2026) -> Iterator[Figure]:
     """All figures of one condition."""
-    gaps = [TOLD + math.radians(step) for step in (0.0, *STEPS)]
+    gaps = [KNOWN_GAP + math.radians(step) for step in (0.0, *STEPS)]
     counts = [size.quiet, *(size.changed for _ in STEPS)]
     resting, *changed = pools(condition, gaps, counts, seed)
     rules, rng = NoveltyRules(), np.random.default_rng(seed)
@@ -99,34 +108,34 @@ def charted(condition: NoveltyCondition, size: Size, seed: int = 2026) -> Iterat
     for step, pool in zip(STEPS, changed, strict=True):
         power = one_window(resting, pool, FALSE_ALARMS)
         yield Figure(f"{name}: {step} deg in one window, one false alarm in 120: power", power, ANY, windows)
-        found = delays(resting, pool, rules, size.trials, rng)
-        yield _delay(f"{name}: {step} deg", found, size.trials)
+        result = delays(resting, pool, rules, size.trials, rng)
+        yield _delay(f"{name}: {step} deg", result, size.trials)
         fresh = delays(resting, pool, rules, size.trials, rng, fresh=True)
         yield _delay(f"{name}: {step} deg in the window after news", fresh, size.trials)
     for rate in WEAR:
-        found = wearing(resting, math.radians(rate), rules, size.trials // 4, rng)
-        yield _delay(f"{name}: wear of {rate} deg per window", found, size.trials // 4)
+        result = wearing(resting, math.radians(rate), rules, size.trials // 4, rng)
+        yield _delay(f"{name}: wear of {rate} deg per window", result, size.trials // 4)
 
 
 def _scatter(pool: ScorePool) -> float:
     return float(np.mean(pool.scores[..., 0].std(axis=1)))
 
 
-def _delay(name: str, found: Delays, trials: int) -> Figure:
-    remark = f"90 % within {found.late:g}; in the first {found.at_once:.0%}"
-    return Figure(f"{name}: seen after, windows (median)", found.median, ANY, trials, remark)
+def _delay(name: str, result: Delays, trials: int) -> Figure:
+    remark = f"90 % within {result.late:g}; in the first {result.at_once:.0%}"
+    return Figure(f"{name}: seen after, windows (median)", result.median, ANY, trials, remark)
 
 
 def cost(size: Size, clock: Clock = time.perf_counter) -> Iterator[Figure]:
-    """What judging takes: 1 s at 5 kHz, in plain floats."""
+    """Measure the time of one score: 1 s at 5 kHz, in plain floats."""
     known, spent = Servo.preset("paper"), []
     model = model_of(known, RATE)
     for seed in range(1 + size.quiet // 200):
-        for window in recorded(PoolTask(CONDITIONS[0], TOLD, seed), known):
+        for window in recorded(PoolTask(CONDITIONS[0], KNOWN_GAP, seed), known):
             assert window.theta_m is not None
-            signals = array("d", window.theta_m), array("d", window.position)
+            theta_m, position = array("d", window.theta_m), array("d", window.position)
             begin = clock()
-            score(*signals, model, TOLD, usual=math.inf)
+            score(theta_m, position, model, KNOWN_GAP, usual=math.inf)
             spent.append(1e3 * (clock() - begin))
     remark = f"slowest {max(spent):.1f} ms"
     yield Figure("one window of 1 s at 5 kHz, ms (median)", median(spent), ANY, len(spent), remark)

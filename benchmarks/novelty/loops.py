@@ -1,4 +1,4 @@
-"""What is sent in the closed loop, and what it costs, where the edge tells which windows are worth sending."""
+"""Windows sent in the closed loop, and the accuracy that is left, where the edge selects the windows to send."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LoopCase(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What one loop sent and how well it did.
+    """Windows that one loop sent, and the accuracy of its twin.
 
     Attributes
     ----------
@@ -73,18 +73,18 @@ QUICK = (("fig15", 200.0, True), ("fig15", 400.0, False))
 def accounts(loops: Sequence[tuple[str, float, bool]]) -> Iterator[tuple[LoopCase, str, Account]]:
     """All loops under all rules, each rule with its name, in their order."""
     cases = {LoopCase(*loop, rules): name for loop in loops for name, rules in RULES}
-    found = dict(shared(account, cases))
+    results = dict(shared(account, cases))
     for case, name in cases.items():
-        yield case, name, found[case]
+        yield case, name, results[case]
 
 
 def account(case: LoopCase) -> Account:
-    """One loop."""
+    """Run one loop and sum it up."""
     return summary(cosimulate(scenario(case)))
 
 
 def scenario(case: LoopCase) -> Scenario:
-    """The packaged one, its wear stretched."""
+    """Vary the packaged scenario: stretch its wear."""
     packaged = Scenario.preset(case.scenario)
     gap = SCurve(0.0, GROWTH, duration=case.seconds) if case.wears else 0.5 * GROWTH
     recording = replace(packaged.recording, novelty=case.rules)
@@ -92,14 +92,14 @@ def scenario(case: LoopCase) -> Scenario:
 
 
 def summary(loop: Loop) -> Account:
-    """What it sent and how well it did."""
+    """Sum up the windows that a loop sent, and the accuracy of its twin."""
     run = loop.run
     every, seldom = (max(1, round(run.sample_rate / rate)) for rate in (_SAMPLES, _KNOWN))
-    held, known = (values - run.gap[::seldom] for values in _knowledge(loop, run.time[::seldom]))
-    known_from = np.isfinite(held)
+    errors, known = (values - run.gap[::seldom] for values in _knowledge(loop, run.time[::seldom]))
+    known_from = np.isfinite(errors)
     error = (run.reference - run.position)[::every]
     sent = [m for m in loop.messages if m.direction == "up"]
-    rms = (float(np.sqrt(np.mean(np.square(x[known_from])))) for x in (held, known))
+    rms = (float(np.sqrt(np.mean(np.square(x[known_from])))) for x in (errors, known))
     return Account(
         len(loop.windows) + loop.accounts[FILTERED],
         len(loop.windows),
@@ -108,22 +108,22 @@ def summary(loop: Loop) -> Account:
         dict(Counter(window.reason for window in loop.windows)),
         next(rms),
         next(rms),
-        float(np.max(np.abs(held[known_from]))),
+        float(np.max(np.abs(errors[known_from]))),
         float(np.sqrt(np.mean(np.square(error)))),
         _at_the_end(run.reference[::every], error),
     )
 
 
 def _knowledge(loop: Loop, time: Array) -> tuple[Array, Array]:
-    """(n,) the gap as last estimated, and as the trend predicts it; NaN before the first estimate."""
-    held, known = np.full((2, time.size), math.nan)
+    """(n,) gap of the last estimate, and gap that the trend predicts; NaN before the first estimate."""
+    estimated, known = np.full((2, time.size), math.nan)
     pairs = [(e, t) for e, t in zip(loop.estimates, loop.trends, strict=True) if e.ok and t is not None]
     ends = [*(estimate.time for estimate, _ in pairs[1:]), math.inf]
     for (estimate, trend), end in zip(pairs, ends, strict=True):
         part = np.flatnonzero((time >= estimate.time) & (time < end))
-        held[part] = estimate.gap
+        estimated[part] = estimate.gap
         known[part] = [trend.predict(float(t)).gap if t > trend.time else trend.gap for t in time[part]]
-    return held, known
+    return estimated, known
 
 
 def _at_the_end(reference: Array, error: Array) -> float:

@@ -1,4 +1,4 @@
-"""Sequences of windows drawn from the pools: how long until the chart says something, with a change and without."""
+"""Sequences of windows drawn from the pools: windows until the chart detects a change, or gives a false alarm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST = 2000  # windows after it that are waited for
 
 
 class Delays(NamedTuple):
-    """Windows from a change to its detection, the one that shows it being the first.
+    """Windows from a change to its detection; the first window after the change counts as 1.
 
     Attributes
     ----------
@@ -34,15 +34,15 @@ class Delays(NamedTuple):
 
 
 def follow(chart: Chart, scores: Array, rules: NoveltyRules) -> Iterator[tuple[Chart, bool]]:
-    """The chart after each of some windows (n, 2), and whether it was news."""
+    """Yield the chart after each of some windows (n, 2), and True where the window was news."""
     for gap, std in scores.tolist():
-        seen = add_window(chart, gap, std, rules)
-        chart = seen.chart
-        yield chart, seen.sudden or seen.slow
+        result = add_window(chart, gap, std, rules)
+        chart = result.chart
+        yield chart, result.sudden or result.slow
 
 
 def run_length(pool: ScorePool, rules: NoveltyRules, windows: int, rng: np.random.Generator) -> tuple[float, int]:
-    """Windows per false alarm where nothing changes, after the first few; and how many alarms there were."""
+    """Windows per false alarm where nothing changes, after the first few; and the number of alarms."""
     chart = _settled(pool, rules, rng)
     alarms = sum(news for _, news in follow(chart, pool.drawn(windows, rng), rules))
     return windows / max(1, alarms), alarms
@@ -51,20 +51,20 @@ def run_length(pool: ScorePool, rules: NoveltyRules, windows: int, rng: np.rando
 def delays(
     before: ScorePool, after: ScorePool, rules: NoveltyRules, trials: int, rng: np.random.Generator, fresh: bool = False
 ) -> Delays:
-    """Until a step from one gap to another is seen; `fresh`: the baseline has begun anew with the last window."""
-    found = [_delay(before, after, 0.0, rules, rng, fresh) for _ in range(trials)]
-    return _summary(found)
+    """Windows until a step of the gap is detected; `fresh`: the baseline has begun anew with the last window."""
+    counts = [_delay(before, after, 0.0, rules, rng, fresh) for _ in range(trials)]
+    return _summary(counts)
 
 
 def wearing(pool: ScorePool, rate: float, rules: NoveltyRules, trials: int, rng: np.random.Generator) -> Delays:
-    """Until a growth of `rate` (rad per window) is seen."""
-    found = [_delay(pool, pool, rate, rules, rng, fresh=False) for _ in range(trials)]
-    return _summary(found)
+    """Windows until a growth of `rate` (rad per window) is detected."""
+    counts = [_delay(pool, pool, rate, rules, rng, fresh=False) for _ in range(trials)]
+    return _summary(counts)
 
 
-def _summary(found: list[float]) -> Delays:
-    middle, late = (float(np.quantile(found, share, method="higher")) for share in (0.5, 0.9))
-    return Delays(middle, late, float(np.mean(np.array(found) == 1.0)))
+def _summary(counts: list[float]) -> Delays:
+    middle, late = (float(np.quantile(counts, share, method="higher")) for share in (0.5, 0.9))
+    return Delays(middle, late, float(np.mean(np.array(counts) == 1.0)))
 
 
 def _delay(
@@ -84,7 +84,7 @@ def _delay(
 
 
 def _settled(pool: ScorePool, rules: NoveltyRules, rng: np.random.Generator) -> Chart:
-    """A chart that has seen some windows."""
+    """Make a chart that has learnt some windows."""
     chart = Chart()
     for later, _ in follow(chart, pool.drawn(QUIET, rng), rules):
         chart = later

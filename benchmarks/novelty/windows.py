@@ -22,7 +22,7 @@ from servotwin.simulation import simulate
 RATE, SECONDS = 5000.0, 1.0
 STEP, AMPLITUDE = 5.0, 1e-3  # s from one change of the reference to the next, m
 CHUNK = 20  # windows of one run
-TOLD = math.radians(10.0)
+KNOWN_GAP = math.radians(10.0)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ScorePool:
     scores : (2, n, 2) array
         Estimate and standard deviation, rad.
     silent : int
-        Windows that said nothing.
+        Windows that do not show the gap.
     """
 
     gap: float
@@ -92,29 +92,29 @@ def pools(condition: NoveltyCondition, gaps: Sequence[float], counts: Sequence[i
         for place, (gap, count) in enumerate(zip(gaps, counts, strict=True))
         for chunk in range(-(-count // CHUNK))
     ]
-    found = dict(shared(scored, tasks))
+    results = dict(shared(scored, tasks))
     for gap in gaps:
-        rows = [row for task in tasks if task.gap == gap for row in found[task]]
-        said = [[s[1:] for s in rows if s[0] == way and math.isfinite(s[1])] for way in (0, 1)]
-        few = min(map(len, said))
-        yield ScorePool(gap, np.array([way[:few] for way in said]), len(rows) - sum(map(len, said)))
+        rows = [row for task in tasks if task.gap == gap for row in results[task]]
+        informative = [[s[1:] for s in rows if s[0] == way and math.isfinite(s[1])] for way in (0, 1)]
+        few = min(map(len, informative))
+        yield ScorePool(gap, np.array([way[:few] for way in informative]), len(rows) - sum(map(len, informative)))
 
 
 def scored(task: PoolTask) -> list[tuple[int, float, float]]:
-    """Of each window: after which kind of step, estimate, standard deviation; NaN where it says nothing."""
+    """Score each window: direction of the step before it, estimate, standard deviation; NaN where it shows no gap."""
     known = Servo.preset("paper")
     model, rng = model_of(known, RATE), np.random.default_rng(task.seed)
     rows = []
     for number, window in enumerate(recorded(task, known)):
         assert window.theta_m is not None
         position = window.position + FLOOR * rng.standard_normal(window.position.size)
-        found = score(array("d", window.theta_m), array("d", position), model, TOLD)
-        rows.append((number % 2, math.nan, math.nan) if found is None else (number % 2, found.gap, found.std))
+        estimate = score(array("d", window.theta_m), array("d", position), model, KNOWN_GAP)
+        rows.append((number % 2, math.nan, math.nan) if estimate is None else (number % 2, estimate.gap, estimate.std))
     return rows
 
 
 def recorded(task: PoolTask, known: Servo) -> Iterator[Window]:
-    """The windows after the steps of one run, in a dead zone for what the twin was told."""
+    """Yield the windows after the steps of one run, with the dead zone for the gap that the twin knows."""
     condition = task.condition
     plant = known.replace(k=_times(known.k, condition.k), c=_times(known.c, condition.c))
     law = known.controller
@@ -124,7 +124,7 @@ def recorded(task: PoolTask, known: Servo) -> Iterator[Window]:
         controller=law if condition.noise is None else law.replace(sample_rate=RATE, loop_filter_hz=20.0),
         reference=SquareWave(AMPLITUDE, 2.0 * STEP),
         gap=task.gap,
-        tolerance=known.tolerance_for(TOLD),
+        tolerance=known.tolerance_for(KNOWN_GAP),
         noise=condition.noise,
         seed=task.seed,
         theta_d0=float(np.random.default_rng(task.seed).uniform(-0.5, 0.5)) * task.gap,

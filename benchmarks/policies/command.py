@@ -45,7 +45,7 @@ def policies(
     blocks: Sequence[str] = BLOCKS,
     console: Console | None = None,
 ) -> tuple[PolicyScores, ...]:
-    """Compare, show as it comes, and write JSON when asked to.
+    """Compare, show as it comes, and write JSON if `output` is given.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def _choice(scores: Scores, which: NDArray[np.bool_]) -> tuple[str, str, str]:
 
 def dumps(rows: Sequence[PolicyScores], date: str) -> str:
     """The document: schema, date, machine, and every measure of every run."""
-    found = [
+    table = [
         {
             "block": row.block,
             "policy": row.name,
@@ -124,4 +124,4 @@ def dumps(rows: Sequence[PolicyScores], date: str) -> str:
         }
         for row in rows
     ]
-    return report.text(SCHEMA, date, rows=found)
+    return report.text(SCHEMA, date, rows=table)

@@ -20,7 +20,7 @@ _NOT_BOUND = 100.0
 
 @cache
 def contender(name: str, model: Servo, known: Uncertainty) -> Contender:
-    """A policy by name, with the model and what is stated of it."""
+    """Make a policy by name, with the model and its stated uncertainty."""
     own = Design(model.controller)
     if name == "no dead zone":
         return Contender(None, own)
@@ -35,15 +35,18 @@ def contender(name: str, model: Servo, known: Uncertainty) -> Contender:
 
 
 def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
-    """Constant settings by name: what `certified` chooses from, without its bound on Ms, and the paper's gains with
-    dead zones for gaps of 10, 30 and 60 deg."""
+    """List constant settings by name.
+
+    They are the candidates of `certified`, without its bound on Ms, and the paper's gains with dead zones for gaps of
+    10, 30 and 60 deg.
+    """
     policy = CertifiedPolicy(model, known)
     demands = replace(policy.demands, Ms=_NOT_BOUND)
-    own, found = model.controller, {}
+    own, policies = model.controller, {}
     for setting in candidates_of(model, demands, 0.0, disturbed=True, noisy=False):
         law = setting.controller
-        found[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
+        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
     for share in (1.0 / 6.0, 0.5, 1.0):
         width = model.tolerance_for(share * known.gap[1], 1.5)
-        found[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
-    return found
+        policies[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
+    return policies

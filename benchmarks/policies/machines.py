@@ -19,7 +19,7 @@ _RELATIVE = ("k", "c", "k_B", "m")
 
 @dataclass(frozen=True)
 class TrialMachine:
-    """One plant with its gap and what happens to it.
+    """One plant with its gap, disturbances and reference step.
 
     Attributes
     ----------

@@ -79,8 +79,8 @@ def compare(
 
 def _row(block: str, name: str, those: Sequence[TrialMachine], model: Servo, competitor: Contender) -> PolicyScores:
     tasks = [_Task(place, machine, block, model, competitor) for place, machine in enumerate(those)]
-    found = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
-    return PolicyScores(block, name, Scores(*np.array([scores for _, scores in found]).T), tuple(those))
+    ordered = sorted((task.place, scores) for task, scores in shared(_tried, tasks))
+    return PolicyScores(block, name, Scores(*np.array([scores for _, scores in ordered]).T), tuple(those))
 
 
 def _tried(task: _Task) -> Scores:
@@ -88,7 +88,7 @@ def _tried(task: _Task) -> Scores:
 
 
 def _best_constant(block: str, those: Sequence[TrialMachine], model: Servo, known: Uncertainty) -> PolicyScores:
-    """The best on all machines of those that are best on a fifth of them: with hindsight."""
+    """Select, with hindsight, the best on all machines among those that are best on a fifth of them."""
     few = those[: max(_FEWEST, round(_SCREENED * len(those)))]
     settings = {f"constant: {name}": setting for name, setting in constants(model, known).items()}
     tried = [_row(block, name, few, model, Contender(None, setting)) for name, setting in settings.items()]
@@ -97,5 +97,5 @@ def _best_constant(block: str, those: Sequence[TrialMachine], model: Servo, know
 
 
 def _rank(row: PolicyScores) -> tuple[bool, float]:
-    """The cheapest of those that settle; in noise nothing does."""
+    """Select the cheapest of those that settle; in noise none does."""
     return row.block != "noise" and row.settled < LEAST_SETTLED, row.at("cost", 95.0)

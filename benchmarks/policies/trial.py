@@ -84,8 +84,11 @@ class Contender:
 
 
 def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Contender) -> Scores:
-    """The gap's estimate is right to 0.05 deg (standard deviation) and says so; of the rest a policy knows what its
-    windows show: 2 s that end 2 s before the step, 20 and 40 s after it, its setting in force a second later."""
+    """Run a machine under a policy.
+
+    The policy gets the gap with an error of 0.05 deg (standard deviation), which it knows. It learns everything else
+    from its windows: 2 s that end 2 s before the step, 20 and 40 s after it; its setting is in force a second later.
+    """
     rng = np.random.default_rng(machine.seed)
     believed = max(0.0, machine.gap + SPREAD * rng.standard_normal())
     setting = _redesigned(competitor, Evidence(_estimate(believed)), competitor.start)
@@ -93,8 +96,8 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
     for end in UPDATES if competitor.policy is not None else ():
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
-        seen = disturbance(window, model)
-        evidence = Evidence(_estimate(believed), seen, None, setting.setting(), told_for)
+        measured = disturbance(window, model)
+        evidence = Evidence(_estimate(believed), measured, None, setting.setting(), told_for)
         now = _redesigned(competitor, evidence, setting)
         told_for = believed
         if now != setting:
@@ -106,7 +109,7 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
 
 
 def scores(run: Run, step: float, setting: Design, model: Servo) -> Scores:
-    """Measures of a run with one step, from there on, and the setting at its end."""
+    """Measure a run with one step from the step on; state the setting at its end."""
     law, own = setting.controller, model.controller
     error = (run.reference - run.position)[round(REST * run.sample_rate) :]
     last = slice(-round(LAST * run.sample_rate), None)
@@ -127,7 +130,7 @@ def scores(run: Run, step: float, setting: Design, model: Servo) -> Scores:
 
 
 def _redesigned(competitor: Contender, evidence: Evidence, before: Design) -> Design:
-    """The setting after a policy was asked."""
+    """Let the policy decide; return the setting after its decision."""
     if competitor.policy is None:
         return before
     made = competitor.policy.redesign(evidence)
@@ -159,7 +162,7 @@ def _simulation(machine: TrialMachine, block: str, setting: Design, rng: np.rand
 
 
 def _law(controller: Controller, block: str) -> Controller:
-    """Continuous and exact, but sampled where there is noise."""
+    """Simulate continuously and exactly; with noise, sampled."""
     return controller.replace(sample_rate=_RATES.get(block))
 
 

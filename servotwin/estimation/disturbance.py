@@ -3,7 +3,7 @@
 At rest nothing accelerates, so on average no torque is passed on, and the motor's voltage cancels the bias, whatever
 the controller is made of. A motor that creeps across its gap is still at rest in that sense: the voltage then carries
 its back EMF too, which is taken off (Eq 4 without acceleration). Coulomb friction holds a motor at rest against any
-voltage up to its own, and is not told from a bias.
+voltage up to its own and cannot be told from a bias.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-SHORTEST = 0.1  # s at rest, without which nothing is said
-_BATCH_S, _GROUPS = 0.025, 8  # s over which samples are averaged; means that a spread is made of, at most
-_CREEP = 0.1  # V of back EMF: slower than that is at rest
-_BACK_EMF_SHARE = 0.1  # how wrong k_B may be
+SHORTEST = 0.1  # s: shortest rest that counts
+_BATCH_S, _GROUPS = 0.025, 8  # s over which samples are averaged; most groups of means that a spread is computed from
+_CREEP = 0.1  # V of back EMF: a slower motor counts as at rest
+_BACK_EMF_SHARE = 0.1  # relative error of k_B that the spread allows for
 _SMOOTH = 1.0  # mean square of successive differences over variance: 2 for noise, 0.2 for a swing at 3 Hz
-_FEWEST = 8  # means that tell noise from a swing
-_NEAR, _FINE = 2.0, 1e-3  # times the least spread, or V: not worth a shorter rest
-_DRIFTS = 2.0  # standard deviations from which on a drift is one
+_FEWEST = 8  # fewest means that tell noise from a swing
+_NEAR, _FINE = 2.0, 1e-3  # times the least spread, or V: a longer rest with so little more is preferred
+_DRIFTS = 2.0  # standard deviations: a smaller drift counts as chance
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Disturbance:
     effort : float
         V, root mean square of the voltage in the whole window; NaN when it was not recorded.
     reasons : tuple of str
-        Why something is unknown, one sentence each.
+        Reasons for unknown values, one sentence each.
     """
 
     bias: float
@@ -72,7 +72,7 @@ def nothing_known(effort: float, *reasons: str) -> Disturbance:
 
 
 def disturbance(window: Window, servo: Servo) -> Disturbance:
-    """Input bias and noise, from the longest rest that shows the bias about as well as any.
+    """Estimate input bias and noise from the longest rest whose spread is close to the least.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ def disturbance(window: Window, servo: Servo) -> Disturbance:
 
 
 def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
-    """Input bias and its spread (V) from the last `SHORTEST` s before the reference changes, or the window ends.
+    """Estimate input bias and spread (V) from the last `SHORTEST` s before a reference change or the window's end.
 
-    The first of these moments that is one of rest counts; without one, or without the channels, (NaN, inf).
+    The first such interval at rest counts; without one, or without the channels, the result is (NaN, inf).
     """
     if any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
         return math.nan, math.inf
@@ -109,7 +109,7 @@ def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
 
 
 def _longest_good(rests: list[tuple[float, float, int, int]]) -> tuple[float, float, int, int]:
-    """The longest of (bias, std, first, last) with little more than the least spread, which is partly luck."""
+    """Select the longest of (bias, std, first, last) with little more than the least spread, which is partly chance."""
     allowed = max(_NEAR * min(rest[1] for rest in rests), _FINE)
     return max((rest for rest in rests if rest[1] <= allowed), key=lambda rest: rest[3] - rest[2])
 
@@ -126,7 +126,7 @@ def _constant(window: Window, size: int) -> list[tuple[int, int]]:
 def _rests(
     window: Window, servo: Servo, size: int, stretches: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[float, float, int, int]]:
-    """(bias, std, first, last) of those stretches in which nothing moves."""
+    """Yield (bias, std, first, last) of the stretches in which nothing moves."""
     begins: dict[int, int] = {}
     for first, last in stretches:
         begins[last] = min(first, begins.get(last, first))
@@ -181,7 +181,7 @@ def _roughness(means: Array) -> float:
 
 
 def _spread(drive: Array) -> float:
-    """Standard deviation of the mean of correlated values, from the means of groups, a drift being none of chance."""
+    """Standard deviation of the mean of correlated values, from the means of groups; a clear drift adds half of it."""
     count = min(_GROUPS, drive.size)
     bounds = np.arange(count + 1) * drive.size // count
     groups = np.add.reduceat(drive, bounds[:-1]) / np.diff(bounds)

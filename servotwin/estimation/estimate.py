@@ -1,4 +1,4 @@
-"""An estimate of the gap is never a bare number: value, spread, interval, status, and what it rests on."""
+"""Estimate of the gap: value, spread, interval, status, reasons, and the model and method behind it."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class OffsetReading:
 
 @dataclass(frozen=True)
 class CarriedOffset:
-    """The encoder's offset from earlier windows, without which this one would not show the gap.
+    """The encoder's offset from earlier windows; without it the window would not show the gap.
 
     Attributes
     ----------
     offset, std : float
         rad, as handed to the estimator.
     slope : float
-        By how much the gap would be another per change of the offset.
+        Change of the estimated gap per change of the offset.
     """
 
     offset: float
@@ -50,7 +50,7 @@ class CarriedOffset:
 
 @dataclass(frozen=True, repr=False)
 class GapEstimate:
-    """The total gap as one window shows it.
+    """Total gap estimated from one window.
 
     Attributes
     ----------
@@ -59,25 +59,25 @@ class GapEstimate:
     std : float
         Statistical standard deviation, rad; inf when the window does not determine the gap.
     std_total : float
-        The same with the systematic error that the method is known to have, rad.
+        `std` with the method's known systematic error added, rad.
     interval : (float, float)
         95 % interval of the gap from `std_total`, rad; its upper end is inf where only a lower bound is known.
     status : GapStatus
     time : float
-        Time of the middle of the window, s, to which the value belongs.
+        Time of the window's middle, s; the gap belongs to it.
     theta_d0 : float
         Screw angle at the first sample, rad; NaN when unknown.
     reasons : tuple of str
-        Why the status is not OK, one sentence each; empty when it is.
+        Reasons for a status other than OK, one sentence each.
     model_version : str
-        Which model numbers were assumed: `Servo.version`.
+        Version of the assumed model: `Servo.version`.
     method : str
     rms : float
         Root mean square of the residual over the samples that count, m; NaN when nothing was fitted.
     evaluations : int
         Evaluations of the cost.
     offset : OffsetReading or CarriedOffset, optional
-        What the window says of the encoder's offset, or what it was told of it; None: neither was asked.
+        The encoder's offset, read from this window or carried from earlier ones; None: not used.
     """
 
     gap: float
@@ -95,7 +95,7 @@ class GapEstimate:
     offset: OffsetReading | CarriedOffset | None = None
 
     def __post_init__(self) -> None:
-        # What the numbers libraries return becomes plain: estimates go into messages and logs.
+        # Estimates go into messages and logs, which take plain floats only, not numpy scalars.
         for name in ("gap", "std", "std_total", "time", "theta_d0", "rms"):
             object.__setattr__(self, name, float(getattr(self, name)))
         low, high = self.interval
@@ -127,7 +127,7 @@ class GapEstimate:
 
 
 def no_estimate(time: float, reasons: tuple[str, ...] = (), model_version: str = "", method: str = "") -> GapEstimate:
-    """Make the estimate of a window that shows nothing, with the reasons; `time` in s."""
+    """Make the estimate of a window that does not show the gap, with the reasons; `time` in s."""
     return GapEstimate(
         gap=math.nan,
         std=math.inf,

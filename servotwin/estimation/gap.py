@@ -1,4 +1,4 @@
-"""Estimating the gap: one entry, a registry of methods. A new method is one more module there."""
+"""Estimate the gap by any method: one entry, one registry. A new method is one more module in `METHODS`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def estimate_gap(
     prior: float | GapEstimate | None = None,
     settings: Any = None,
 ) -> GapEstimate:
-    """The total gap that a window of measurements shows, with its spread, and whether it may be believed.
+    """Estimate the total gap from a window of measurements, with its spread and status.
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def estimate_gap(
         "whitened", the default (`servotwin.estimation.whitened`), or "paper", the published one
         (`servotwin.estimation.paper`).
     prior : float or GapEstimate, optional
-        What was known before, rad, total gap; an estimate that is not OK counts as nothing. The search starts there,
-        among other places; "whitened" also gives it back when the window says nothing.
+        Total gap known before, rad; an estimate that is not OK is ignored. The search starts there, among other
+        places; "whitened" also returns it where the window does not show the gap.
     settings : optional
         The method's own `Settings`.
 
@@ -67,11 +67,11 @@ def estimate_gap(
         is too short.
     """
     chosen = settings_of(method, settings)
-    return METHODS[method].estimate(window, servo, _believed(prior), chosen)
+    return METHODS[method].estimate(window, servo, _usable_prior(prior), chosen)
 
 
 def settings_of(method: str, settings: Any = None) -> Any:
-    """The settings, or the method's own where they are None.
+    """Return the settings, or the method's defaults where they are None.
 
     Raises
     ------
@@ -82,8 +82,8 @@ def settings_of(method: str, settings: Any = None) -> Any:
         raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(METHODS)}")
     kind = METHODS[method].settings
     if settings is not None and not isinstance(settings, kind):
-        wanted = f"{kind.__module__.removeprefix('servotwin.')}.{kind.__name__}"
-        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {wanted}")
+        expected = f"{kind.__module__.removeprefix('servotwin.')}.{kind.__name__}"
+        raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {expected}")
     return kind() if settings is None else settings
 
 
@@ -92,8 +92,8 @@ def shortest_window(method: str, sample_rate: float, settings: Any = None) -> tu
     return METHODS[method].shortest(settings_of(method, settings), sample_rate)
 
 
-def _believed(prior: float | GapEstimate | None) -> float | GapEstimate | None:
-    """Return the prior if it may be used."""
+def _usable_prior(prior: float | GapEstimate | None) -> float | GapEstimate | None:
+    """Return the prior; None for an estimate that is not OK."""
     if isinstance(prior, GapEstimate):
         return prior if prior.ok else None
     if prior is not None and not (math.isfinite(prior) and prior >= 0.0):

@@ -1,9 +1,9 @@
-"""The encoder's offset as a window shows it, beside the gap; and the gap as one contact shows it, the offset known.
+"""Read the encoder's offset from a window, and the gap from a window with one contact once the offset is known.
 
 The offset is position / static gain less the screw's angle: what the encoder would have to be shifted by for both to
-agree at rest. It is a constant in the residual, so it costs nothing to read once the gap is known; what earlier windows
-tell of it lets later ones show the gap with one contact only. It is constant as long as the gap opens to both sides
-alike; `TrendSettings.offset_walk_rad_per_sqrt_s` is for wear on one flank.
+agree at rest. It is a constant in the residual, so it costs nothing to read once the gap is known; with the offset from
+earlier windows, a later one shows the gap with one contact only. The offset is constant as long as the gap opens to
+both sides alike; `TrendSettings.offset_walk_rad_per_sqrt_s` is for wear on one flank.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 _GAP, _CONSTANT = 0, 1  # rows of the columns
-# An offset that is right leaves what was left without it. A search that lost its way in the narrow valley which the
-# offset makes was sure of gaps 1 deg off, and left a hundred times as much.
+# A right offset leaves about the same residual as none. Searches that got lost in its narrow valley stated gaps 1 deg
+# off with a small spread; their residual was a hundred times as large.
 _WORSE = 3.0
 
 
@@ -37,10 +37,10 @@ def estimate_carrying(
     settings: whitened.WhitenedSettings,
     carried: tuple[float, float] | None,
 ) -> GapEstimate:
-    """The gap from the window alone, or, where that shows too little of it, with the offset that earlier ones showed.
+    """Estimate the gap from the window alone, or, where that shows too little, with the offset from earlier windows.
 
-    The estimate says what it knows of the offset, for the trend. A window that shows both sides of the gap is never
-    told of the offset, so that an encoder that has slipped cannot spoil it.
+    The estimate holds the offset for the trend. The carried offset is not used where the window shows both sides of the
+    gap, so that an encoder that has slipped cannot spoil the estimate.
 
     Parameters
     ----------
@@ -49,13 +49,13 @@ def estimate_carrying(
     prior : float or GapEstimate, optional
         As for `estimate_gap`.
     settings : whitened.WhitenedSettings
-        With an `offset` of its own, nothing is carried and nothing read.
+        With an `offset` of its own, none is carried and none is read.
     carried : (float, float), optional
         Mean and standard deviation of the offset, rad.
     """
     fitted = whitened.fit(window, servo, prior, settings)
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
-    # A window of one contact can show nothing alone; looking for how little it shows takes longer than all the rest.
+    # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
     alone = None if known and fitted.one_sided() else fitted.concluded()
     if alone is not None:
         if settings.offset is None and alone.ok:
@@ -71,7 +71,7 @@ def estimate_carrying(
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
-    """Return the estimate of the window alone, with the reason why the other is not used."""
+    """Return the estimate of the window alone, with the reason for not using the other."""
     if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
         return alone
     worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
@@ -108,10 +108,10 @@ def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whit
     model = response(servo, window.sample_rate)
     angle = motor_angle(window, servo.encoder_resolution, settings)
     first, home = float(angle[0]), float(window.position[0])
-    seen = polygon(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
-    rows = model.respond(seen[[SCREW, BY_GAP, BY_START]])
+    screw = polygon(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
+    rows = model.respond(screw[[SCREW, BY_GAP, BY_START]])
     constant = np.full((1, angle.size), model.static_gain)
-    late = model.velocities(seen[[SCREW]])
+    late = model.velocities(screw[[SCREW]])
     return np.vstack([window.position - home - rows[0], rows[1:2], constant, rows[2:], model.free(angle.size), late])
 
 

@@ -13,7 +13,7 @@ from scipy.special import ndtr, owens_t
 from servotwin.plant.signals import Array
 
 _TAILS = (0.025, 0.5, 0.975)
-_GRID = np.geomspace(1e-6, 1e6, 2401)  # of the time that the trend's own numbers suggest
+_GRID = np.geomspace(1e-6, 1e6, 2401)  # times `_scale`
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Passage:
     interval : (float, float)
         s, 95 %; its upper end is inf unless the trend is sure to get there, which needs a rate whose sign is certain.
     probability : float
-        That it ever does.
+        Probability that it ever does.
     """
 
     median: float
@@ -38,8 +38,8 @@ class Passage:
 def passage(mean: Array, covariance: Array, gap: float, gap_walk: float = 0.0, rate_walk: float = 0.0) -> Passage:
     """First passage of gap + rate t through `gap`.
 
-    The chance to have passed by t is that of lying beyond now or at some time up to t. Without random walks it is
-    exact; with them a path that passed and came back by t is missed, which wear, going one way, hardly does.
+    The chance of having passed by t is taken as that of lying beyond now or at t. Without random walks it is exact;
+    with them it misses the paths that passed and came back by t, which are rare because wear goes one way.
 
     Parameters
     ----------
@@ -49,12 +49,11 @@ def passage(mean: Array, covariance: Array, gap: float, gap_walk: float = 0.0, r
     gap : float
         The limit, rad.
     gap_walk, rate_walk : float
-        rad/sqrt(s) and rad/s/sqrt(s): how gap and rate go on wandering.
+        rad/sqrt(s) and rad/s/sqrt(s): random walks of gap and rate.
     """
-    walks = gap_walk**2, rate_walk**2
 
     def passed(time: Array) -> Array:
-        return _passed(mean, covariance, gap, time, *walks)
+        return _passed(mean, covariance, gap, time, gap_variance=gap_walk**2, rate_variance=rate_walk**2)
 
     grid = _GRID * _scale(mean, covariance, gap)
     chance = np.maximum.accumulate(passed(np.concatenate([[0.0], grid])))
@@ -63,7 +62,7 @@ def passage(mean: Array, covariance: Array, gap: float, gap_walk: float = 0.0, r
 
 
 def _scale(mean: Array, covariance: Array, gap: float) -> float:
-    """A time in the middle of what matters: distance over rate, spreads included; 1 s when nothing moves."""
+    """Time scale of the passage: distance over rate, spreads included; 1 s when nothing moves."""
     distance = abs(gap - float(mean[0])) + math.sqrt(covariance[0, 0])
     rate = abs(float(mean[1])) + math.sqrt(covariance[1, 1])
     return min(max(distance / rate, 1e-60), 1e60) if rate > 0.0 and distance > 0.0 else 1.0
@@ -80,10 +79,12 @@ def _quantile(passed: Callable[[Array], Array], grid: Array, chance: Array, tail
     return float(brentq(lambda t: float(passed(np.array([t]))[0]) - tail, begin, end, xtol=1e-12 * end))
 
 
-def _passed(mean: Array, covariance: Array, gap: float, time: Array, gap_walk: float, rate_walk: float) -> Array:
-    """Chance to be beyond `gap` now or at each `time` (n,)."""
+def _passed(
+    mean: Array, covariance: Array, gap: float, time: Array, gap_variance: float, rate_variance: float
+) -> Array:
+    """Chance of lying beyond `gap` now or at each `time` (n,); the walks' variances grow per second."""
     now, cross, rate = float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])
-    then = now + 2.0 * time * cross + time**2 * rate + gap_walk * time + rate_walk * time**3 / 3.0
+    then = now + 2.0 * time * cross + time**2 * rate + gap_variance * time + rate_variance * time**3 / 3.0
     shared = now + time * cross
     first = _score(gap - float(mean[0]), np.full_like(time, now))
     second = _score(gap - float(mean[0]) - time * float(mean[1]), then)

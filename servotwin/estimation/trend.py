@@ -35,15 +35,15 @@ class TrendMeasurement:
 
     @property
     def of_gap(self) -> TrendMeasurement:
-        """Its first value alone."""
+        """The measurement of the gap alone."""
         return TrendMeasurement(self.values[:1], self.select[:1], self.noise[:1, :1])
 
 
 def reading(estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None) -> TrendMeasurement:
     """Turn an OK estimate into a measurement of gap and offset.
 
-    A gap that rests on the carried offset is none of its own: the window shows gap - slope offset. Taken as a gap, the
-    offset's error would count anew with every such window, as if it were another each time.
+    Where the gap rests on the carried offset, the window shows gap - slope * offset only. Taken as a measurement of the
+    gap, it would count the offset's error as an independent one in every such window.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def process_noise(step: float, settings: TrendSettings) -> Array:
     return noise
 
 
-def bound_std(estimate: GapEstimate) -> float:
+def _bound_std(estimate: GapEstimate) -> float:
     """Spread (rad) of a lower bound, from the lower end of its 95 % interval."""
     return max(0.0, estimate.gap - estimate.interval[0]) / NORMAL_95
 
@@ -129,7 +129,7 @@ class Trend:
     refused : int
         Outliers since the last window that counted.
     reasons : tuple of str
-        Why the last window did not count, or counted otherwise than as a plain value.
+        Reasons for which the last window did not count, or counted otherwise than as a plain value.
     rival : Trend or None
         The state that outliers since then would make; it takes over once `restart_after` of them agree.
     """
@@ -188,7 +188,7 @@ class Trend:
         """The state at the estimate's time, corrected by it.
 
         Only an OK estimate counts as a value. A lower bound counts one-sidedly: it moves the state only as far as the
-        state lies below it. Others leave the prediction as it is, and say why.
+        state lies below it. Any other status leaves the prediction as it is, with the reason.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class Trend:
         return replace(ahead, reasons=(f"the window did not count, being {estimate.status.value}: {because}",))
 
     def without_offset(self) -> Trend:
-        """The same wear seen by an encoder of which nothing is known, as after it was homed anew."""
+        """The same wear with an unknown encoder offset, as after the encoder was homed anew."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[OFFSET] = covariance[OFFSET] = covariance[:, OFFSET] = 0.0
         covariance[OFFSET, OFFSET] = self.settings.offset_std_rad**2
@@ -216,58 +216,58 @@ class Trend:
         """The same state on a clock that now reads `time`, s."""
         return replace(self, time=_time(time), rival=self.rival and self.rival.on_clock(time))
 
-    def _corrected(self, seen: TrendMeasurement) -> Trend:
-        """Corrected by what was seen, unless the gap is an outlier; an offset that is one is read anew."""
-        distance = self._distance(seen.of_gap)
+    def _corrected(self, measurement: TrendMeasurement) -> Trend:
+        """Correct the state by a measurement, unless its gap is an outlier; an outlying offset is read anew."""
+        distance = self._distance(measurement.of_gap)
         if distance > self.settings.outlier_std:
-            return self._refused(distance, seen)
-        if self._distance(seen) > self.settings.outlier_std:
-            return replace(self.without_offset()._joseph(seen), reasons=(_MOVED,))
-        return self._joseph(seen)
+            return self._refused(distance, measurement)
+        if self._distance(measurement) > self.settings.outlier_std:
+            return replace(self.without_offset()._joseph(measurement), reasons=(_MOVED,))
+        return self._joseph(measurement)
 
-    def _distance(self, seen: TrendMeasurement) -> float:
+    def _distance(self, measurement: TrendMeasurement) -> float:
         """Distance from the prediction, in standard deviations of both."""
-        surprise = seen.values - seen.select @ self.mean
-        spread = seen.select @ self.covariance @ seen.select.T + seen.noise
+        surprise = measurement.values - measurement.select @ self.mean
+        spread = measurement.select @ self.covariance @ measurement.select.T + measurement.noise
         return math.sqrt(max(0.0, float(surprise @ np.linalg.solve(spread, surprise))))
 
-    def _joseph(self, seen: TrendMeasurement) -> Trend:
+    def _joseph(self, measurement: TrendMeasurement) -> Trend:
         """Kalman update; Joseph's form keeps the covariance definite."""
-        select, noise = seen.select, seen.noise
+        select, noise = measurement.select, measurement.noise
         spread = select @ self.covariance @ select.T + noise
         gain = np.linalg.solve(spread, select @ self.covariance).T
         left = np.eye(3) - gain @ select
         covariance = left @ self.covariance @ left.T + gain @ noise @ gain.T
-        mean = self.mean + gain @ (seen.values - select @ self.mean)
+        mean = self.mean + gain @ (measurement.values - select @ self.mean)
         counted = self.updates + 1
         return replace(self, mean=mean, covariance=_symmetric(covariance), updates=counted, refused=0, rival=None)
 
-    def _refused(self, distance: float, seen: TrendMeasurement) -> Trend:
-        """The prediction with one more refusal; or what the outliers say, once enough of them agree."""
+    def _refused(self, distance: float, measurement: TrendMeasurement) -> Trend:
+        """Count one more outlier; once enough of them agree, start afresh from them."""
         expected = f"{math.degrees(self.mean[GAP]):.4g} deg were expected"
         limit = f"{distance:.3g} standard deviations away, and {self.settings.outlier_std:.3g} are allowed"
         refused = replace(self, refused=self.refused + 1, reasons=(f"{_OUTLIER}: {expected}, {limit}",))
-        if _leans_on_offset(seen):
+        if _leans_on_offset(measurement):
             return replace(refused.without_offset(), reasons=(*refused.reasons, _DOUBTED))
-        rival = self._rival(seen)
+        rival = self._rival(measurement)
         if rival.updates < self.settings.restart_after:
             return replace(refused, rival=rival)
         reason = f"outliers in a row that agree: {rival.updates}; the gap starts afresh, as after a crash or a repair"
         return replace(rival, updates=self.updates + rival.updates, reasons=(reason,))
 
-    def _rival(self, seen: TrendMeasurement) -> Trend:
-        """The state that the outliers so far would make, were they right: of those that agree with this one."""
-        if self.rival is not None and self.rival._distance(seen.of_gap) <= self.settings.agreement_std:
-            return self.rival._corrected(seen)
+    def _rival(self, measurement: TrendMeasurement) -> Trend:
+        """State that this outlier makes together with the earlier ones that agree with it."""
+        if self.rival is not None and self.rival._distance(measurement.of_gap) <= self.settings.agreement_std:
+            return self.rival._corrected(measurement)
         fresh = Trend.start(self.time, self.settings).covariance
         fresh[RATE, RATE] = self.covariance[RATE, RATE]
         mean = np.array([0.0, self.mean[RATE], 0.0])
-        return Trend(self.time, mean, fresh, self.settings)._joseph(seen)
+        return Trend(self.time, mean, fresh, self.settings)._joseph(measurement)
 
     def _bounded(self, estimate: GapEstimate) -> Trend:
         """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
         column = self.covariance[:, GAP]
-        spread = math.hypot(math.sqrt(column[GAP]), bound_std(estimate))
+        spread = math.hypot(math.sqrt(column[GAP]), _bound_std(estimate))
         margin = (self.mean[GAP] - estimate.gap) / spread if spread > 0.0 else math.inf
         pull, cut = truncation(margin)
         gain = column / spread if spread > 0.0 else np.zeros(3)
@@ -298,7 +298,7 @@ class Trend:
 
     @property
     def rate_std(self) -> float:
-        """rad/s."""
+        """Standard deviation of the wear rate, rad/s."""
         return math.sqrt(self.covariance[RATE, RATE])
 
     @property
@@ -328,13 +328,18 @@ class Trend:
             raise InvalidInput(f"trend: gap = {gap!r} rad: must be finite and at least 0")
         covariance = self.covariance[:OFFSET, :OFFSET].copy()
         covariance[GAP, GAP] += self.settings.shared_error_rad**2
-        walks = self.settings.gap_walk_rad_per_sqrt_s, self.settings.rate_walk_rad_per_s_per_sqrt_s
-        return passage(self.mean[:OFFSET], covariance, gap, *walks)
+        return passage(
+            self.mean[:OFFSET],
+            covariance,
+            gap,
+            gap_walk=self.settings.gap_walk_rad_per_sqrt_s,
+            rate_walk=self.settings.rate_walk_rad_per_s_per_sqrt_s,
+        )
 
 
-def _leans_on_offset(seen: TrendMeasurement) -> bool:
-    """Tell whether a gap was read by means of the carried offset."""
-    return bool(seen.select[0, OFFSET] != 0.0)
+def _leans_on_offset(measurement: TrendMeasurement) -> bool:
+    """Tell whether a gap was measured by means of the carried offset."""
+    return bool(measurement.select[0, OFFSET] != 0.0)
 
 
 def _symmetric(matrix: Array) -> Array:

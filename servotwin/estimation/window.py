@@ -1,4 +1,4 @@
-"""A window of measurements as numbers: what every estimator starts from."""
+"""Window of measurements: the input of every estimator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MINIMUM_SAMPLES = 16
 CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
-_JITTER = 0.05  # of a sample interval: what rounded time stamps may deviate from a uniform grid
+_JITTER = 0.05  # of a sample interval: largest deviation of (rounded) time stamps from a uniform grid
 
 
 class RunLike(Protocol):
@@ -53,7 +53,7 @@ class Window:
     start : float
         Time of the first sample, s; only with `sample_rate`.
     source : str, optional
-        Where the window comes from, for people; errors begin with it.
+        Origin of the window in words; error messages begin with it.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class Window:
 
     @classmethod
     def from_run(cls, run: RunLike, start: float, duration: float) -> Window:
-        """The samples of a simulated run from `start` (s) on, `duration` (s) long, as the sensors gave them.
+        """Cut the measured samples of a simulated run from `start` (s) on, `duration` (s) long.
 
         The last sample is one interval before the end.
 
@@ -131,14 +131,14 @@ class Window:
         return cls(**channels, sample_rate=rate, start=begin + part.start / rate)
 
     def slice(self, start: float, duration: float) -> Window:
-        """The part of `duration` (s) that begins at the sample nearest to `start` (s, on the window's own clock)."""
+        """Cut the part of `duration` (s) from the sample nearest to `start` (s, on the window's own clock)."""
         rate = self.sample_rate
         part = _samples(self.where, self.start, rate, self.position.size, start, duration)
         channels: dict[str, Any] = {name: value[part] for name, value in self.channels.items()}
         return Window(**channels, sample_rate=rate, start=self.start + part.start / rate, source=self.source)
 
     def replace(self, **channels: ArrayLike) -> Window:
-        """A copy with other samples in some channels, validated again."""
+        """Copy the window with other samples in some channels; they are validated again."""
         return replace(self, **channels)  # type: ignore[arg-type]
 
     @property
@@ -169,7 +169,7 @@ class Window:
 
 
 def _samples(where: str, begin: float, rate: float, size: int, start: float, duration: float) -> slice:
-    """Select of `size` samples at `rate` (Hz), the first at `begin` (s), those in `duration` (s) from `start` (s)."""
+    """Slice the samples from `start` (s) for `duration` (s) out of `size` at `rate` (Hz), the first at `begin` (s)."""
     first = round((_number(where, "start", "s", start) - begin) * rate)
     last = first + round(_number(where, "duration", "s", duration) * rate)
     if not 0 <= first < last <= size:
@@ -198,7 +198,7 @@ def _channel(where: str, name: str, values: ArrayLike) -> Array:
 
 
 def _common_size(where: str, channels: Mapping[str, Array | None]) -> int:
-    """Number of samples of every channel that was measured; position, the first, always is."""
+    """Check that all measured channels have as many samples as the position; return that number."""
     sizes = {name: samples.size for name, samples in channels.items() if samples is not None}
     size = sizes["position"]
     for name, other in sizes.items():
@@ -232,9 +232,11 @@ def _number(where: str, name: str, unit: str, value: Any) -> float:
 
 
 def _uniform(where: str, size: int, time: ArrayLike, start: float) -> tuple[float, float]:
-    """Rate and start of uniformly spaced times."""
+    """(sample rate, Hz; start, s) of uniformly spaced times."""
     if start != 0.0:
-        raise InvalidInput(f"{where}start = {start!r} s: must be left out when time is given, which says it already")
+        raise InvalidInput(
+            f"{where}start = {start!r} s: must be left out where time is given, because time[0] is the start"
+        )
     times = np.array(time, dtype=np.float64)
     if times.shape != (size,):
         raise InvalidInput(f"{where}time has shape {times.shape} and position ({size},): must be equal")

@@ -16,11 +16,11 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
 _ROWS = 20_000  # of a CSV file written at a time
-_METADATA = "metadata"  # name of the last column of a CSV file, whose first row holds them
+_METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
 
 
 class LogColumns(NamedTuple):
-    """Columns that were asked for, as the file holds them; names of all columns; metadata."""
+    """Requested columns as the file holds them; names of all columns; metadata."""
 
     values: Mapping[str, Any]
     names: Sequence[str]
@@ -36,12 +36,12 @@ class SignalTable:
 
 
 class LogFormat(NamedTuple):
-    """One format: how to read the wanted columns of a file, how to write a table, and the library it needs.
+    """One format: its reader, its writer, and the library that it needs.
 
     Attributes
     ----------
     read : callable
-        (path, wanted column names) -> `LogColumns`.
+        (path, requested column names) -> `LogColumns`.
     write : callable
         (table, path) -> None.
     library, extra : str
@@ -62,11 +62,11 @@ class LogFormat(NamedTuple):
             )
 
 
-def _read_csv(path: Path, wanted: Collection[str]) -> LogColumns:
+def _read_csv(path: Path, requested: Collection[str]) -> LogColumns:
     """Read a line of names, then numbers.
 
-    Metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is; in
-    files of the version before they stand in a first line that begins with #.
+    The metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is.
+    In files of the previous version they are a first line that begins with #.
     """
     try:
         with path.open(encoding="utf-8-sig") as file:
@@ -75,12 +75,12 @@ def _read_csv(path: Path, wanted: Collection[str]) -> LogColumns:
             if line.startswith("#"):
                 metadata, line, skipped = _parsed(line.removeprefix("#")), file.readline(), 2
             names = [name.strip() for name in line.split(",")]
-            places = [names.index(name) for name in wanted if name in names]
+            places = [names.index(name) for name in requested if name in names]
             if not places:
-                found = ", ".join(filter(None, names)) or "empty"
-                first = next(iter(wanted))
+                header = ", ".join(filter(None, names)) or "empty"
+                first = next(iter(requested))
                 raise InvalidInput(
-                    f"log {path}: line {skipped} must name the columns ({first}, ...); it is: {found:.80}"
+                    f"log {path}: line {skipped} must name the columns ({first}, ...); it is: {header:.80}"
                 )
             text = file.readlines()
         if not metadata and text and names[-1] == _METADATA:
@@ -113,11 +113,11 @@ def _write_csv(table: SignalTable, path: Path) -> None:
             np.savetxt(file, values[first : first + _ROWS], fmt="%.12g", delimiter=",", newline=end)
 
 
-def _read_npz(path: Path, wanted: Collection[str]) -> LogColumns:
+def _read_npz(path: Path, requested: Collection[str]) -> LogColumns:
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             metadata = _parsed(str(file["metadata"])) if "metadata" in file.files else {}
-            return LogColumns({name: file[name] for name in file.files if name in wanted}, file.files, metadata)
+            return LogColumns({name: file[name] for name in file.files if name in requested}, file.files, metadata)
     except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, KeyError) as error:
         raise InvalidInput(f"log {path}: is not an .npz file of numbers ({str(error).splitlines()[0]})") from None
 
@@ -128,13 +128,13 @@ def _write_npz(table: SignalTable, path: Path) -> None:
         np.savez_compressed(file, **arrays)
 
 
-def _read_parquet(path: Path, wanted: Collection[str]) -> LogColumns:
+def _read_parquet(path: Path, requested: Collection[str]) -> LogColumns:
     import pyarrow
     from pyarrow import parquet
 
     try:
         schema = parquet.read_schema(path)
-        table = parquet.read_table(path, columns=[name for name in wanted if name in schema.names])
+        table = parquet.read_table(path, columns=[name for name in requested if name in schema.names])
         columns = {name: table[name].to_numpy() for name in table.column_names}
     except pyarrow.ArrowException as error:
         raise InvalidInput(f"log {path}: is not a parquet file of numbers ({str(error).splitlines()[0]})") from None
@@ -160,10 +160,10 @@ def _number(text: str) -> Any:
 def _parsed(text: str) -> Mapping[str, Any]:
     """Parse metadata as JSON; a comment of another kind holds none."""
     try:
-        found = json.loads(text)
+        metadata = json.loads(text)
     except json.JSONDecodeError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return metadata if isinstance(metadata, dict) else {}
 
 
 FORMATS: Mapping[str, LogFormat] = {

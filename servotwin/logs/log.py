@@ -17,14 +17,14 @@ from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
 TIME = "time_s"
-# Columns of each channel; the first one that is there counts: the measured position before the true one.
+# Column names of each channel, in order of preference: the measured position before the true one.
 COLUMNS = {
     "position": ("measured_position_m", "position_m"),
     "theta_m": ("theta_m_rad",),
     "voltage": ("voltage_v",),
     "reference": ("reference_m",),
 }
-_WANTED = (TIME, *(name for names in COLUMNS.values() for name in names))
+_COLUMN_NAMES = (TIME, *(name for names in COLUMNS.values() for name in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def read_log(path: Path) -> Log:
         raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
     FORMATS[path.suffix].check_installed(f"log {path}")
     try:
-        columns = FORMATS[path.suffix].read(path, _WANTED)
+        columns = FORMATS[path.suffix].read(path, _COLUMN_NAMES)
     except OSError as error:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
     return Log(_whole(path, columns), columns.metadata)
@@ -89,12 +89,12 @@ def write_log(table: SignalTable, path: Path) -> None:
 
 
 def _whole(path: Path, columns: LogColumns) -> Window:
-    found = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
-    for name, place in (("position_m", found["position"]), (TIME, TIME if TIME in columns.values else None)):
+    chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
+    for name, place in (("position_m", chosen["position"]), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
             hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)
             raise InvalidInput(f"log {path}: column {name!r} is missing{hint}; it has {known or 'none'}")
-    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in found.items() if name is not None}
+    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in chosen.items() if name is not None}
     return Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
 
 

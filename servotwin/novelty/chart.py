@@ -1,10 +1,10 @@
 """Control chart of the gap, window by window: a learnt baseline and a two-sided cumulative sum.
 
 The baseline is the weighted mean of all windows since it began; a window is compared with those before it, and then
-learnt. Such recursive residuals are independent with one variance, however few windows the baseline stands on, so the
-limits mean the same from the second window on (Hawkins 1987). What the model has wrong shifts every window alike and
-is in the baseline. How far windows scatter, against what each says of its own spread, is learnt as a factor: from the
-median of second differences, which neither steady wear nor a single step moves.
+added. Such recursive residuals are independent with one variance, however few windows the baseline stands on, so the
+limits mean the same from the second window on (Hawkins 1987). An error of the model shifts every window alike and is
+part of the baseline. The ratio of the windows' scatter to their stated spreads is learnt as a factor, from the median
+of second differences, which neither steady wear nor a single step moves.
 """
 
 from math import copysign, log1p, sqrt
@@ -16,7 +16,7 @@ from msgspec import Struct, structs
 from servotwin.novelty.settings import NoveltyRules
 
 _QUARTILE = 0.6744897501960817  # of a standard normal: the median of its size
-_PRIOR, _MOST = 5, 120  # second differences that the stated spread counts as; that are kept
+_PRIOR, _MOST = 5, 120  # second differences that the stated spread counts as; most that are stored
 _TRUSTED, _EACH = 10.0, 0.2  # degrees of freedom of the stated spread, and of one second difference in a median
 
 
@@ -64,9 +64,9 @@ class Chart(Struct, frozen=True):
 
 
 class ChartResult(NamedTuple):
-    """The chart with a window learnt, the window's standardised change, and whether it is news by either limit.
+    """The chart with a window added, the window's standardised change, and whether it is news by either limit.
 
-    Where it is, the baseline has begun anew with it.
+    A window that is news begins a new baseline.
     """
 
     chart: Chart
@@ -76,7 +76,7 @@ class ChartResult(NamedTuple):
 
 
 def add_window(chart: Chart, gap: float, std: float, rules: NoveltyRules) -> ChartResult:
-    """Compare a window (gap and standard deviation, rad) with the baseline, then learn it."""
+    """Compare a window (gap and standard deviation, rad) with the baseline, then add it."""
     own = std * std + rules.resolution * rules.resolution
     variance = max(own * chart.factor * chart.factor, rules.resolution * rules.resolution)
     change = up = down = 0.0
@@ -114,17 +114,17 @@ def _learnt(chart: Chart, gap: float, variance: float) -> Chart:
 
 
 def restarted(chart: Chart, gap: float = 0.0, weight: float = 0.0) -> Chart:
-    """Another baseline; what was learnt of the spread stays, sums begin anew."""
+    """Begin another baseline; the learnt factor of the spread stays, the sums begin anew."""
     return structs.replace(chart, gap=gap, weight=weight, anchor=gap, up=0.0, down=0.0)
 
 
 def with_fewer_windows(chart: Chart, windows: int) -> Chart:
-    """The same baseline, to count as no more than so many windows like the last: the next ones decide about it."""
+    """Reduce the baseline's weight to at most so many windows like the last, so that the next ones can move it."""
     most = windows / chart.last[-1].variance if chart.last else chart.weight
     return restarted(chart, chart.gap, min(chart.weight, most))
 
 
 def normal(student: float, freedom: float) -> float:
-    """The standard normal number that is as unlikely as a Student's t (Wallace 1959)."""
+    """Convert a Student's t to the standard normal number that is as unlikely (Wallace 1959)."""
     ratio = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)
     return copysign(ratio * sqrt(freedom * log1p(student * student / freedom)), student)

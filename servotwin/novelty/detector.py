@@ -1,8 +1,8 @@
 """Novelty detector: state and cut window in, state and verdict out.
 
-It measures the change of the gap since the last window that the twin got as news, which begins a new baseline. After an
-accepted update the baseline counts as a few windows only, and where the update stands on a window that did not show the
-gap here, the baseline moves with the update's gap. A window that does not show the gap changes no baseline.
+It measures the change of the gap since the last window that was sent as news; that window begins a new baseline. After
+an accepted update the baseline counts as a few windows only, and where the update stands on a window that did not show
+the gap here, the baseline moves with the update's gap. A window that does not show the gap changes no baseline.
 """
 
 from math import hypot, inf, sqrt
@@ -30,8 +30,8 @@ _STORED = {
     "reported_lost_motion": "bound",
 }
 _RECENT = 8  # windows that an update may stand on
-_WIDEST = 1.0  # rad: a larger spread is no estimate
-_STILL = 0.2  # of the margin: what moves less rests
+_WIDEST = 1.0  # rad: a gap with a larger spread does not count as an estimate
+_STILL = 0.2  # of the margin: a signal that moves less is at rest
 
 
 class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
@@ -80,12 +80,12 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
 
 
 class NoveltyVerdict(NamedTuple):
-    """Reason to send a window, and what the detector read off it.
+    """Reason to send a window, and the detector's measurements.
 
     Attributes
     ----------
     reason : str
-        Empty: it is not to be sent.
+        Empty: the window is not sent.
     score : Score or None
         None: the window does not show the gap.
     change : float
@@ -101,12 +101,12 @@ class NoveltyVerdict(NamedTuple):
 
 
 def start(settings: NoveltySettings) -> NoveltyState:
-    """Return the state of an edge that has seen no window."""
+    """Return the state before the first window."""
     return NoveltyState(settings.gap, settings.rules.learn)
 
 
 def booted(state: NoveltyState, rules: NoveltyRules) -> NoveltyState:
-    """Return the state after a restart: the baseline stays; what counts samples or turns of the encoder begins anew."""
+    """Return the state after a restart: the baseline stays; sample times and the encoder's offset begin anew."""
     return NoveltyState(state.gap, rules.learn, state.chart, state.version, state.update_gap)
 
 
@@ -117,48 +117,48 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
     ----------
     state : NoveltyState
     cut : Cut
-        Its `reason` is why it was cut.
+        Its `reason` is the reason for the cut.
     settings : NoveltySettings
     """
     rules, model = settings.rules, settings.model
     leads = leads_at_rest(cut.signals["theta_m"], cut.signals["position"], model.rate, model.static_gain, _still(rules))
     state = _rested(_updated(state, cut, rules), leads)
-    found = _read(state, cut, settings)
-    if found is None:
+    estimate = _read(state, cut, settings)
+    if estimate is None:
         return _without_score(state, cut, settings)
-    seen = add_window(state.chart, found.gap, found.std, rules)
-    far = abs(found.gap - state.chart.anchor) > rules.outlier
-    news = SCORE if seen.sudden else CUSUM if seen.slow else LOST_MOTION if _lost(state, rules) else ""
-    state = structs.replace(_after_score(state, cut, found, rules), chart=seen.chart)
+    charted = add_window(state.chart, estimate.gap, estimate.std, rules)
+    far = abs(estimate.gap - state.chart.anchor) > rules.outlier
+    news = SCORE if charted.sudden else CUSUM if charted.slow else LOST_MOTION if _lost(state, rules) else ""
+    state = structs.replace(_after_score(state, cut, estimate, rules), chart=charted.chart)
     reason = _reason(state, cut, settings, news)
     if news:
         state = structs.replace(state, unconditional=rules.confirm if far else 0)
     elif state.unconditional and reason:
         state = structs.replace(state, unconditional=state.unconditional - 1)
-    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, found, seen.change, _range(state))
+    return _sent(state, cut, settings, reason), NoveltyVerdict(reason, estimate, charted.change, _range(state))
 
 
-def _after_score(state: NoveltyState, cut: Cut, found: Score, rules: NoveltyRules) -> NoveltyState:
+def _after_score(state: NoveltyState, cut: Cut, estimate: Score, rules: NoveltyRules) -> NoveltyState:
     """Update all but the chart with a window's score."""
     return structs.replace(
         state,
-        gap=max(0.0, found.gap),
+        gap=max(0.0, estimate.gap),
         uninformative=0,
         recent=(*state.recent, cut.sequence)[-_RECENT:],
-        offset=_carried(state.offset, found.offset, rules),
-        noise=found.noise,
+        offset=_carried(state.offset, estimate.offset, rules),
+        noise=estimate.noise,
     )
 
 
 def _read(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Score | None:
     """Score a window by itself, or else with the encoder's offset from earlier ones; None: it does not show the gap."""
-    signals, least = (cut.signals["theta_m"], cut.signals["position"]), settings.rules.travel
-    alone = score(*signals, settings.model, state.gap, usual=state.noise)
+    theta_m, position, least = cut.signals["theta_m"], cut.signals["position"], settings.rules.travel
+    alone = score(theta_m, position, settings.model, state.gap, usual=state.noise)
     if alone is not None and min(alone.travel) >= least and alone.std < _WIDEST:
         return alone
     if state.offset is None:
         return None
-    carried = score(*signals, settings.model, state.gap, EncoderOffset(*state.offset), state.noise)
+    carried = score(theta_m, position, settings.model, state.gap, EncoderOffset(*state.offset), state.noise)
     return carried if carried is not None and max(carried.travel) >= least and carried.std < _WIDEST else None
 
 

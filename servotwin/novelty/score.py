@@ -3,7 +3,7 @@
 The motor's angle goes through the play operator at a gap, the screw's angle through the structure. What the position
 has beyond that is regressed on its sensitivity to the gap, db = phi'r / phi'phi. Beside that sensitivity stand columns
 for where the screw began, the encoder's offset, the structure's motion from before the window and a delay between the
-channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than a little, the
+channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than 2 mrad, the
 regression is repeated at the new one.
 
 A window in which the screw is pushed one way only shows the gap if the encoder's offset is known from other windows of
@@ -30,18 +30,18 @@ from servotwin.novelty.settings import NoveltyModel, ResponseMode
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-# Samples that are judged per period of the structure's fastest mode: the load moves no faster, and what the sensor adds
-# above is left out. With 36 the spread is the same and an autoregression of it needs four times the order.
-PER_PERIOD = 9.0
+# Judged samples per period of the structure's fastest mode: the load moves no faster, and noise above is left out. With
+# 36 the spread is the same and an autoregression of it needs four times the order.
+_PER_PERIOD = 9.0
 _LINEARISATIONS = 8  # at most
 _WHITENED_FITS = 2  # fits in the noise that the one before has left
 _CLOSE = 2e-3  # rad: nearer than that one more linearisation changes nothing that matters
-_STARTS = 0.0, 0.9, -0.9  # places in the gap that are tried until one leads somewhere
-_USUAL = 1.5  # times the usual residual is no reason to look elsewhere
+_STARTS = 0.0, 0.9, -0.9  # places in the gap, tried in turn until a fit converges with a usual residual
+_USUAL = 1.5  # times the usual residual: up to this, no other start is tried
 _ORDER = 8  # of the autoregression, at most
 _ROUNDING = 1e-13  # of the largest motion
 _PER_COLUMN = 3  # judged samples, at least
-_LARGEST = 1e100  # rad or m: no sensor's; the squares of larger numbers overflow
+_LARGEST = 1e100  # rad or m: no sensor gives more, and the squares of larger numbers overflow
 _BLOCK_S, _PARTS = 0.1, 5  # s of rest that make one lead; parts of it whose means must agree
 
 
@@ -90,7 +90,7 @@ def model_of(servo: Servo, sample_rate: float) -> NoveltyModel:
         ResponseMode(complex(*decay), complex(*gain))
         for decay, gain in zip(known.decay.tolist(), known.position.gain.tolist(), strict=True)
     )
-    factor = max(1, round(sample_rate / (PER_PERIOD * fastest)))
+    factor = max(1, round(sample_rate / (_PER_PERIOD * fastest)))
     return NoveltyModel(sample_rate, modes, known.position.direct, known.static_gain, known.unseen, factor)
 
 
@@ -130,7 +130,7 @@ def score(
     offset : EncoderOffset, optional
         Known from other windows; None: the window stands alone.
     usual : float
-        m: residual (rms) that fits usually leave. Where one leaves more, the screw may have begun elsewhere.
+        m, usual residual (rms) of a fit. Where it is larger, the screw may have begun elsewhere.
     """
     angle, load = np.asarray(theta_m, dtype=np.float64), np.asarray(position, dtype=np.float64)
     fewest = _PER_COLUMN * (2 * len(model.modes) + 4)
@@ -140,9 +140,9 @@ def score(
         return None
     window, best = _Window.prepared(angle, load, model, offset), None
     for start in _STARTS:
-        found = window.converged(_Place(max(gap, 0.0), start))
-        if found is not None and (best is None or found.noise < best.noise):
-            best = found
+        candidate = window.converged(_Place(max(gap, 0.0), start))
+        if candidate is not None and (best is None or candidate.noise < best.noise):
+            best = candidate
         if best is not None and best.noise <= _USUAL * usual:
             break
     return best
@@ -166,9 +166,9 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Window made ready: angle and decimated position from their first samples on.
+    """Prepared window: angle and decimated position, counted from their first samples.
 
-    `level` is what is known of the position's constant less the screw's first angle, m; `floor` the rounding, m.
+    `level` is the known constant of the position less the screw's first angle, m; `floor` the rounding, m.
     """
 
     theta_m: Array
@@ -197,7 +197,7 @@ class _Window:
         )
 
     def converged(self, place: _Place) -> Score | None:
-        """Linearise until nothing moves any more, and fit in the noise that the last fit has left."""
+        """Linearise until gap and place converge, and fit in the noise of the last fit's residual."""
         noise, fits = None, 0
         for _ in range(_LINEARISATIONS):
             columns = self.columns(place)
@@ -205,23 +205,23 @@ class _Window:
                 return None
             moved = place
             while place.near(moved) and fits <= _WHITENED_FITS:
-                found = columns.fitted(noise)
-                noise = burg(found.left[None], min(_ORDER, found.left.size // 8)).at_least(self.floor)
-                moved, fits = found.moved(place), fits + 1
+                fit = columns.fitted(noise)
+                noise = burg(fit.left[None], min(_ORDER, fit.left.size // 8)).at_least(self.floor)
+                moved, fits = fit.moved(place), fits + 1
             if place.near(moved):
-                return columns.score(found)
+                return columns.score(fit)
             place, fits = moved, min(fits, _WHITENED_FITS)
         return None
 
     def columns(self, place: _Place) -> _Columns | None:
         """Linearise at a place; None where the screw was not pushed, or one way only and the offset is not known."""
-        seen = contacts(self.theta_m, Gap(place.gap, place.screw))
-        pushes = int(np.count_nonzero(np.diff(seen[BY_GAP], prepend=0.0)))
+        followed = contacts(self.theta_m, Gap(place.gap, place.screw))
+        pushes = int(np.count_nonzero(np.diff(followed[BY_GAP], prepend=0.0)))
         if pushes < (2 if self.level is None else 1):
             return None
-        screw = seen[SCREW]
-        # From zero at the first sample on; a constant and the free motions account for the rest.
-        signals = np.vstack([screw - screw[0], seen[BY_START] - 1.0, seen[BY_GAP]])
+        screw = followed[SCREW]
+        # All signals start from zero; the constant and the free motions account for what happened before.
+        signals = np.vstack([screw - screw[0], followed[BY_START] - 1.0, followed[BY_GAP]])
         load, by_start, by_gap = self.reduce.rows(self.response.respond(signals))
         late = np.gradient(load)
         by_place, by_gap = 0.5 * place.gap * by_start, by_gap + 0.5 * place.place * by_start
@@ -232,10 +232,10 @@ class _Window:
 
 
 class _Fit(NamedTuple):
-    """Least squares, whether the place was held, the residual (m,) m, and its standard deviation when white."""
+    """Least squares, whether the place was fixed, the residual (m,) m, and its standard deviation when white."""
 
     solved: LeastSquares
-    held: bool
+    fixed_place: bool
     left: Array
     spread: float
 
@@ -245,8 +245,8 @@ class _Fit(NamedTuple):
         return float(self.solved.coefficients[-1])
 
     def moved(self, place: _Place) -> _Place:
-        """Place that the fit leads to."""
-        change = 0.0 if self.held else float(self.solved.coefficients[-2])
+        """Place after the fit's step."""
+        change = 0.0 if self.fixed_place else float(self.solved.coefficients[-2])
         return _Place(max(0.0, place.gap + self.gap), min(max(place.place + change, -1.0), 1.0))
 
 
@@ -260,21 +260,21 @@ class _Columns(NamedTuple):
     travel: tuple[float, float]
 
     def fitted(self, noise: Autoregression | None) -> _Fit:
-        """Fit in white noise, or in that of an autoregression; a place that would leave the gap is held at its end."""
+        """Fit in white noise, or in that of an autoregression; a place that would leave the gap stays at its end."""
         table = np.vstack([self.residual, self.rows])
         white = self.with_level(table if noise is None else noise.whiten(table), plain=noise is None)
-        found = self._solved(white, held=False)
-        beyond = abs(self.place.place) == 1.0 and found.solved.coefficients[-2] * self.place.place > 0.0
-        return self._solved(np.delete(white, -2, axis=0), held=True) if beyond else found
+        fit = self._solved(white, fixed=False)
+        beyond = abs(self.place.place) == 1.0 and fit.solved.coefficients[-2] * self.place.place > 0.0
+        return self._solved(np.delete(white, -2, axis=0), fixed=True) if beyond else fit
 
-    def _solved(self, white: Array, held: bool) -> _Fit:
+    def _solved(self, white: Array, fixed: bool) -> _Fit:
         solved = independent_least_squares(white[1:], white[0])
         rest = white[0] - solved.coefficients @ white[1:]
-        left = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if held else self.rows)
-        return _Fit(solved, held, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
+        left = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if fixed else self.rows)
+        return _Fit(solved, fixed, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
 
     def with_level(self, white: Array, plain: bool) -> Array:
-        """Append what is known of the offset to the whitened table as one more sample."""
+        """Append the known offset to the whitened table as one more sample."""
         level = self.window.level
         if level is None:
             return white
@@ -289,22 +289,22 @@ class _Columns(NamedTuple):
         gain = self.window.model.static_gain
         return -0.5 * gain * self.place.gap, -0.5 * gain * self.place.place
 
-    def score(self, found: _Fit) -> Score | None:
-        """Turn the last fit into an estimate; None: it shows nothing."""
-        solved, gain = found.solved, self.window.model.static_gain
+    def score(self, fit: _Fit) -> Score | None:
+        """Turn the last fit into an estimate; None: it does not show the gap."""
+        solved, gain = fit.solved, self.window.model.static_gain
         of_gap, of_level = np.zeros(solved.coefficients.size), np.zeros(solved.coefficients.size)
         of_gap[-1] = of_level[0] = 1.0
         by_place, of_level[-1] = self.by_level
-        if not found.held:
+        if not fit.fixed_place:
             of_level[-2] = by_place
-        std = found.spread * solved.deviation(of_gap)
-        if not isfinite(std + found.gap):
+        std = fit.spread * solved.deviation(of_gap)
+        if not isfinite(std + fit.gap):
             return None
         level = float(of_level @ solved.coefficients) - gain * self.place.screw
-        offset_std = found.spread * solved.deviation(of_level) / abs(gain)
+        offset_std = fit.spread * solved.deviation(of_level) / abs(gain)
         offset = EncoderOffset((level + self.window.origin) / gain, offset_std)
-        noise = sqrt(float(found.left @ found.left) / found.left.size)
-        return Score(self.place.gap + found.gap, std, offset, self.travel, noise)
+        noise = sqrt(float(fit.left @ fit.left) / fit.left.size)
+        return Score(self.place.gap + fit.gap, std, offset, self.travel, noise)
 
 
 def leads_at_rest(
@@ -324,16 +324,16 @@ def leads_at_rest(
     static_gain : float
         m/rad.
     still : float
-        rad: what moves by less rests. Of the load the means of fiftieths of a second count.
+        rad: a signal that moves by less is at rest. Of the load, the means of fiftieths of a second count.
     """
     angles, loads = np.asarray(theta_m, dtype=np.float64), np.asarray(position, dtype=np.float64)
     size = max(_PARTS, round(_BLOCK_S * rate))
-    part, found = size // _PARTS, []
+    part, leads = size // _PARTS, []
     for first in range(0, angles.size - size + 1, size):
         angle = angles[first : first + size]
         if float(np.ptp(angle)) >= still:
             continue
         means = loads[first : first + part * _PARTS].reshape(_PARTS, part).mean(axis=1) / static_gain
         if float(np.ptp(means)) < still:
-            found.append(float(angle.mean() - means.mean()))
-    return found
+            leads.append(float(angle.mean() - means.mean()))
+    return leads

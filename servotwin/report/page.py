@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from string import Template
 
-SIGNS = {"reproduced": ("✓", "yes"), "not as stated": ("✗", "no"), "cannot be checked": ("–", "open")}
+_SIGNS = {"reproduced": ("✓", "yes"), "not as stated": ("✗", "no"), "cannot be checked": ("–", "open")}
 
 
 def page(title: str, body: Iterable[str]) -> str:
@@ -39,7 +39,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, stack: bool = F
 
 def badge(verdict: str) -> str:
     """Make a badge of a verdict: sign, word and colour."""
-    sign, kind = SIGNS[verdict]
+    sign, kind = _SIGNS[verdict]
     return f'<span class="badge {kind}">{sign} {escape(verdict)}</span>'
 
 

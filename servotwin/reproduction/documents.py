@@ -46,7 +46,7 @@ from servotwin.reproduction import measures, policy_runs
 from servotwin.reproduction.claims import Claim, ClaimResult, Finding, Value
 from servotwin.reproduction.policy_runs import PolicyOutcome, PolicyStep, PolicyTotal
 
-CLAIMS_SCHEMA, BEYOND_SCHEMA = "servotwin-claims/1", "servotwin-beyond/1"
+CLAIMS_SCHEMA, _BEYOND_SCHEMA = "servotwin-claims/1", "servotwin-beyond/1"
 PAPER = (
     "Y. Vered and S. J. Elliott, The use of digital twins to remotely update feedback controllers for the motion"
     " control of nonlinear dynamic systems, Mechanical Systems and Signal Processing, 2023"
@@ -82,7 +82,7 @@ def beyond_json(outcomes: Mapping[str, Sequence[PolicyOutcome]], preset: str) ->
     """Encode beyond.json from each figure's outcomes."""
     return _dumps(
         {
-            "schema": BEYOND_SCHEMA,
+            "schema": _BEYOND_SCHEMA,
             "version": st.__version__,
             "preset": preset,
             "definitions": policy_runs.DEFINITIONS,

@@ -20,7 +20,7 @@ from servotwin.twin.settings import TwinSettings
 POLICIES = ("paper", "margin", "hysteresis", "certified")
 ALONE = "fallback set alone"  # the certified loop's first setting, never updated
 CONTESTANTS = (*POLICIES, ALONE)
-TURN = 2.0 * math.pi
+_TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class PolicyJob:
 
     All policies share the machine, its noise, the link and the estimator (ours, with its defaults). Windows are those
     of the scenario; under "certified" they are those of that policy's own scenario, because its loop is calmer.
-    `ALONE` is "certified" with its twin switched off; the difference between the two is the worth of the updates.
+    `ALONE` is "certified" with its twin switched off; the difference between the two shows the benefit of the updates.
     """
 
     preset: str
@@ -151,12 +151,12 @@ def measured_steps(run: TwinRun) -> tuple[PolicyStep, ...]:
     error = trace.reference - trace.position
     return tuple(
         PolicyStep(
-            step.begin,
-            step.gap_end,
-            step.settled,
-            float(np.abs(error[tail(trace.time, step.end)]).max()),
-            overshoot(trace, step.begin, step.end),
-            step.settling_time,
+            begin=step.begin,
+            gap=step.gap_end,
+            settled=step.settled,
+            error=float(np.abs(error[tail(trace.time, step.end)]).max()),
+            overshoot=overshoot(trace, step.begin, step.end),
+            settling=step.settling_time,
         )
         for step in trace.steps
     )
@@ -178,7 +178,7 @@ def measured_total(run: TwinRun) -> PolicyTotal:
     return PolicyTotal(
         voltage=_rms(trace.voltage),
         voltage_at_rest=_rms(np.concatenate(rests)) if rests else math.nan,
-        travel=float(np.abs(np.diff(trace.theta_m)).sum()) / TURN,
+        travel=float(np.abs(np.diff(trace.theta_m)).sum()) / _TURN,
         estimates=sum(one.ok for one in run.estimates),
         windows=len(run.estimates),
         updates=origins.count(SettingOrigin.UPDATE),

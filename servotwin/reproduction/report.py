@@ -33,7 +33,7 @@ HEADS = (
     "Updates",
     "Fallbacks",
 )
-EMPTY = "–"
+_EMPTY = "–"
 MM = 1e3
 
 
@@ -160,7 +160,7 @@ def _format(value: Value | None) -> str:
 
 def _figures(drawn: Sequence[DrawnFigure], preset: str) -> Iterator[str]:
     yield '<h2 id="figures">Figures</h2>'
-    yield f"<p>DrawnFigure with the preset <code>{escape(preset)}</code>.</p>"
+    yield f"<p>The figures are drawn with the preset <code>{escape(preset)}</code>.</p>"
     yield from map(_figure, drawn)
 
 
@@ -191,13 +191,13 @@ def policy_tables(outcomes: Sequence[PolicyOutcome]) -> Iterator[str]:
 def _total_cells(one: PolicyOutcome) -> tuple[str, ...]:
     """Word a policy's whole run, in the order of `HEADS`."""
     if one.total is None:
-        return (one.policy, *(EMPTY for _ in HEADS[1:]))
+        return (one.policy, *(_EMPTY for _ in HEADS[1:]))
     total, errors = one.total, [step.error for step in one.steps]
     return (
         one.policy,
         f"{sum(step.settled for step in one.steps)} of {len(one.steps)}",
         f"{worst(one.steps, 'error') * MM:.4f}",
-        f"{MM * math.fsum(errors) / len(errors):.4f}" if errors else EMPTY,
+        f"{MM * math.fsum(errors) / len(errors):.4f}" if errors else _EMPTY,
         f"{worst([step for step in one.steps if step.settled], 'settling'):.1f}",
         f"{100.0 * worst(one.steps, 'overshoot'):.1f}",
         f"{total.voltage:.4f}",

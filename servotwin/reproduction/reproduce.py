@@ -48,7 +48,7 @@ class ReproductionTask(Protocol[_R]):
 
 
 @lru_cache(maxsize=1)
-def runs_of(preset: str) -> Runs:
+def _runs_of(preset: str) -> Runs:
     """Return this process's runs of a preset; successive tasks of one preset share them."""
     return Runs(preset)
 
@@ -62,7 +62,7 @@ class ClaimsTask:
 
     def run(self) -> tuple[ClaimResult, ...]:
         """Measure the claims."""
-        return tuple(claims.measure(claim, runs_of(self.preset)) for claim in self.claims)
+        return tuple(claims.measure(claim, _runs_of(self.preset)) for claim in self.claims)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class FigureTask:
 
     def run(self) -> DrawnFigure:
         """Draw; the vector image is also in NAME.svg, beside NAME.png."""
-        runs, spec = runs_of(self.preset), figure_spec(self.name)
+        runs, spec = _runs_of(self.preset), figure_spec(self.name)
         path = style.save(spec.draw(runs), self.directory, self.name)
         outcomes = tuple(replace(one, run=None) for one in spec.measure(runs))
         return DrawnFigure(self.name, spec.title, spec.caption, path.read_bytes(), outcomes)
@@ -136,7 +136,7 @@ def reproduce(
 
 
 def select(only: Sequence[str]) -> Selection:
-    """Figures and claims by name; several names may stand in one text, with commas."""
+    """Select figures and claims by name; a text may hold several names, separated by commas."""
     names = {one.name: one for one in figures.FIGURES}
     listed = {claim.id: claim for claim in claims.claims()}
     requested = [name.strip() for text in only for name in text.split(",") if name.strip()]
@@ -155,7 +155,7 @@ def select(only: Sequence[str]) -> Selection:
 
 
 def planned(selection: Selection, preset: str, directory: Path) -> list[ReproductionTask[TaskResult]]:
-    """Independent tasks, preset by preset and that of the figures last, so that neighbours can share runs."""
+    """Plan independent tasks preset by preset, the figures' preset last, so that neighbours can share runs."""
     groups = [tuple(group) for _, group in groupby(sorted(selection.claims, key=claims.group), key=claims.group)]
     presets = sorted(PRESETS, key=lambda each: each == preset)
     measuring = [ClaimsTask(each, group) for each in presets for group in reversed(groups)]
@@ -170,9 +170,10 @@ def _workers(tasks: Sequence[ReproductionTask[TaskResult]]) -> int:
 
 def _with_progress(tasks: Sequence[ReproductionTask[TaskResult]], workers: int, console: Console) -> list[TaskResult]:
     """Perform all tasks under a progress bar."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     results = []
-    with Progress(*columns, console=console) as progress:
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console
+    ) as progress:
         bar = progress.add_task("reproducing", total=len(tasks))
         for result in _perform(tasks, workers):
             results.append(result)
@@ -181,10 +182,10 @@ def _with_progress(tasks: Sequence[ReproductionTask[TaskResult]], workers: int, 
 
 
 def _sorted(outcomes: Iterable[TaskResult], selection: Selection) -> tuple[list[DrawnFigure], list[ClaimResult]]:
-    """Figures and results in the paper's order, figures of ours last."""
+    """Sort figures and results into the paper's order; figures beyond the paper come last."""
     outcomes = list(outcomes)
     by_name = {one.name: one for one in outcomes if isinstance(one, DrawnFigure)}
-    by_key = {(r.claim.id, r.preset): r for found in outcomes if isinstance(found, tuple) for r in found}
+    by_key = {(r.claim.id, r.preset): r for results in outcomes if isinstance(results, tuple) for r in results}
     drawn = [by_name[name] for name in selection.figures]
     return drawn, [by_key[claim.id, preset] for claim in selection.claims for preset in PRESETS]
 

@@ -18,10 +18,10 @@ from servotwin.simulation import Run, simulate
 
 AMPLITUDE = 1e-3  # m, section 3.2
 PERIOD, DURATION = 40.0, 200.0  # s, section 3.2
-STEP_DURATION = 60.0  # s, of the runs with one step
-END_DEG, STRESS_DEG = 20.0, 30.0  # where the gap's S-curve ends (erratum E15)
+_STEP_DURATION = 60.0  # s, of the runs with one step
+_END_DEG, STRESS_DEG = 20.0, 30.0  # where the gap's S-curve ends (erratum E15)
 ESTIMATE_DEG = 10.0  # the fixed estimate of Figs 11 and 12
-RATE, KEPT = 5000.0, 500.0  # Hz: simulated and recorded; kept for plots and measures
+RATE, _TRACE_RATE = 5000.0, 500.0  # Hz: simulated and recorded; stored for plots and measures
 
 _R = TypeVar("_R", covariant=True)
 
@@ -45,7 +45,7 @@ class Square:
 
     @property
     def family(self) -> tuple[Square, ...]:
-        """Nine squares whose amplitudes differ by 0.1 %: no machine could tell them apart beforehand (erratum E17)."""
+        """Nine squares whose amplitudes differ by 0.1 %, less than any machine is known to (erratum E17)."""
         return tuple(self.scaled(1.0 + 1e-3 * k) for k in range(-4, 5))
 
 
@@ -55,7 +55,7 @@ UNIPOLAR = Square("0/1 mm", AMPLITUDE / 2.0, AMPLITUDE / 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The signals of a run at `KEPT` Hz, each (N,), SI units."""
+    """The signals of a run at `_TRACE_RATE` Hz, each (N,), SI units."""
 
     time: Array
     position: Array
@@ -68,8 +68,8 @@ class Trace:
 
     @classmethod
     def of(cls, run: Run) -> Trace:
-        """Every tenth sample of a 5 kHz run."""
-        every = round(run.sample_rate / KEPT)
+        """Decimate a run: every tenth sample at 5 kHz."""
+        every = round(run.sample_rate / _TRACE_RATE)
         names = cls.__dataclass_fields__
         return cls(**{name: np.ascontiguousarray(getattr(run, name)[::every]) for name in names})
 
@@ -94,7 +94,7 @@ class StepJob:
     dead_zone_deg: float | None = None
     amplitude: float = AMPLITUDE
     theta_d0_deg: float = 0.0
-    duration: float = STEP_DURATION
+    duration: float = _STEP_DURATION
 
     def simulate(self) -> Run:
         """Simulate the run."""
@@ -146,7 +146,7 @@ class WearJob:
     preset: str
     square: Square = BIPOLAR
     dead_zone_deg: float | None = ESTIMATE_DEG
-    to_deg: float = END_DEG
+    to_deg: float = _END_DEG
 
     def run(self) -> Trace:
         """Simulate; keep the signals."""
@@ -229,6 +229,6 @@ class Runs:
         """Largest motor angle (rad) in 5 s after a step, with the dead zone made for the gap."""
         return self.get(MotorTravelJob(StepJob(self.preset, gap_deg, gap_deg, amplitude, duration=5.0)))
 
-    def wear(self, square: Square = BIPOLAR, to_deg: float = END_DEG) -> Trace:
+    def wear(self, square: Square = BIPOLAR, to_deg: float = _END_DEG) -> Trace:
         """Signals of Fig 12."""
         return self.get(WearJob(self.preset, square, to_deg=to_deg))

@@ -31,7 +31,7 @@ Progress = Callable[[float], object]
 
 @dataclass(frozen=True, slots=True)
 class EstimateRecord:
-    """One estimate: time of its window's middle (s), total gap, spread and interval (rad), the truth then (rad).
+    """One estimate: time of its window's middle (s), total gap, spread and interval (rad), the true gap then (rad).
 
     `seconds` is the wall time of the estimation. Where the status is not OK, `gap` is the prior or a bound.
     """
@@ -136,7 +136,7 @@ class TwinJob:
         )
 
     def run(self) -> TwinRun:
-        """Co-simulate; keep what figures and claims need."""
+        """Co-simulate; reduce the run to the needs of figures and claims."""
         return run_twin(self.scenario_to_run(), exact=self.exact)
 
 
@@ -228,10 +228,10 @@ def _window_bytes(loop: Loop) -> tuple[int, ...]:
 def _setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
     """List every setting that was in force, in order; an update without gains leaves those in force before it."""
     start = loop.scenario.start
-    found = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
+    changes = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
     for begin, origin, tolerance, gains in sorted(_later_settings(loop), key=lambda change: change[0]):
-        found.append(SettingChange(begin, origin, tolerance, gains or found[-1].gains))
-    return tuple(found)
+        changes.append(SettingChange(begin, origin, tolerance, gains or changes[-1].gains))
+    return tuple(changes)
 
 
 def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, messages.Gains | None]]:
@@ -244,7 +244,7 @@ def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, m
         yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.setting.tolerance, fallback.setting.gains
 
 
-WINDOW_GAPS_DEG, WINDOW_STEPS = (3.0, 10.0, 18.0), 6
+_WINDOW_GAPS_DEG, _WINDOW_STEPS = (3.0, 10.0, 18.0), 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,7 @@ class WindowJob:
     def run(self) -> Mapping[float, float]:
         """Mean error for each gap."""
         servo = st.Servo.preset(self.preset)
-        return {gap: float(np.mean(_window_errors(servo, gap, self.settle))) for gap in WINDOW_GAPS_DEG}
+        return {gap: float(np.mean(_window_errors(servo, gap, self.settle))) for gap in _WINDOW_GAPS_DEG}
 
 
 def _window_errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float]:
@@ -268,13 +268,13 @@ def _window_errors(servo: st.Servo, gap_deg: float, settle: float) -> list[float
     gap = math.radians(gap_deg)
     run = st.simulate(
         servo,
-        WINDOW_STEPS * PERIOD / 2.0,
+        _WINDOW_STEPS * PERIOD / 2.0,
         reference=BIPOLAR.signal,
         gap=gap,
         tolerance=servo.tolerance_for(gap),
         sample_rate=RATE,
     )
-    starts = np.arange(WINDOW_STEPS) * PERIOD / 2.0
+    starts = np.arange(_WINDOW_STEPS) * PERIOD / 2.0
     windows = [st.Window.from_run(run, float(start), 1.0) for start in starts]
     settings = paper.PaperSettings(settle_s=settle)
     estimates = [

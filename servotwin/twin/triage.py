@@ -172,7 +172,7 @@ def _blind(why: str, moved: bool = True) -> Glance:
 
 def _unclear(fit: QuickFit, settings: TriageSettings) -> str:
     """Reason why a glance cannot decide whether the gap moved; empty: none."""
-    if not fit.settled:
+    if not fit.converged:
         return "the plain fit did not converge"
     if not fit.std <= settings.widest:
         return f"at a glance the window shows the gap to {math.degrees(fit.std):.3g} deg only"

@@ -69,7 +69,7 @@ def test_windows_fall_due_at_the_rate_and_no_more_than_the_plan_has() -> None:
     assert edges.take(100.0) is None
 
 
-def test_in_an_outage_windows_are_kept() -> None:
+def test_in_an_outage_windows_wait() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 1.5)))
     edges.add_due(1.0)
     assert edges.take(1.0) is None
@@ -116,7 +116,7 @@ def test_updates_are_applied_once_and_answered() -> None:
 
 
 class Spoken:
-    """A line that answers at once, as told."""
+    """A line that answers at once, from a list of answers."""
 
     def __init__(self, *answers) -> None:
         self.answers, self.asked = list(answers), []
@@ -144,7 +144,7 @@ def test_a_turn_polls_answers_and_sends() -> None:
 
 
 @pytest.mark.parametrize(("status", "kept", "failures"), [(503, 1, 0), (429, 1, 0), (400, 0, 1), (500, 0, 1)])
-def test_what_is_put_off_is_kept_and_what_is_refused_ends_it(status: int, kept: int, failures: int) -> None:
+def test_a_postponed_window_is_sent_again_and_a_refused_one_ends_the_run(status: int, kept: int, failures: int) -> None:
     edges, told = fleet(), []
     turn = EdgeTurn(edges, Spoken((status, b"")), asyncio.Event(), told)
     turn.begin(edges.edges[0], 0.0)
@@ -195,10 +195,10 @@ def test_shares_are_the_median_the_99_percent_and_the_largest() -> None:
     assert shares([]) == (0.0, 0.0, 0.0)
 
 
-# --- what is seen
+# --- measurements
 
 
-def test_processes_are_seen_by_what_they_use() -> None:
+def test_the_usage_of_a_process_is_measured_until_it_ends() -> None:
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         seen = used(process.pid)
         assert seen is not None
@@ -211,7 +211,7 @@ def watched(*samples: ResourceSample) -> ResourceWatch:
     return ResourceWatch(1, 2, lambda: (0, 0.0), list(samples))
 
 
-def test_cores_and_memory_of_a_role() -> None:
+def test_a_role_has_its_cores_and_memory_from_the_samples() -> None:
     def at(time: float, cpu: float, memory: int) -> ResourceSample:
         return ResourceSample(time, {EDGES: ProcessUsage(cpu, memory)}, 0, 0.0)
 
@@ -221,7 +221,7 @@ def test_cores_and_memory_of_a_role() -> None:
     assert watch.cores(TWIN) == 0.0
 
 
-def test_the_store_tells_how_long_windows_waited(tmp_path: Path) -> None:
+def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
     store = open_store(f"sqlite:///{tmp_path / 'x.db'}")
     try:
         items = [
@@ -244,7 +244,7 @@ def test_the_store_tells_how_long_windows_waited(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_small_fleet_with_real_processes(tmp_path: Path, monkeypatch) -> None:
+def test_a_small_fleet_runs_with_real_processes(tmp_path: Path, monkeypatch) -> None:
     kept: list[FleetRun] = []
     monkeypatch.setattr(
         "benchmarks.fleet.command.show", lambda _scale, alone, whole, _console: kept.extend((alone, whole))
@@ -267,7 +267,7 @@ def test_a_small_fleet_with_real_processes(tmp_path: Path, monkeypatch) -> None:
     assert len(found["lines"]) == len(list(lines(QUICK, alone, whole)))
 
 
-def test_full_belongs_to_the_fleet() -> None:
+def test_the_option_full_belongs_to_the_fleet_bench() -> None:
     for names in (["tick"], ["W1"], [], ["fleet", "--quick"]):
         shown = CliRunner().invoke(app, ["bench", *names, "--full"])
         assert shown.exit_code == 2

@@ -23,7 +23,7 @@ def test_a_run_counts_every_instant_as_a_sample_or_as_missed() -> None:
     console = Console(record=True, width=140)
     console.print(tick.shown([run]))
     assert "normal" in console.export_text()
-    assert "PREEMPT_RT" in " ".join(tick.said([run]))
+    assert "PREEMPT_RT" in " ".join(tick.summary_lines([run]))
 
 
 def test_the_loop_imports_no_numbers_library() -> None:

@@ -55,7 +55,7 @@ def test_a_corner_counts_as_a_minimum():
     assert minimise(ridge, np.array([1.0, 1.0]), 1e-8, 1e-9).converged
 
 
-def test_says_when_it_did_not_converge():
+def test_the_minimiser_reports_that_it_did_not_converge():
     found = minimise(lambda p: (float(rosen(p)), rosen_der(p)), np.array([-1.2, 1.0]), 1e-8, 1e-12, iterations=3)
     assert not found.converged
     assert found.message == "no convergence in 3 iterations"

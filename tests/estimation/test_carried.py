@@ -113,7 +113,7 @@ def test_spreads_and_the_trend_hold_what_they_say():
     assert np.all(np.mean(np.abs(scores) < 1.96, axis=0) >= 0.85)
 
 
-def test_a_window_with_two_contacts_is_never_told_of_the_offset():
+def test_a_window_with_two_contacts_never_uses_the_carried_offset():
     window = noisy(stretch(5.0, 2.0), 1)
     alone = estimate_gap(window, SERVO)
     told = estimate_carrying(window, SERVO, None, SETTINGS, (3.0, 1e-6))
@@ -121,7 +121,7 @@ def test_a_window_with_two_contacts_is_never_told_of_the_offset():
     assert told.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
 
 
-def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
+def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
     """However sure it is: an offset that is right does not change what is left over."""
     window, true = noisy(stretch(5.0, 1.2), 1), whitened.estimate
 
@@ -137,7 +137,7 @@ def test_a_fit_that_the_offset_spoils_is_not_believed(monkeypatch):
     assert "times as much is left over" in refused.reasons[-1]
 
 
-def test_what_is_known_too_badly_is_not_carried():
+def test_an_offset_that_is_too_uncertain_is_not_carried():
     window = noisy(stretch(5.0, 1.2), 1)
     for known in (None, (0.0, 0.1 * DEG)):
         assert estimate_carrying(window, SERVO, None, SETTINGS, known).status in REFUSED
@@ -167,7 +167,7 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     assert doubted.prior.offset_std == doubted.settings.offset_std_rad
 
 
-def test_a_loop_tells_bias_and_reason_for_every_window():
+def test_a_loop_reports_bias_and_reason_for_every_window():
     assert len(loop().disturbances) == len(loop().redesigns) == len(loop().estimates) == 10
     for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):
         assert (redesign.setting is not None) == estimate.ok == (redesign.reason == "")

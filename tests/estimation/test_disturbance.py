@@ -1,4 +1,4 @@
-"""Input bias and noise from the rest in a window: simulated loops, windows made by hand, and what is not said."""
+"""Input bias and noise from the rest in a window: simulated loops, windows made by hand, and refusals."""
 
 import math
 from functools import cache

@@ -77,7 +77,7 @@ def test_free_motion_is_what_an_initial_state_adds():
     np.testing.assert_allclose(whole - forced, start @ sampled.free(SIGNAL.size), atol=1e-15)
 
 
-def test_selection():
+def test_a_selected_family_has_the_derivatives_of_its_parameters():
     family = structure_family(Servo.preset("paper"))
     chosen = family.select(("pitch", "k/m"))
     assert isinstance(chosen, Family)

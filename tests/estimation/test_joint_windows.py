@@ -1,7 +1,7 @@
 """Several windows of one machine, the recorder's windows, what is left of a window, and the noise that a fit leaves."""
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
@@ -86,7 +86,7 @@ def test_a_useless_window_harms_no_other():
     ("windows", "word"),
     [((), "no window"), ((window_of(10.0), Window(np.zeros(2000), voltage=np.ones(2000), sample_rate=RATE)), "alike")],
 )
-def test_what_cannot_be_fitted_together_is_said(windows, word):
+def test_windows_that_cannot_be_fitted_together_are_refused_with_the_reason(windows, word):
     with pytest.raises(InvalidInput, match=word):
         estimate_jointly(windows, SERVO)
 
@@ -130,7 +130,7 @@ def test_without_noise_the_voltages_jumps_cost_nothing(loop):
         assert np.all(np.abs(found.errors) < 3.0 * found.stds)
 
 
-def test_what_is_left_is_the_noise():
+def test_the_residual_is_the_noise():
     for window, noise in ((window_of(10.0), FLOOR), (Window.from_run(run_of(10.0), 5.0, 1.0), 0.0)):
         assert estimate_jointly(window, DESCRIBED).gap.rms == pytest.approx(noise, rel=0.05, abs=1e-9)
 
@@ -171,21 +171,21 @@ def test_the_noise_a_fit_leaves_is_not_taken_for_quieter_than_it_was():
 
 
 def _gain(noise: Autoregression) -> float:
-    """Of slow noise, per sample."""
+    """Gain of slow noise, per sample."""
     return float(noise.spread[-1] / abs(noise.predictors[-1].sum()))
 
 
 def test_the_bound_grows_with_what_is_unknown():
-    """By code of its own; an estimator below it would have been told the answer, one far above it wastes data."""
+    """By code of its own; an estimator below it would have known the answer, one far above it wastes data."""
     groups = bench.windows(bench.CONTINUOUS, "paper", 2, 3)
     cases = [case for group in groups for case in group]
     case, root = cases[0], noise_root(5000, RATE, FLOOR, None)
-    at = (SERVO, case.window.theta_m, RATE, case.gap, case.theta_d0, root)
-    plain, structure = bound(*at), bound(*at, free=("k", "c", "p"))
-    motor = bound(*at, angles=motor_unknowns(SERVO, case.window.voltage, RATE, held=False))
+    bound_in = partial(bound, SERVO, case.window.theta_m, RATE, case.gap, case.theta_d0)
+    plain, structure = bound_in(root), bound_in(root, free=("k", "c", "p"))
+    motor = bound_in(root, angles=motor_unknowns(SERVO, case.window.voltage, RATE, zero_order_hold=False))
     assert plain < structure < 5.0 * plain
     assert plain < motor < 2.0 * plain
-    assert bound(*at[:-1], 2.0 * root, free=("k", "c", "p")) == pytest.approx(2.0 * structure, rel=1e-6)
+    assert bound_in(2.0 * root, free=("k", "c", "p")) == pytest.approx(2.0 * structure, rel=1e-6)
     errors = bench.Errors.of(groups, [bench.estimates(group, bench.CONTINUOUS, False, False) for group in groups])
     ratio = math.sqrt(np.mean(errors.errors**2)) / bench.limit(cases, bench.CONTINUOUS, voltage=False)
     assert 0.4 < ratio < 1.6

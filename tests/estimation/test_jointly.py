@@ -216,7 +216,7 @@ def test_quiet_and_broken_windows_are_refused():
         ({"theta_m": True}, {"settings": JointSettings(largest_delay_s=0.2)}, "samples"),
     ],
 )
-def test_what_cannot_be_is_said(channels, options, word):
+def test_impossible_requests_are_refused_with_the_reason(channels, options, word):
     signal = np.sin(np.arange(2000) / 300.0)
     window = Window(signal, **dict.fromkeys(channels, signal), sample_rate=5000.0)
     with pytest.raises(InvalidInput, match=word):

@@ -65,7 +65,7 @@ def test_the_information_matrix_hides_what_the_structure_hides(preset):
         assert subspace_angles(hidden, shows.hidden.T).max() < 1e-5, case.measured
 
 
-def test_products_and_single_parameters():
+def test_products_are_identifiable_where_single_parameters_are_not():
     unknown, coasting, angle, step, delay, pitch = (case.stds for case in cases())
     assert all(math.isinf(std) for std in unknown.values())
     assert {name for name, std in coasting.items() if math.isfinite(std)} == {"J R/(k_T k_B)", "L/R"}

@@ -69,7 +69,7 @@ def test_settling_times_of_fig_a1(alpha, settled):
     assert times[np.flatnonzero(error > 0.02 * 1.5e-3)[-1]] == pytest.approx(settled, abs=1e-3)
 
 
-def test_initial_state_has_the_derivatives_asked_for():
+def test_initial_state_has_the_given_derivatives():
     o = observer(PAPER)
     state = o.initial_state(FIG_A1)
     derivatives = [np.linalg.matrix_power(o.A_o, i)[0] @ state for i in range(4)]

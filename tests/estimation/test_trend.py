@@ -196,7 +196,7 @@ def test_a_lower_bound_moves_only_what_lies_below_it():
 
 
 @given(st.floats(-30.0, 30.0))
-def test_truncated_moments(margin):
+def test_truncated_moments_are_those_of_a_cut_normal(margin):
     pull, cut = truncation(margin)
     if margin > -8.0:
         grid = np.linspace(-margin, -margin + 40.0, 400_001) if margin > -8 else None
@@ -207,7 +207,7 @@ def test_truncated_moments(margin):
     assert 0.0 <= cut <= 1.0
 
 
-def test_what_does_not_count_says_so():
+def test_an_estimate_that_does_not_count_leaves_a_reason():
     trend = Trend.start(0.0, SETTINGS).update(seen(0.0, 0.2, 0.01))
     for status in (GapStatus.UNIDENTIFIABLE, GapStatus.MODEL_MISMATCH):
         after = trend.update(replace(seen(10.0, math.nan, math.inf, status)))
@@ -268,7 +268,7 @@ def test_how_many_must_agree_is_a_setting():
 
 
 def test_a_gap_read_by_the_carried_offset_is_one_equation():
-    """gap - 2 offset was seen: the same as least squares with that row; a hundred such windows teach no more of it."""
+    """Measuring gap - 2 offset equals least squares with that row; a hundred such windows add no more information."""
     known = Trend.start(0.0, SETTINGS).update(seen(0.0, 0.3, 0.02), OffsetReading(0.1, 0.01))
     std = math.hypot(2.0 * known.prior.offset_std, 1e-3)
     lean = CarriedOffset(known.prior.offset, known.prior.offset_std, 2.0)
@@ -283,7 +283,7 @@ def test_a_gap_read_by_the_carried_offset_is_one_equation():
     assert after.covariance[0, 0] == pytest.approx(free[0, 0], rel=1e-3)
 
 
-def test_an_outlier_that_leans_on_the_offset_proves_no_change():
+def test_an_outlier_that_rests_on_the_carried_offset_starts_no_new_trend():
     trend = steady().update(seen(40.0, 0.3, 0.001), OffsetReading(0.0, 0.001))
     lean = CarriedOffset(0.0, 0.001, 2.0)
     trend = trend.update(seen(50.0, 0.8, 0.003), lean)

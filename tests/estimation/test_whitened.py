@@ -80,7 +80,7 @@ def test_random_windows_are_refused_or_right():
 
 
 def test_in_white_noise_it_reaches_the_bound():
-    """Two-sided: an estimator below the Cramer-Rao bound would have been told the answer."""
+    """Two-sided: an estimator below the Cramer-Rao bound would have known the answer."""
     assert failures(bench.in_white_noise(5, 3)) == []
 
 
@@ -185,7 +185,7 @@ def test_nan_samples_are_refused_at_the_door():
         Window(position, clean()[0].window.theta_m, sample_rate=RATE)
 
 
-def test_what_the_window_must_bring():
+def test_a_window_without_theta_m_or_too_short_is_refused():
     window = clean()[0].window
     with pytest.raises(InvalidInput, match="no theta_m"):
         estimate_gap(Window(window.position, sample_rate=RATE), SERVO)
@@ -349,7 +349,7 @@ def one_contact():
                 yield measured(case), gap
 
 
-def test_rounding_proves_nothing():
+def test_rounding_carries_no_information():
     """A window that the model explains to 1e-18 m, whatever the gap: how the sum rounds is no evidence."""
     servo = Servo.preset("table1")
     calm, gap = servo.controller.replace(Ki=0.0), math.radians(2.2616)
@@ -385,7 +385,7 @@ def evidence(case: WindowCase) -> FitEvidence:
     """Evidence of a clean fit with a spread of 0.01 deg, against which nothing speaks."""
     fitted = fit(measured(case), case.servo, None, WhitenedSettings())
     assert fitted.aligned is not None
-    gap, std = fitted.aligned.found.point.gap, math.radians(0.01)
+    gap, std = fitted.aligned.whitened.point.gap, math.radians(0.01)
     return FitEvidence(
         aligned=fitted.aligned,
         std=std,
@@ -401,10 +401,10 @@ def evidence(case: WindowCase) -> FitEvidence:
 @pytest.mark.parametrize(("deviations", "status"), [(2.0, GapStatus.OK), (5.0, GapStatus.MODEL_MISMATCH)])
 @pytest.mark.parametrize("view", ["free model", "observer form", "lost motion"])
 def test_another_view_counts_from_three_standard_deviations_on(view: str, deviations: float, status: GapStatus):
-    """Noise moves every view of a window; only what it cannot explain is held against the model."""
+    """Noise moves every view of a window; only what noise cannot explain counts against the model."""
     seen, given = evidence(clean()[1]), WhitenedSettings()
     std = math.radians(0.1)
-    most = 1.05 * seen.aligned.found.point.gap + given.contact_travel
+    most = 1.05 * seen.aligned.whitened.point.gap + given.contact_travel
     seen = {
         "free model": replace(seen, shift=ModelShift(deviations * std, std, "a stiffness off", 0.0)),
         "observer form": replace(seen, observer=(-deviations * std, std)),

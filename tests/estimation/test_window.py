@@ -24,7 +24,7 @@ def test_keeps_its_samples_read_only():
         window.position[0] = 1.0
 
 
-def test_times():
+def test_a_window_has_its_sample_times():
     window = Window(RAMP, sample_rate=100.0, start=2.0)
     assert window.duration == 0.5
     assert window.mid_time == pytest.approx(2.245, abs=1e-12)

@@ -92,7 +92,7 @@ def test_what_may_be_an_outlier_to_the_twin_is_sent_twice() -> None:
     assert found == [FIRST, FIRST, "", "", SCORE, FIRST, "", ""]
 
 
-def test_an_accepted_update_ends_what_is_owed_and_keeps_the_news_out() -> None:
+def test_an_accepted_update_ends_the_unconditional_windows_and_keeps_the_news_out() -> None:
     novelty = NoveltyDetector(SETTINGS)
     assert reasons(novelty, [cut(0)]) == [FIRST]
     assert reasons(novelty, [updated(cut(k), 1, 10.0, 0) for k in range(1, 6)]) == [""] * 5
@@ -101,7 +101,7 @@ def test_an_accepted_update_ends_what_is_owed_and_keeps_the_news_out() -> None:
     assert novelty.state.update_gap == math.radians(12.0)
 
 
-def test_an_update_that_stands_on_a_window_not_looked_at_moves_the_baseline() -> None:
+def test_an_update_that_stands_on_a_window_not_judged_moves_the_baseline() -> None:
     novelty = NoveltyDetector(SETTINGS)
     reasons(novelty, [updated(cut(k), 1, 10.0, 1) for k in range(5)])
     assert reasons(novelty, [updated(cut(k, 12.0), 2, 12.0, 99) for k in range(5, 9)]) == [""] * 4

@@ -17,7 +17,7 @@ from benchmarks.novelty.loops import LoopCase, account, summary
 from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, OutgoingMessage
+from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
@@ -115,9 +115,9 @@ def agent(rules: NoveltyRules | None, rate: float = 500.0) -> Agent:
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000, 5000])
-def test_a_reference_that_never_changes_is_looked_at_all_the_same(block: int) -> None:
+def test_a_window_is_cut_and_judged_though_the_reference_never_changes(block: int) -> None:
     rules, count = NoveltyRules(look_s=2.0, period_s=5.0, patience=2), 5000
-    edge, sent = agent(rules), list[OutgoingMessage]()
+    edge, sent = agent(rules), list[ScheduledMessage]()
     for first in range(0, count, block):
         zeros = [0.0] * min(block, count - first)
         sent += edge.absorb_block(zeros, zeros, zeros, zeros)
@@ -127,7 +127,7 @@ def test_a_reference_that_never_changes_is_looked_at_all_the_same(block: int) ->
     assert edge.dropped[FILTERED] == edge.windows_cut - len({(w.sequence) for w in messages(sent)})
 
 
-def messages(sent: list[OutgoingMessage]) -> list[WindowMessage]:
+def messages(sent: list[ScheduledMessage]) -> list[WindowMessage]:
     return [each.message for each in sent if isinstance(each.message, WindowMessage)]
 
 
@@ -142,7 +142,7 @@ def test_a_model_for_another_rate_is_refused() -> None:
         AgentSettings("axis", "b0", 1000.0, window_filter=NoveltySettings(model_of(Servo.preset("paper"), 500.0)))
 
 
-def test_the_bench_measures_what_it_says() -> None:
+def test_the_bench_measures_and_writes_its_figures() -> None:
     tiny = replace(QUICK, quiet=40, changed=20, drawn=2000, trials=5)
     figures = {figure.name: figure.value for figure in charted(CONDITIONS[2], tiny)}
     assert figures["1 um: windows that say nothing, share"] == 0.0

@@ -106,10 +106,10 @@ def test_one_contact_says_something_only_where_the_offset_is_known() -> None:
     )
     window = servotwin.Window.from_run(run, 0.8, 1.0)
     assert window.theta_m is not None
-    signals = array("d", window.theta_m), array("d", window.position)
-    alone = score(*signals, MODEL, gap)
+    theta_m, position = array("d", window.theta_m), array("d", window.position)
+    alone = score(theta_m, position, MODEL, gap)
     assert alone is None or min(alone.travel) < math.radians(0.5)
-    known = score(*signals, MODEL, gap + 0.02, EncoderOffset(0.0, 1e-4))
+    known = score(theta_m, position, MODEL, gap + 0.02, EncoderOffset(0.0, 1e-4))
     assert known is not None
     assert math.degrees(abs(known.gap - gap)) < 0.03
 

@@ -64,7 +64,7 @@ def test_peaks_are_interior():
 
 
 @pytest.mark.parametrize(("values", "expected"), [([1, 2, 2, 5], True), ([3, 1, 0], True), ([1, 2, 1], False)])
-def test_monotone(values, expected):
+def test_a_sequence_is_monotone_if_it_never_turns(values, expected):
     assert measures.is_monotone(values) is expected
 
 

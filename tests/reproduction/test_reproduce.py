@@ -90,7 +90,7 @@ def small(tmp_path_factory):
     return out
 
 
-def test_a_small_reproduction_writes_what_it_says(small):
+def test_a_small_reproduction_writes_its_report_and_claims(small):
     names = ["claims.json", "fig4.png", "fig4.svg", "fig7.png", "fig7.svg", "report.html"]
     assert sorted(path.name for path in small.iterdir()) == names
     assert json.loads((small / "claims.json").read_text())["claims"] == []

@@ -78,7 +78,7 @@ def test_every_claim_has_one_measuring_function_and_none_is_left_over():
         *("larger dead zone", "slightly biased", "faster than real-time", "amplitude increases"),
     ],
 )
-def test_the_list_contains_what_was_asked_for(words):
+def test_the_list_contains_the_required_claims(words):
     assert any(words in claim.sentence for claim in LISTED.values())
 
 

@@ -58,7 +58,7 @@ def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_does_
     assert not outcomes["paper"].steps[1].settled
 
 
-def test_what_was_in_force_is_counted(outcomes):
+def test_updates_and_fallbacks_in_force_are_counted(outcomes):
     for one in outcomes.values():
         origins = [change.origin for change in one.run.changes]
         assert origins[0] is SettingOrigin.START
@@ -109,7 +109,7 @@ def test_totals_of_known_signals(outcomes):
     assert [step.error for step in policy_runs.measured_steps(shifted)] == pytest.approx([2e-6, 2e-6])
 
 
-def test_a_policy_that_cannot_design_says_so(monkeypatch):
+def test_a_policy_that_cannot_design_states_the_reason(monkeypatch):
     scenario = PolicyJob("paper", "margin", NOISE, SHORT).scenario_to_run()
     limited = scenario.replace(controller=scenario.law.replace(voltage_limit=24.0))
     monkeypatch.setattr(PolicyJob, "scenario_to_run", lambda _: limited)

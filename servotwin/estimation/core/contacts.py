@@ -1,14 +1,14 @@
 """The play operator with its exact sensitivities, at the samples and between them.
 
 The screw's angle is piecewise affine in the gap and in where the screw began. Pushed forwards it is theta_m - half the
-gap, pushed backwards theta_m + half the gap, and it keeps what the last contact gave it. Before the first contact it
-rests where it began.
+gap, pushed backwards theta_m + half the gap, and between contacts it rests. Before the first contact it rests where it
+began.
 
-Between the samples: the structure's response takes the screw's angle as linear from sample to sample. Of the true path
-that leaves out the bow of a curved motion, the sample within which a contact begins, and the crest that lies between
-two samples, which stays in the screw's angle until the next contact: some 1e-10 m in all, which is how small the
-evidence of a gap can be. In `polygon` the motor's angle is a cubic in between, and the polygon keeps the true path's
-area and first moment in every interval: the structure, slow against the sample rate, answers to both alike.
+Between the samples the structure's response takes the screw's angle as linear. That leaves out the bow of a curved
+motion, the sample within which a contact begins, and the crest between two samples, which stays in the screw's angle
+until the next contact: some 1e-10 m in all, and the evidence of a gap can be as small. In `polygon` the motor's angle
+is a cubic in between, and the polygon keeps the true path's area and first moment in every interval: the structure,
+slow against the sample rate, answers to both alike.
 """
 
 from __future__ import annotations
@@ -112,14 +112,14 @@ def last_contacts(
 
 
 def through_gap(columns: Array, theta_m: Array, at: Gap) -> Array:
-    """(k, n) changes of the screw's angle for changes `columns` (k, n) of the motor's: kept since the last contact."""
+    """(k, n) changes of the screw's angle for changes `columns` (k, n) of the motor's: those at the last contact."""
     last = last_contacts(theta_m, at.gap, at.theta_d0, at.rate)
     touched = last >= 0
     return np.where(touched, columns[:, np.maximum(last, 0)], 0.0)
 
 
 _SIXTH, _TWELFTH, _FORTY_FIFTH = 1.0 / 6.0, 1.0 / 12.0, 1.0 / 45.0  # a product takes a quarter of a division's time
-_STEPS, _CLOSE = 30, 1e-13  # of a search for where a contact begins, in samples
+_STEPS, _CLOSE = 30, 1e-13  # steps, and accuracy in samples, of the search for the begin of a contact
 
 # Callees first: what is compiled is cached under the code of the functions that it names, if they are known by then.
 
@@ -181,7 +181,7 @@ def pushed(low: float, high: float, before: float, after: float) -> tuple[float,
     crest : float
         rad, how far the screw was pushed; 0: not at all.
     begin : float
-        0..1, when that began.
+        0..1, time at which the push began.
     area, moment : float
         rad: of the screw's path less that of the line to its end, an interval being 1 long.
     """
@@ -215,7 +215,7 @@ def put(out: Array, i: int, side: float, time: float) -> None:
 
 @inlined
 def begun(out: Array, i: int, begin: float) -> None:
-    """Give steps of the derivatives between samples i - 1 and i, at the part `begin` of the way, their areas."""
+    """Spread each derivative's step, at the part `begin` of the way from sample i - 1 to i, over both by its area."""
     moment = 0.5 * (1.0 - begin * begin) - 1.0 / 3.0
     early = 0.5 - begin - moment
     for row in range(SCREW + 1, BY_RATE + 1):

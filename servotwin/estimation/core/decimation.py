@@ -50,7 +50,7 @@ def decimation(factor: int) -> Decimation:
 
 
 def shortest_for(factor: int, outputs: int) -> int:
-    """Fewest samples that a decimation by `factor` makes `outputs` samples of."""
+    """Fewest samples from which a decimation by `factor` makes `outputs` samples."""
     return outputs if factor == 1 else factor * (outputs + _AVERAGES - 1)
 
 

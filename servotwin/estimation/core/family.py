@@ -64,7 +64,7 @@ class Family:
     def sampled(self, sample_rate: float, hold: InputHold = InputHold.LINEAR) -> Sampled:
         """At a sample rate in Hz."""
         interval = 1.0 / sample_rate
-        parts = [_held(self.system, one, interval, hold) for one in (self.system, *self.by)]
+        parts = [_discretised(self.system, one, interval, hold) for one in (self.system, *self.by)]
         steps = [parts[0][0], *(derivative for _, derivative in parts[1:])]
         size = self.system.B.size
         F, G, H = (np.array([step[:size, part] for step in steps]) for part in (slice(size), size, size + 1))
@@ -115,7 +115,7 @@ class Sampled:
         return np.array([bare.respond(silence, state)[0] for state in states])
 
 
-def _held(system: Matrices, by: Matrices, interval: float, hold: InputHold) -> tuple[Array, Array]:
+def _discretised(system: Matrices, by: Matrices, interval: float, hold: InputHold) -> tuple[Array, Array]:
     """exp of the system with its input's value and slope as states, over an interval, and its derivative."""
     flow, change = _flow(system, interval, hold), _flow(by, interval, hold, constant=False)
     _, (scale, _) = matrix_balance(flow, permute=False, separate=True)
@@ -212,7 +212,7 @@ def structure_family(servo: Servo) -> Family:
     """Screw angle (rad) to the last mass's position (m), for all stiffnesses, all dampings over the masses, and p.
 
     "k/m" scales every stiffness, "c/m" every damping, "pitch" the screw. The state is z = x - B_velocity d, whose
-    derivative holds none of the input's. Only a rigid screw is a function of its angle alone.
+    derivative does not contain the input's. Only a rigid screw is a function of its angle alone.
     """
     m, k, c, p = servo.masses, servo.stiffnesses, servo.dampings, servo.p
     whole, bare = servo.chain(), chain(m, 0.0 * k, 0.0 * c).A

@@ -65,8 +65,8 @@ def least_squares(columns: Array, target: Array) -> LeastSquares:
 def independent_least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,), without those that depend on the rows before them.
 
-    By orthogonalisation, which tells dependence at 1e-7 of a column's length; `least_squares`, which squares the
-    columns, at 3e-6 and without regard to their order.
+    Orthogonalisation detects dependence at 1e-7 of a column's length; `least_squares`, which squares the columns,
+    detects it at 3e-6, whatever their order.
     """
     size = np.sqrt(np.sum(columns * columns, axis=1))
     size[size == 0.0] = 1.0

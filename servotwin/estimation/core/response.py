@@ -55,7 +55,7 @@ class Response:
     static_gain : float
         m/rad, position over angle at rest.
     unseen : float
-        s: what the screw does so late in a window has not reached the last mass: the sum of sqrt(m / k).
+        s: motions of the screw so late in a window have not reached the last mass; the sum of sqrt(m / k).
     """
 
     poles: Complex
@@ -98,17 +98,17 @@ def response(servo: Servo, sample_rate: float) -> Response:
     drive = np.linalg.solve(shapes, servo.p * (chain.A @ chain.B_velocity + chain.B_position))
     row = chain.C_last
     weight = (row @ shapes) * drive
-    kept = poles.imag >= 0.0
-    poles, weight = poles[kept], weight[kept] * np.where(poles[kept].imag > 0.0, 2.0, 1.0)
+    upper = poles.imag >= 0.0
+    poles, weight = poles[upper], weight[upper] * np.where(poles[upper].imag > 0.0, 2.0, 1.0)
     direct = servo.p * float(row @ chain.B_velocity + chain.D[-1])
     return Response(
-        poles,
-        _parts(np.exp(poles * interval)),
-        _readout(poles, weight, interval, direct),
-        _readout(poles, weight * poles, interval, float(np.sum(weight).real)),
-        interval,
-        direct - float(np.sum(weight / poles).real),
-        float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:]))),
+        poles=poles,
+        decay=_parts(np.exp(poles * interval)),
+        position=_readout(poles, weight, interval, direct),
+        velocity=_readout(poles, weight * poles, interval, float(np.sum(weight).real)),
+        interval=interval,
+        static_gain=direct - float(np.sum(weight / poles).real),
+        unseen=float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:]))),
     )
 
 

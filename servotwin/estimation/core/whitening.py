@@ -1,7 +1,7 @@
-"""Noise as an autoregression, found by Burg's method, and the filter that makes it white.
+"""Noise as an autoregression, estimated by Burg's method, and the filter that makes it white.
 
-Burg's needs no window at the ends of the data; the autocorrelation method (Yule-Walker) has one, whose leakage hides
-the deep low-frequency notch of high-passed noise, exactly where the gap shows.
+Burg's method needs no window at the ends of the data; the autocorrelation method (Yule-Walker) has one, whose leakage
+hides the deep low-frequency notch of high-passed noise, exactly where the gap shows.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Autoregression:
 
     @classmethod
     def white(cls, std: float) -> Autoregression:
-        """No memory."""
+        """White noise of a standard deviation: a model without memory."""
         return cls(np.ones((1, 1)), np.array([std]))
 
     def at_least(self, spread: float) -> Autoregression:
@@ -42,7 +42,7 @@ class Autoregression:
 
     @property
     def order(self) -> int:
-        """p."""
+        """Highest order, p."""
         return self.spread.size - 1
 
     def whiten(self, columns: Array) -> Array:
@@ -66,7 +66,7 @@ class Autoregression:
 def burg(series: Array, most: int) -> Autoregression:
     """The autoregression of equally likely series (s, n), its order chosen by the corrected Akaike criterion.
 
-    The order is at most `most`, and counted as if there were one series: the others say nothing new, they only state
+    The order is at most `most`, and chosen as if there were one series: the others add no information, they only state
     what is not known of it.
     """
     predictors, power = recursion(series, most)
@@ -113,7 +113,7 @@ def correlation(ahead: Array, behind: Array) -> tuple[float, float]:
 
 @inlined
 def reflect(ahead: Array, behind: Array, reflection: float) -> None:
-    """One stage of the lattice, in place."""
+    """Run one stage of the lattice, in place."""
     for i in range(ahead.size):
         one, two = ahead[i], behind[i]
         ahead[i] = one + reflection * two

@@ -38,7 +38,7 @@ from servotwin.estimation.joint.verdict import (
     at_bound,
     estimate_of,
     mismatched,
-    stated,
+    window_estimate,
 )
 from servotwin.estimation.trend import Prior
 from servotwin.estimation.whitened.channels import faults, motor_angle
@@ -49,7 +49,7 @@ from servotwin.plant.signals import Array
 
 __all__ = ["JointEstimate", "JointSettings", "SharedFit", "estimate_jointly"]
 
-SHARED = ("k/m", "c/m", "pitch", "k_B")
+_SHARED = ("k/m", "c/m", "pitch", "k_B")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +69,9 @@ class SharedFit:
 
     @classmethod
     def of(cls, fits: Sequence[WindowMinima]) -> SharedFit:
-        """The layout."""
+        """Lay out the parameters of all windows."""
         names = fits[0].model.names
-        shared = {name: i for i, name in enumerate(name for name in names if name in SHARED)}
+        shared = {name: i for i, name in enumerate(name for name in names if name in _SHARED)}
         places, end = [], len(shared)
         for fit in fits:
             own = [name for name in fit.model.names if name not in shared]
@@ -103,30 +103,30 @@ class SharedFit:
         known, residuals, blocks = self.known(), [], []
         for fit, place in zip(self.fits, self.places, strict=True):
             count = len(place)
-            seen = fit.evaluated(fit.known.vague(np.ones(count, dtype=bool)))(point[place])
-            block = np.zeros((self.size, seen.residual.size - count))
-            block[place] = seen.jacobian[:, :-count]
-            residuals.append(seen.residual[:-count])
+            evaluation = fit.evaluated(fit.known.vague(np.ones(count, dtype=bool)))(point[place])
+            block = np.zeros((self.size, evaluation.residual.size - count))
+            block[place] = evaluation.jacobian[:, :-count]
+            residuals.append(evaluation.residual[:-count])
             blocks.append(block)
         prior, slope = (point - known.mean) / known.spread, np.diag(1.0 / known.spread)
         return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
 
     def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
-        """The best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
+        """Find the best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
         tolerance = self.joined([tolerance_of(fit.model) for fit in self.fits])
         starts = [self._start([fit.best for fit in self.fits])]
         for index, fit in enumerate(self.fits):
             others = [one.best for one in self.fits]
             starts += [self._start([*others[:index], rival, *others[index + 1 :]]) for rival in fit.minima[1:]]
-        found = [descend(self.evaluate, start, self.known(), tolerance) for start in starts]
-        best = min(found, key=lambda one: one.cost)
-        near = [one for one in found if one.cost < best.cost + RIVAL]
+        minima = [descend(self.evaluate, start, self.known(), tolerance) for start in starts]
+        best = min(minima, key=lambda one: one.cost)
+        near = [one for one in minima if one.cost < best.cost + RIVAL]
         gaps = [place[0] for place in self.places]
         rivals = tuple(tuple(float(one.point[i]) for one in near if _apart(one.point[i], best.point[i])) for i in gaps)
-        return replace(best, evaluations=sum(one.evaluations for one in found)), rivals
+        return replace(best, evaluations=sum(one.evaluations for one in minima)), rivals
 
     def _start(self, stands: Sequence[FitPoint]) -> Array:
-        """Each window's own minimum; the shared parameters of the one that knows its gap best."""
+        """Start at each window's own minimum, with the shared parameters of the window whose gap is known best."""
         leader = min(range(len(stands)), key=lambda i: float(stands[i].deviations()[0]))
         whole = self.joined([one.point for one in stands])
         whole[self.places[leader]] = stands[leader].point
@@ -137,7 +137,7 @@ def _apart(gap: float, other: float) -> bool:
     return abs(gap - other) > APART
 
 
-WITH_ANGLE, FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
+_WITH_ANGLE, _FROM_VOLTAGE = ("k/m", "c/m", "pitch"), ("k/m", "c/m", "k_B")
 SHORTEST = 200  # samples beside the margins, as before the decimation; after it a window has MINIMUM_SAMPLES at least
 _SIGMAS = 4.0  # by how many standard deviations a gap may move when its window is fitted with others
 
@@ -149,7 +149,7 @@ def estimate_jointly(
     prior: AnyPrior = None,
     settings: JointSettings | None = None,
 ) -> JointEstimate:
-    """The total gap with the model's numbers, from windows with or without the motor's angle.
+    """Estimate the total gap with the model's numbers, from windows with or without the motor's angle.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def estimate_jointly(
         The model to start from.
     free : tuple of str, optional
         Of "k/m", "c/m", "pitch", "k_B", "gap rate". By default k/m, c/m and the pitch; without the motor's angle k_B in
-        place of the pitch, which it cannot be told from.
+        place of the pitch, because the position shows only their ratio.
     prior : number, GapEstimate or Prior, optional
         A gap (rad) to search from as well; a `Prior`'s spread counts as information, on the first window.
     settings : JointSettings, optional
@@ -175,19 +175,19 @@ def estimate_jointly(
     windows = _windows(window)
     names = _free(windows[0], free)
     fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
-    found = [_alone(fit) for fit in fits]
+    results = [_alone(fit) for fit in fits]
     counted = [
-        i for i, one in enumerate(found) if not (fits[i].blocked or mismatched(one, given) or at_bound(one, given))
+        i for i, one in enumerate(results) if not (fits[i].blocked or mismatched(one, given) or at_bound(one, given))
     ]
     if len(counted) > 1:
-        joined = _joined([fits[i] for i in counted], [found[i] for i in counted], given)
-        found = [dict(zip(counted, joined, strict=True)).get(i, one) for i, one in enumerate(found)]
-    leading = found[counted[-1] if counted else -1]
-    return estimate_of(tuple(stated(one, given) for one in found), leading, given)
+        joined = _joined([fits[i] for i in counted], [results[i] for i in counted], given)
+        results = [dict(zip(counted, joined, strict=True)).get(i, one) for i, one in enumerate(results)]
+    leading = results[counted[-1] if counted else -1]
+    return estimate_of(tuple(window_estimate(one, given) for one in results), leading, given)
 
 
 def _windows(given: Window | Sequence[Window]) -> tuple[Window, ...]:
-    """At least one, and all with the same channels."""
+    """List the windows: at least one, and all with the same channels."""
     windows = (given,) if isinstance(given, Window) else tuple(given)
     if not windows:
         raise InvalidInput("there is no window: the joint estimator needs at least one")
@@ -204,7 +204,7 @@ def _start_of(prior: AnyPrior) -> AnyPrior:
 def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
     """Names of the free parameters, checked."""
     measured = window.theta_m is not None
-    names = (WITH_ANGLE if measured else FROM_VOLTAGE) if free is None else tuple(free)
+    names = (_WITH_ANGLE if measured else _FROM_VOLTAGE) if free is None else tuple(free)
     for name in names:
         if name not in SPREADS:
             raise InvalidInput(f"free parameter {name!r} does not exist: allowed are {', '.join(SPREADS)}")
@@ -252,7 +252,7 @@ def _still(window: Window) -> bool:
 def _fit(
     window: Window, servo: Servo, names: tuple[str, ...], prior: AnyPrior, settings: JointSettings
 ) -> WindowMinima:
-    """One window by itself; not searched when its channels are useless."""
+    """Fit one window by itself; it is not searched when its channels are useless."""
     model = _model(window, servo, names, settings)
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
@@ -265,7 +265,7 @@ def _fit(
 
 
 def _alone(fit: WindowMinima) -> JointFit:
-    """The best minimum of one window, and what speaks against it being the only one."""
+    """Take the best minimum of one window, with an objection where others explain the window nearly as well."""
     best = fit.best
     rivals = tuple(float(one.point[0]) for one in fit.minima[1:] if one.cost < best.cost + RIVAL)
     objection = fit.blocked or _doubt(best.converged, float(best.point[0]), rivals)
@@ -273,20 +273,20 @@ def _alone(fit: WindowMinima) -> JointFit:
 
 
 def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: JointSettings) -> list[JointFit]:
-    """The windows fitted together; one whose gap moves by more than its spread contradicts the others."""
+    """Fit the windows together; one whose gap moves by more than its spread contradicts the others."""
     whole = SharedFit.of(fits)
     best, rivals = whole.solved()
-    covariance, found = best.covariance(), []
+    covariance, results = best.covariance(), []
     for before, place, others in zip(alone, whole.places, rivals, strict=True):
         point = best.point[place]
         objection = _doubt(best.converged, float(point[0]), others)
         one = JointFit(before.model, point, covariance[np.ix_(place, place)], best.evaluations, objection)
-        found.append(replace(one, contradiction=_contradiction(before, one, settings)))
-    return found
+        results.append(replace(one, contradiction=_contradiction(before, one, settings)))
+    return results
 
 
 def _contradiction(before: JointFit, after: JointFit, settings: JointSettings) -> str:
-    """Reason why a window is not of the same machine as the others; empty when it may be."""
+    """Reason for which a window cannot be of the same machine as the others; empty when it can."""
     moved, spread = after.point[0] - before.point[0], math.hypot(before.std(settings), settings.model_error_rad)
     if before.objection or not abs(moved) > _SIGMAS * spread:
         return ""

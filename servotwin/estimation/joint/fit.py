@@ -35,15 +35,15 @@ class ParameterPrior:
     mean: Array
     spread: Array
 
-    def vague(self, kept: Flags) -> ParameterPrior:
+    def vague(self, free: Flags) -> ParameterPrior:
         """The bounds alone, and parameters that are not `kept` (P,) held at their means: for a first search."""
-        lowest, highest = np.where(kept, self.lowest, self.mean), np.where(kept, self.highest, self.mean)
+        lowest, highest = np.where(free, self.lowest, self.mean), np.where(free, self.highest, self.mean)
         return ParameterPrior(lowest, highest, self.mean, np.full_like(self.spread, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
 class FitPoint:
-    """A point, and what holds there: residual and derivatives (P, m + P) with the prior as P more samples."""
+    """A point with its residual (m + P,) and derivatives (P, m + P); the prior counts as P more samples."""
 
     point: Array
     residual: Array
@@ -74,8 +74,8 @@ class FitPoint:
 Evaluate: TypeAlias = Callable[[Array], FitPoint]
 
 
-def stand(model: JointModel, point: Array, known: ParameterPrior, reduce: Reduce) -> FitPoint:
-    """Evaluate at a point."""
+def _evaluate_at(model: JointModel, point: Array, known: ParameterPrior, reduce: Reduce) -> FitPoint:
+    """Evaluate residual and derivatives at a point."""
     slopes = model.slopes(dict(zip(model.names, point.tolist(), strict=True)), reduce)
     prior = (point - known.mean) / known.spread
     jacobian = np.hstack([slopes.jacobian, np.diag(1.0 / known.spread)])
@@ -104,9 +104,9 @@ def descend(evaluate: Evaluate, start: Array, known: ParameterPrior, tolerance: 
 def _step(here: FitPoint, known: ParameterPrior, damping: float) -> Array:
     """The damped Gauss-Newton step of the parameters that are not held by their bounds."""
     downhill = -here.jacobian @ here.residual
-    held = ((here.point <= known.lowest) & (downhill < 0.0)) | ((here.point >= known.highest) & (downhill > 0.0))
+    blocked = ((here.point <= known.lowest) & (downhill < 0.0)) | ((here.point >= known.highest) & (downhill > 0.0))
     size = np.linalg.norm(here.jacobian, axis=1)
-    free = np.flatnonzero(~held & (size > 0.0))
+    free = np.flatnonzero(~blocked & (size > 0.0))
     step = np.zeros_like(here.point)
     scaled = here.jacobian[free] / size[free, None]
     damped = scaled @ scaled.T + damping * np.eye(free.size)
@@ -125,8 +125,8 @@ def scan(model: JointModel, values: Mapping[str, float], gaps: Array, keep: int,
 AnyPrior = float | GapEstimate | Prior | None
 
 
-def known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
-    """Bounds and priors."""
+def _known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
+    """Bounds and priors of the model's parameters."""
     rows = {"gap": (0.0, settings.largest_gap_rad, 0.0, math.inf), "place": (-1.0, 1.0, 0.0, math.inf)}
     rows["delay"] = (-settings.largest_delay_s, settings.largest_delay_s, 0.0, math.inf)
     rows.update({name: (-4.0 * s, 4.0 * s, 0.0, s) for name, s in ((n, settings.spread(n)) for n in SPREADS)})
@@ -144,7 +144,7 @@ def known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Par
 
 
 def start_of(model: JointModel, prior: AnyPrior) -> Array:
-    """(P,) the point that the search begins from, but for gap and place, which are scanned."""
+    """(P,) start of the search; the gap and the place are scanned besides."""
     values = dict.fromkeys(model.names, 0.0)
     values["gap"] = _gap_of(prior) or 0.0
     if "speed0" in values and model.window.voltage is not None:
@@ -153,7 +153,7 @@ def start_of(model: JointModel, prior: AnyPrior) -> Array:
 
 
 def _gap_of(prior: AnyPrior) -> float | None:
-    """rad."""
+    """Gap (rad) of a prior; None without one."""
     gap = prior if prior is None or isinstance(prior, int | float) else prior.gap
     if isinstance(prior, GapEstimate) and not prior.ok:
         return None
@@ -163,7 +163,7 @@ def _gap_of(prior: AnyPrior) -> float | None:
 
 
 def tolerance_of(model: JointModel) -> Array:
-    """(P,) steps that do not matter: 3e-5 deg, and 1e-6 of what is a logarithm."""
+    """(P,) steps small enough to end a search: 3e-5 deg for the gap, 1e-6 for logarithms."""
     steps = {"gap": 5e-7, "place": 1e-2, "delay": 1e-8, "gap rate": 1e-6, "speed0": 1e-3, "current0": 1e-4}
     steps.update({f"{JUMP}{index}": 1e-8 for index in model.jumps})
     return np.array([steps.get(name, 1e-6) for name in model.names])
@@ -173,13 +173,15 @@ _LEAST = 1e-300
 
 
 def estimate_noise(
-    model: JointModel, found: FitPoint, reduce: Decimation, before: Autoregression, order: int, put: bool
+    model: JointModel, minimum: FitPoint, reduce: Decimation, before: Autoregression, order: int, put: bool
 ) -> Autoregression:
     """Estimate the noise from the residual of a fit that was made with a first idea of it.
 
     With `put`, the noise that the fit may have taken away is put back.
     """
-    table = _kept(model, model.table(dict(zip(model.names, found.point.tolist(), strict=True)), reduce.rows))
+    table = _without_motor_start(
+        model, model.table(dict(zip(model.names, minimum.point.tolist(), strict=True)), reduce.rows)
+    )
     rows = before.whiten(table)
     solved = least_squares(rows[1:], rows[0])
     left = table[0] - solved.coefficients @ table[1:]
@@ -202,10 +204,10 @@ def likeliest(series: Array, table: Array, most: int) -> Autoregression:
     spreads = np.sqrt(np.maximum(power, _LEAST))
     orders = [Autoregression(predictors[:n, :n].copy(), spreads[:n]) for n in range(1, power.size + 1)]
     rows = np.vstack([table[:1], orthonormal(table[1:])])
-    return min(orders, key=lambda noise: restricted(noise, rows))
+    return min(orders, key=lambda noise: _restricted(noise, rows))
 
 
-def restricted(noise: Autoregression, rows: Array) -> float:
+def _restricted(noise: Autoregression, rows: Array) -> float:
     """Minus twice the restricted log-likelihood of rows[0] off rows[1:], and the corrected Akaike penalty.
 
     The level of the noise is free.
@@ -220,7 +222,7 @@ def restricted(noise: Autoregression, rows: Array) -> float:
     return likelihood + 2.0 * count * size / max(1, size - count - 1)
 
 
-def _kept(model: JointModel, table: Array) -> Array:
+def _without_motor_start(model: JointModel, table: Array) -> Array:
     """The rows without those of the motor's start, which is over in milliseconds and takes little away."""
     first = len(table) - len(model.names)
     return np.delete(table, [first + i for i, name in enumerate(model.names) if name in MOTOR_START], axis=0)
@@ -229,12 +231,12 @@ def _kept(model: JointModel, table: Array) -> Array:
 RIVAL, APART = 12.0, math.radians(0.3)  # a rival's cost is as near; minima closer than this (rad) are one
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _STARTS = 3
-_SAMPLES_HZ = 250.0  # what is kept: with fewer the noise model fits itself to the residual, spreads come out small
+_SAMPLES_HZ = 250.0  # rate after decimation: at a lower one the noise model fits itself to the residual
 
 
 @dataclass(frozen=True, eq=False)
 class WindowMinima:
-    """One window's fit.
+    """Minima of one window's cost, in its own noise.
 
     Attributes
     ----------
@@ -246,7 +248,7 @@ class WindowMinima:
         The lowest first; whitened.
     evaluations : int
     blocked : str
-        Why the window was not searched; empty when it was.
+        Reason for which the window was not searched; empty if it was.
     """
 
     model: JointModel
@@ -264,7 +266,7 @@ class WindowMinima:
 
     def evaluated(self, known: ParameterPrior) -> Evaluate:
         """Whitened residual and derivatives as a function of the point."""
-        return lambda point: stand(self.model, point, known, self.whitened)
+        return lambda point: _evaluate_at(self.model, point, known, self.whitened)
 
     def whitened(self, rows: Array) -> Array:
         """(k, m) reduced and whitened rows (k, n)."""
@@ -273,17 +275,14 @@ class WindowMinima:
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
     """Make the fit from which a search begins."""
-    known, reduce, noise = (
-        known_of(model, prior, settings),
-        decimation(decimation_factor(model.rate)),
-        Autoregression.white(1.0),
-    )
-    here = stand(model, start_of(model, prior), known, reduce.rows)
+    known, noise = _known_of(model, prior, settings), Autoregression.white(1.0)
+    reduce = decimation(decimation_factor(model.rate))
+    here = _evaluate_at(model, start_of(model, prior), known, reduce.rows)
     return WindowMinima(model, known, reduce, noise, (here,), here.evaluations, blocked)
 
 
 def searched(model: JointModel, prior: AnyPrior, settings: JointSettings) -> WindowMinima:
-    """The minima of a window's cost, noise and parameters estimated in turn."""
+    """Search the minima of a window's cost; noise and parameters are estimated in turn."""
     fit = _unwhitened(unsearched(model, prior, settings), settings)
     for number in range(settings.whitenings):
         put = number == settings.whitenings - 1
@@ -293,27 +292,27 @@ def searched(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Win
 
 
 def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
-    """The minima in white noise: first with the motor's start and the jumps held, which no scan could sort out.
+    """Search in white noise, first with the motor's start and the jumps fixed: no scan could sort them out.
 
-    Then with all of them free: what a jump that is held leaves would be taken for noise, a hundred times too much.
+    Then all of them are free: the residual of a fixed jump would be taken for noise, a hundred times too much.
     """
     model, fine = fit.model, np.array([name in MOTOR_START or name.startswith(JUMP) for name in fit.model.names])
     values = dict(zip(model.names, fit.best.point.tolist(), strict=True))
     gaps = np.unique(np.append(_GRID[settings.largest_gap_rad >= _GRID], values["gap"]))
-    held, tolerance = fit.known.vague(~fine), 30.0 * tolerance_of(model)
+    bounds, tolerance = fit.known.vague(~fine), 30.0 * tolerance_of(model)
     starts = scan(model, values, gaps, _STARTS, fit.reduce.rows)
-    coarse = [descend(fit.evaluated(held), begin, held, tolerance) for begin in starts]
-    found = replace(fit, minima=distinct(coarse), evaluations=sum(one.evaluations for one in coarse))
-    return _descended(found, fit.known.vague(fine | True), found.minima) if fine.any() else found
+    coarse = [descend(fit.evaluated(bounds), begin, bounds, tolerance) for begin in starts]
+    searched_fit = replace(fit, minima=_distinct(coarse), evaluations=sum(one.evaluations for one in coarse))
+    return _descended(searched_fit, fit.known.vague(fine | True), searched_fit.minima) if fine.any() else searched_fit
 
 
 def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoint]) -> WindowMinima:
     """Descend from each of the starts to its minimum; keep those near the lowest."""
     tolerance = tolerance_of(fit.model)
-    found = [descend(fit.evaluated(known), one.point, known, tolerance) for one in starts]
-    near = min(one.cost for one in found) + 100.0 * RIVAL
-    minima = tuple(one for one in distinct(found) if one.cost <= near)
-    return replace(fit, minima=minima, evaluations=fit.evaluations + sum(one.evaluations for one in found))
+    ends = [descend(fit.evaluated(known), one.point, known, tolerance) for one in starts]
+    near = min(one.cost for one in ends) + 100.0 * RIVAL
+    minima = tuple(one for one in _distinct(ends) if one.cost <= near)
+    return replace(fit, minima=minima, evaluations=fit.evaluations + sum(one.evaluations for one in ends))
 
 
 def decimation_factor(rate: float) -> int:
@@ -321,10 +320,10 @@ def decimation_factor(rate: float) -> int:
     return max(1, int(rate / _SAMPLES_HZ))
 
 
-def distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
+def _distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
     """The lowest of each group with the same gap, the lowest of all first."""
-    kept: list[FitPoint] = []
+    different: list[FitPoint] = []
     for one in sorted(stands, key=lambda one: one.cost):
-        if all(abs(one.point[0] - other.point[0]) > APART for other in kept):
-            kept.append(one)
-    return tuple(kept)
+        if all(abs(one.point[0] - other.point[0]) > APART for other in different):
+            different.append(one)
+    return tuple(different)

@@ -1,4 +1,4 @@
-"""Parameters, or products of parameters, that a measurement determines; and what of the motor can be learnt.
+"""Parameters, or products of parameters, that a measurement determines; those of the motor in six cases.
 
 Everything is by the logarithms of the parameters, so that a direction of the information matrix is a product of powers
 and its standard deviation is relative. A direction without information is a product that no such data can ever show.
@@ -72,9 +72,9 @@ class Identifiability:
         for name in exponents:
             if name not in self.names:
                 raise InvalidInput(f"parameter {name!r} does not exist: allowed are {', '.join(self.names)}")
-        wanted = np.array([exponents.get(name, 0.0) for name in self.names])
-        along = self.directions @ wanted
-        if np.any(np.abs(along[self.rank :]) > _ALONG * np.linalg.norm(wanted)):
+        powers = np.array([exponents.get(name, 0.0) for name in self.names])
+        along = self.directions @ powers
+        if np.any(np.abs(along[self.rank :]) > _ALONG * np.linalg.norm(powers)):
             return math.inf
         return float(np.linalg.norm(along[: self.rank] / self.strengths[: self.rank]))
 
@@ -130,7 +130,7 @@ class SensorNoise:
 
 @dataclass(frozen=True, eq=False)
 class MotorCase:
-    """Measured channels, and what they show of (J, L, R, k_T, k_B)."""
+    """Measured channels, and their information about (J, L, R, k_T, k_B)."""
 
     measured: str
     shows: Identifiability
@@ -150,18 +150,18 @@ def _without(powers: Mapping[str, float], known: Mapping[str, float]) -> Mapping
 def motor_cases(
     window: Window, servo: Servo, at: Gap, noise: SensorNoise | None = None, hold: InputHold = InputHold.LINEAR
 ) -> tuple[MotorCase, ...]:
-    """The six cases, for the motion that a window holds.
+    """Compute the six cases for the motion in a window.
 
     Parameters
     ----------
     window : Window
-        With theta_m and voltage: the operating point. Which of them a case may use is the case's affair.
+        With theta_m and voltage: the operating point. Each case uses only the channels that it names.
     servo : Servo
     at : Gap
         Gap and first screw angle that the window was made with (rad).
     noise : SensorNoise, optional
     hold : InputHold
-        What the voltage does between samples.
+        Course of the voltage between samples.
 
     Raises
     ------
@@ -213,11 +213,11 @@ def _from_position(
     driven, free = (through_gap(columns, theta_m, at) for columns in motor)
     unknown = np.vstack([structure.plain(np.vstack([free, screw[[BY_GAP, BY_START]]])), structure.free(theta_m.size)])
     skewed = np.vstack([unknown, np.gradient(position[0])])
-    seen, names = structure.plain(driven), (*MOTOR, "pitch")
-    with_pitch = np.vstack([seen, position[3:]])
+    shown, names = structure.plain(driven), (*MOTOR, "pitch")
+    with_pitch = np.vstack([shown, position[3:]])
     return (
-        MotorCase("voltage and position, clocks in step", identifiability(MOTOR, seen, unknown, noise)),
-        MotorCase("voltage and position, delay unknown", identifiability(MOTOR, seen, skewed, noise)),
+        MotorCase("voltage and position, clocks in step", identifiability(MOTOR, shown, unknown, noise)),
+        MotorCase("voltage and position, delay unknown", identifiability(MOTOR, shown, skewed, noise)),
         MotorCase("voltage and position, pitch unknown too", identifiability(names, with_pitch, skewed, noise)),
     )
 

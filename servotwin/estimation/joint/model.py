@@ -2,7 +2,7 @@
 
 From the motor's angle, or, where that is not measured, from the voltage: theta_m = G1 u. The screw follows through the
 gap, the structure answers, and the whole may come late by a delay. The structure's initial state and the encoder's
-offset are linear and found on the way.
+offset are linear unknowns, solved for on the way.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Reduce: TypeAlias = Callable[[Array], Array]
 MOTOR_START = ("speed0", "current0")  # rad/s and A at the first sample, when only the voltage is known
 JUMP = "jump "  # V s: what a jump of the voltage between two samples adds to the area of the line between them
 _EDGE = 2  # samples that interpolation needs beyond the shift
-_ROUNDING = 1e-9  # of a derivative: what the nuisances leave of it below this is none
-_MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0
+_ROUNDING = 1e-9  # of a derivative: a smaller remainder beside the nuisances is rounding
+_MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0  # jumps; least size of one: of the range, over the usual difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class JointModel:
 
     @property
     def rate(self) -> float:
-        """Hz."""
+        """Sample rate, Hz."""
         return self.window.sample_rate
 
     @property
@@ -112,7 +112,7 @@ class JointModel:
         return servo, theta_m, self.gap_at(theta_m, values)
 
     def gap_at(self, theta_m: Array, values: Mapping[str, float]) -> Gap:
-        """The play operator's arguments."""
+        """Arguments of the play operator."""
         gap = values["gap"]
         return Gap(gap, float(theta_m[0]) + 0.5 * gap * values["place"], values.get("gap rate", 0.0) / self.rate)
 
@@ -140,24 +140,24 @@ class JointModel:
         servo = self.adapted(values)
         theta_m, by_motor = self.motor(servo, values)
         at = self.gap_at(theta_m, values)
-        seen = contacts(theta_m, at)
+        screw = contacts(theta_m, at)
         structure = structure_family(servo).select(self.of_structure).sampled(self.rate)
         shift = values.get("delay", 0.0) * self.rate
-        forced = self.delayed(structure.plain(seen[:1]), shift)
+        forced = self.delayed(structure.plain(screw[:1]), shift)
         rows = reduce(np.vstack([self.measured - forced, self.nuisances(structure, shift)]))
         weights = np.linalg.lstsq(rows[1:].T, rows[0], rcond=None)[0]
-        tangents = self._tangents(seen, theta_m, at, by_motor, values)
-        derivatives = self._derivatives(structure, seen, weights[:-1], tangents)
+        tangents = self._tangents(screw, theta_m, at, by_motor, values)
+        derivatives = self._derivatives(structure, screw, weights[:-1], tangents)
         return np.vstack([rows, reduce(np.array([self._row(derivatives[name], name, shift) for name in self.names]))])
 
     def _tangents(
-        self, seen: Array, theta_m: Array, at: Gap, by_motor: Mapping[str, Array], values: Mapping[str, float]
+        self, screw: Array, theta_m: Array, at: Gap, by_motor: Mapping[str, Array], values: Mapping[str, float]
     ) -> dict[str, Array]:
         """(n,) derivatives of the screw's angle by the parameters that move it."""
         moved = {
-            "gap": seen[BY_GAP] + 0.5 * values["place"] * seen[BY_START],
-            "place": 0.5 * values["gap"] * seen[BY_START],
-            "gap rate": seen[BY_RATE] / self.rate,
+            "gap": screw[BY_GAP] + 0.5 * values["place"] * screw[BY_START],
+            "place": 0.5 * values["gap"] * screw[BY_START],
+            "gap rate": screw[BY_RATE] / self.rate,
         }
         if by_motor:
             passed = through_gap(np.array(list(by_motor.values())), theta_m, at)
@@ -165,10 +165,10 @@ class JointModel:
         return {name: row for name, row in moved.items() if name in self.names}
 
     def _derivatives(
-        self, structure: Sampled, seen: Array, initial: Array, tangents: Mapping[str, Array]
+        self, structure: Sampled, screw: Array, initial: Array, tangents: Mapping[str, Array]
     ) -> dict[str, Array]:
         """(n,) derivatives of the position at the full rate; "delay" holds the position itself."""
-        whole = structure.respond(seen[SCREW], initial)
+        whole = structure.respond(screw[SCREW], initial)
         moved = structure.plain(np.array(list(tangents.values())))
         return {
             **dict(zip(("delay", *self.of_structure), whole, strict=True)),
@@ -197,7 +197,7 @@ class JointModel:
 
 
 def jumps(voltage: Array) -> tuple[int, ...]:
-    """Samples after which a voltage (n,) jumps: where a controller lets go, takes hold, or has its reference stepped.
+    """Samples after which a voltage (n,) jumps: at the edges of a dead zone, or at a step of the reference.
 
     A jump is a difference that stands out from those before and after it, by much of the range and of what is usual.
     """
@@ -205,8 +205,8 @@ def jumps(voltage: Array) -> tuple[int, ...]:
     usual = 0.5 * (np.abs(change[:-2]) + np.abs(change[2:]))
     excess = np.abs(change[1:-1]) - 2.0 * np.maximum(np.abs(change[:-2]), np.abs(change[2:]))
     telling = excess > max(_TELLING * float(np.ptp(voltage)), _USUAL * float(np.median(usual)))
-    found = np.flatnonzero(telling)
-    largest = found[np.argsort(-excess[found], kind="stable")[:_MOST_JUMPS]]
+    candidates = np.flatnonzero(telling)
+    largest = candidates[np.argsort(-excess[candidates], kind="stable")[:_MOST_JUMPS]]
     return tuple(int(i) + 1 for i in np.sort(largest))
 
 

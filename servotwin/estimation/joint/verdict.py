@@ -35,7 +35,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class JointEstimate:
-    """Gaps and parameters.
+    """Gaps of all windows and the parameters that they share.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class JointEstimate:
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """End of a fit, for one window.
+    """Result of a fit for one window.
 
     Attributes
     ----------
@@ -78,9 +78,9 @@ class JointFit:
         For residuals of variance 1.
     evaluations : int
     objection : str
-        Why nothing may be concluded from it; empty when there is no reason.
+        Reason for which nothing may be concluded from the fit; empty without one.
     contradiction : str
-        Why the model does not belong to the window, other windows say; empty when they do not.
+        Contradiction by the other windows; empty without one.
     """
 
     model: JointModel
@@ -106,28 +106,28 @@ class JointFit:
         return math.hypot(settings.inflation * math.sqrt(variance), settings.numeric_error_rad)
 
 
-def estimate_of(gaps: tuple[GapEstimate, ...], found: JointFit, settings: JointSettings) -> JointEstimate:
-    """The gaps of all windows, and the parameters as the last that counted knows them."""
-    model, covariance = found.model, settings.inflation**2 * found.covariance
+def estimate_of(gaps: tuple[GapEstimate, ...], fit: JointFit, settings: JointSettings) -> JointEstimate:
+    """Assemble the gaps of all windows and the parameters of the last window that counted."""
+    model, covariance = fit.model, settings.inflation**2 * fit.covariance
     stds = dict(zip(model.names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     names = [name for name in model.names if name in SPREADS or name == "delay"]
-    parameters = {name: _parameter(model.servo, name, found.values[name], stds[name]) for name in names}
+    parameters = {name: _parameter(model.servo, name, fit.values[name], stds[name]) for name in names}
     remarks = _remarks(names, stds, settings)
-    return JointEstimate(gaps, parameters, model.names, covariance, model.adapted(found.values), remarks)
+    return JointEstimate(gaps, parameters, model.names, covariance, model.adapted(fit.values), remarks)
 
 
-def stated(found: JointFit, settings: JointSettings) -> GapEstimate:
-    """The estimate of a window's gap that a minimum makes."""
-    model, std = found.model, found.std(settings)
-    status, reasons = _verdict(found, std, settings)
+def window_estimate(fit: JointFit, settings: JointSettings) -> GapEstimate:
+    """Make the gap estimate of a window from its fit."""
+    model, std = fit.model, fit.std(settings)
+    status, reasons = _verdict(fit, std, settings)
     blank = replace(
         no_estimate(model.window.mid_time, reasons, model.servo.version, METHOD),
         status=status,
-        rms=found.rms,
-        evaluations=found.evaluations,
+        rms=fit.rms,
+        evaluations=fit.evaluations,
     )
-    gap, total = found.values["gap"], math.hypot(std, settings.model_error_rad)
-    _, theta_m, at = model.screw(found.values)
+    gap, total = fit.values["gap"], math.hypot(std, settings.model_error_rad)
+    _, theta_m, at = model.screw(fit.values)
     if status is GapStatus.LOWER_BOUND:
         bound = interval_95(pushed(model, theta_m, at).lead, total)[0]
         return replace(blank, gap=bound, interval=(bound, math.inf))
@@ -138,11 +138,11 @@ def stated(found: JointFit, settings: JointSettings) -> GapEstimate:
     return replace(known, theta_d0=first + at.theta_d0)
 
 
-def _verdict(found: JointFit, std: float, settings: JointSettings) -> tuple[GapStatus, tuple[str, ...]]:
+def _verdict(fit: JointFit, std: float, settings: JointSettings) -> tuple[GapStatus, tuple[str, ...]]:
     """Status of the minimum, and the reasons where it is not OK."""
-    if found.objection:
-        return GapStatus.UNIDENTIFIABLE, (found.objection,)
-    mismatch = found.contradiction or mismatched(found, settings)
+    if fit.objection:
+        return GapStatus.UNIDENTIFIABLE, (fit.objection,)
+    mismatch = fit.contradiction or mismatched(fit, settings)
     if mismatch:
         return GapStatus.MODEL_MISMATCH, (mismatch,)
     if not std <= settings.largest_std_rad:
@@ -150,28 +150,28 @@ def _verdict(found: JointFit, std: float, settings: JointSettings) -> tuple[GapS
             f"the gap is known to {math.degrees(std):.3g} deg only" if math.isfinite(std) else "nothing shows the gap"
         )
         return GapStatus.UNIDENTIFIABLE, (f"{known}, and {math.degrees(settings.largest_std_rad):.3g} deg are allowed",)
-    status, reasons = _by_contacts(found, settings.contact_travel_rad)
-    bound = at_bound(found, settings)
+    status, reasons = _by_contacts(fit, settings.contact_travel_rad)
+    bound = at_bound(fit, settings)
     if not bound:
         return status, reasons
     return GapStatus.LOWER_BOUND if status is GapStatus.OK else status, (bound, *reasons)
 
 
-def at_bound(found: JointFit, settings: JointSettings) -> str:
-    """Reason why a fit says no more than that the gap is large: the search ended at its bound; empty otherwise."""
+def at_bound(fit: JointFit, settings: JointSettings) -> str:
+    """Reason for which a fit shows only that the gap is large: the search ended at its bound; empty otherwise."""
     largest = settings.largest_gap_rad
     # A search may stop a little before the bound, so that one standard deviation counts as there.
-    if found.values["gap"] < largest - math.hypot(found.std(settings), settings.model_error_rad):
+    if fit.values["gap"] < largest - math.hypot(fit.std(settings), settings.model_error_rad):
         return ""
     return f"the best fit lies at largest_gap_rad = {math.degrees(largest):.6g} deg: the gap is probably larger"
 
 
-def mismatched(found: JointFit, settings: JointSettings) -> str:
-    """Reason why the model does not belong to the window; empty when it does."""
-    variation = float(np.std(found.model.measured))
-    if variation > 0.0 and found.rms > settings.unexplained * variation:
-        return f"the model leaves {100.0 * found.rms / variation:.0f} % of the measured motion unexplained"
-    for name, value in found.values.items():
+def mismatched(fit: JointFit, settings: JointSettings) -> str:
+    """Reason for which the model does not fit the window; empty where it does."""
+    variation = float(np.std(fit.model.measured))
+    if variation > 0.0 and fit.rms > settings.unexplained * variation:
+        return f"the model leaves {100.0 * fit.rms / variation:.0f} % of the measured motion unexplained"
+    for name, value in fit.values.items():
         if name in SPREADS and abs(value) >= 3.999 * settings.spread(name):
             return f"{name} would have to leave its bounds of four times the spread of {settings.spread(name):.3g}"
         if name == "delay" and abs(value) >= 0.999 * settings.largest_delay_s:
@@ -179,15 +179,15 @@ def mismatched(found: JointFit, settings: JointSettings) -> str:
     return ""
 
 
-def _by_contacts(found: JointFit, needed: float) -> tuple[GapStatus, tuple[str, ...]]:
-    """Pushed both ways, the screw shows the gap; pushed one way only, a bound."""
-    _, theta_m, at = found.model.screw(found.values)
-    seen = pushed(found.model, theta_m, at)
-    if min(seen.forwards, seen.backwards) >= needed:
+def _by_contacts(fit: JointFit, needed: float) -> tuple[GapStatus, tuple[str, ...]]:
+    """Decide by contacts: a screw pushed both ways shows the gap, one pushed one way only a bound."""
+    _, theta_m, at = fit.model.screw(fit.values)
+    motion = pushed(fit.model, theta_m, at)
+    if min(motion.forwards, motion.backwards) >= needed:
         return GapStatus.OK, ()
-    ways = f"{math.degrees(seen.forwards):.3g} deg forwards and {math.degrees(seen.backwards):.3g} deg backwards"
+    ways = f"{math.degrees(motion.forwards):.3g} deg forwards and {math.degrees(motion.backwards):.3g} deg backwards"
     reason = f"the screw was pushed {ways}, and {math.degrees(needed):.3g} deg are needed both ways"
-    far = max(seen.forwards, seen.backwards) >= needed
+    far = max(motion.forwards, motion.backwards) >= needed
     return GapStatus.LOWER_BOUND if far else GapStatus.UNIDENTIFIABLE, (reason,)
 
 
@@ -198,7 +198,7 @@ def pushed(model: JointModel, theta_m: Array, at: Gap) -> Travel:
 
 
 def _parameter(servo: Servo, name: str, value: float, std: float) -> Parameter:
-    """In its own unit."""
+    """Convert a fitted parameter into its own unit."""
     if name in ("delay", "gap rate"):
         return Parameter(value, std)
     own = {
@@ -212,7 +212,7 @@ def _parameter(servo: Servo, name: str, value: float, std: float) -> Parameter:
 
 
 def _remarks(names: list[str], stds: Mapping[str, float], settings: JointSettings) -> tuple[str, ...]:
-    """Name the parameters that the window hardly informed."""
+    """Name the parameters about which the window adds hardly any information."""
     return tuple(
         f"{name} rests on what was known before: the window alone does not show it"
         for name in names

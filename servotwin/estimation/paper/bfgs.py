@@ -105,7 +105,7 @@ def _updated(inverse: Array, moved: Array, turned: Array, fresh: bool) -> Array:
 
 
 def _search(evaluate: Slope, here: _Trial, direction: Array) -> tuple[_Trial, bool]:
-    """A point along `direction` that meets the strong Wolfe conditions and True, else the lowest found and False."""
+    """A point along `direction` that meets the strong Wolfe conditions and True, else the lowest trial and False."""
 
     def trial(step: float) -> _Trial:
         point = here.point + step * direction

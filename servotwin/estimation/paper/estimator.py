@@ -1,7 +1,7 @@
 """The paper's estimator (section 4.1, Eqs 22-23, Appendix): observer, play operator and unconstrained BFGS.
 
 It is kept as published, its bias included: what the observer has not yet forgotten at k_s pulls the gap (erratum E8).
-What is added is only what an answer must say of itself: a spread, and a refusal where the window cannot show the gap.
+Added are a spread, and a refusal where the window cannot show the gap.
 """
 
 from __future__ import annotations
@@ -68,25 +68,25 @@ class PaperVerdict(NamedTuple):
         return NOTHING_KNOWN
 
 
-def judge(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict:
+def judge(residual: PlayResidual, minimum: Minimum, std: float, settings: PaperSettings) -> PaperVerdict:
     """The verdict on a minimum with the statistical standard deviation `std` (rad)."""
-    objection = _objection(residual, found, std, settings)
+    objection = _objection(residual, minimum, std, settings)
     if objection is not None:
         return objection
-    fitted, total = float(found.point[0]) * residual.scale, math.hypot(std, settings.method_error)
+    fitted, total = float(minimum.point[0]) * residual.scale, math.hypot(std, settings.method_error)
     widest = max(0.0, fitted) + NORMAL_95 * total
     if residual.scale < widest:
         moved = f"the motor moved by {math.degrees(residual.scale):.3g} deg"
         return _unknown(f"{moved}, less than the {math.degrees(widest):.3g} deg that the gap may have")
-    verdict = _by_contacts(residual, found, max(0.0, fitted), settings.contact_travel)
+    verdict = _by_contacts(residual, minimum, max(0.0, fitted), settings.contact_travel)
     return _negative(fitted, total) if fitted < 0.0 and verdict.status is GapStatus.OK else verdict
 
 
-def _objection(residual: PlayResidual, found: Minimum, std: float, settings: PaperSettings) -> PaperVerdict | None:
-    """Reason why the minimum does not show the gap; empty when it does."""
-    if not found.converged:
-        return _unknown(f"the minimisation did not converge: {found.message}")
-    share = residual.unexplained(found.cost)
+def _objection(residual: PlayResidual, minimum: Minimum, std: float, settings: PaperSettings) -> PaperVerdict | None:
+    """Verdict where the minimum does not show the gap; None where it may."""
+    if not minimum.converged:
+        return _unknown(f"the minimisation did not converge: {minimum.message}")
+    share = residual.unexplained(minimum.cost)
     if share > settings.unexplained:
         reason = f"the model leaves {100.0 * share:.0f} % of the measured motion unexplained"
         return PaperVerdict(GapStatus.MODEL_MISMATCH, math.nan, (reason,))
@@ -99,16 +99,16 @@ def _objection(residual: PlayResidual, found: Minimum, std: float, settings: Pap
 
 
 def _negative(fitted: float, std: float) -> PaperVerdict:
-    """A minimum at a negative gap: zero when that lies within its spread, otherwise a sign that the model is wrong."""
+    """Verdict on a negative gap: zero when that lies within the spread, otherwise a sign that the model is wrong."""
     reason = f"the best fit has a negative gap of {math.degrees(fitted):.3g} deg"
     if -fitted <= NORMAL_95 * std:
         return PaperVerdict(GapStatus.OK, 0.0, (f"{reason}, taken as 0",))
     return PaperVerdict(GapStatus.MODEL_MISMATCH, math.nan, (reason,))
 
 
-def _by_contacts(residual: PlayResidual, found: Minimum, fitted: float, needed: float) -> PaperVerdict:
-    """Pushed both ways, the screw shows the gap; pushed one way only, that it is as wide as the motor's free travel."""
-    forwards, backwards, free = residual.screw_motion(found.point)
+def _by_contacts(residual: PlayResidual, minimum: Minimum, fitted: float, needed: float) -> PaperVerdict:
+    """Decide by contacts: a screw pushed both ways shows the gap, one pushed one way only the motor's free travel."""
+    forwards, backwards, free = residual.screw_motion(minimum.point)
     if min(forwards, backwards) >= needed:
         return PaperVerdict(GapStatus.OK, fitted, ())
     pushed = f"{math.degrees(forwards):.3g} deg forwards and {math.degrees(backwards):.3g} deg backwards"
@@ -135,7 +135,7 @@ def shortest_window(settings: PaperSettings, sample_rate: float) -> tuple[float,
 def estimate(
     window: Window, servo: Servo, prior: float | GapEstimate | None, settings: PaperSettings | None
 ) -> GapEstimate:
-    """The total gap (rad) that a window with theta_m and position shows.
+    """Estimate the total gap (rad) from a window with theta_m and position.
 
     Parameters
     ----------
@@ -160,12 +160,12 @@ def estimate(
     origin = float(position[0]) if settings.origin == "first" else 0.0
     angle_origin = origin / model.static_gain
     skip = math.ceil(settings.settle_s * window.sample_rate - 1e-9)
-    measured = theta_m - angle_origin, position - origin
-    residual = PlayResidual.of(*measured, window.sample_rate, model, servo.p, skip)
+    theta_m = theta_m - angle_origin
+    residual = PlayResidual.of(theta_m, position - origin, window.sample_rate, model, servo.p, skip)
     previous = prior.gap if isinstance(prior, GapEstimate) else prior
-    start = _start(measured[0], previous or 0.0) / residual.scale
-    found = minimise(residual.slope, start, _GRADIENT_TOLERANCE, _STEP_TOLERANCE, settings.iterations)
-    return _stated(_nothing(window, servo), settings, residual, found, angle_origin)
+    start = _start(theta_m, previous or 0.0) / residual.scale
+    minimum = minimise(residual.slope, start, _GRADIENT_TOLERANCE, _STEP_TOLERANCE, settings.iterations)
+    return _stated(_nothing(window, servo), settings, residual, minimum, angle_origin)
 
 
 def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
@@ -190,12 +190,12 @@ def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
 
 
 def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings) -> str:
-    """Reason why the motor's motion cannot show a gap; empty when it can."""
-    seen = motion(theta_m, sample_rate, settings.rest_speed)
-    if seen.moving == 0.0:
+    """Reason for which the motor's motion cannot show a gap; empty when it can."""
+    course = motion(theta_m, sample_rate, settings.rest_speed)
+    if course.moving == 0.0:
         return f"the motor never moved faster than {settings.rest_speed:.3g} rad/s"
-    if seen.reversals < settings.reversals:
-        return f"the motor changed direction {seen.reversals} times, and {settings.reversals} are needed"
+    if course.reversals < settings.reversals:
+        return f"the motor changed direction {course.reversals} times, and {settings.reversals} are needed"
     return ""
 
 
@@ -206,12 +206,12 @@ def _start(theta_m: Array, prior: float) -> Array:
 
 
 def _stated(
-    blank: GapEstimate, settings: PaperSettings, residual: PlayResidual, found: Minimum, angle_origin: float
+    blank: GapEstimate, settings: PaperSettings, residual: PlayResidual, minimum: Minimum, angle_origin: float
 ) -> GapEstimate:
-    """The estimate that a minimum makes of a blank one."""
-    std = residual.scale * standard_deviation(*residual.sensitivities(found.point), residual.values(found.point))
+    """Fill a blank estimate from a minimum."""
+    std = residual.scale * standard_deviation(*residual.sensitivities(minimum.point), residual.values(minimum.point))
     total = math.hypot(std, settings.method_error)
-    verdict = judge(residual, found, std, settings)
+    verdict = judge(residual, minimum, std, settings)
     known = verdict.status is GapStatus.OK
     return replace(
         blank,
@@ -220,13 +220,13 @@ def _stated(
         std_total=total if known else math.inf,
         interval=verdict.interval(total),
         status=verdict.status,
-        theta_d0=residual.first_screw_angle(verdict.gap, found.point) + angle_origin,
+        theta_d0=residual.first_screw_angle(verdict.gap, minimum.point) + angle_origin,
         reasons=verdict.reasons,
-        rms=residual.unit * math.sqrt(found.cost),
-        evaluations=found.evaluations,
+        rms=residual.unit * math.sqrt(minimum.cost),
+        evaluations=minimum.evaluations,
     )
 
 
 def _nothing(window: Window, servo: Servo, *reasons: str) -> GapEstimate:
-    """An estimate that knows nothing, and why."""
+    """Make the estimate of a window that does not show the gap, with the reasons."""
     return no_estimate(window.mid_time, reasons, servo.version, METHOD)

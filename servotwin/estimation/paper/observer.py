@@ -75,8 +75,8 @@ class LagFilter:
     def subtract_play(self, signal: Array, half: float, start: float, residual: Array) -> None:
         """Take the filtered output of a play operator off `residual`, in place.
 
-        Its half gap is `half`, its output before the first sample `start`. Later passes filter what the first one put
-        out: a play without gap passes its input on unchanged.
+        Its half gap is `half`, its output before the first sample `start`. Later passes filter the first one's
+        output: a play without gap passes its input on unchanged.
         """
         carried = np.empty_like(signal)
         for taps in self._sections():
@@ -109,7 +109,7 @@ def lag_polynomial(numerator: Array, order: int, alpha: float) -> Array:
 def _first_order_hold(order: int, alpha: float, interval: float) -> tuple[Array, Array, Array]:
     """x[k+1] = F x[k] + now u[k] + after u[k+1] of the cascade of `order` lags, for u linear in between.
 
-    Kept, because it is the same in every window, and LAPACK's threads can lose milliseconds over it on a busy machine.
+    Cached, because it is the same in every window and LAPACK's threads can lose milliseconds over it on a busy machine.
     """
     augmented = np.zeros((order + 2, order + 2))
     augmented[:order, :order] = alpha * interval * (np.eye(order, k=-1) - np.eye(order))

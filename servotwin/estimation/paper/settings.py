@@ -9,7 +9,7 @@ from typing import Annotated
 from servotwin.config.keys import check, key, settings
 from servotwin.estimation.paper.zero_phase import PADDINGS
 
-ORIGINS = ("absolute", "first")
+_ORIGINS = ("absolute", "first")
 
 
 @settings("estimator")
@@ -55,7 +55,7 @@ class PaperSettings:
     ] = None
     iterations: Annotated[int, key(minimum=1, help="Most iterations of the search.")] = 100
     origin: Annotated[
-        str, key(choices=ORIGINS, help="Where angles and lengths are counted from: zero, or the first sample.")
+        str, key(choices=_ORIGINS, help="Where angles and lengths are counted from: zero, or the first sample.")
     ] = "absolute"
     reversals: Annotated[int, key(minimum=0, help="Least number of times that the motor changes direction.")] = 1
     rest_speed: Annotated[

@@ -1,4 +1,4 @@
-"""Faults of a window's channels, common wrong units and signs, and the motor's angle as the play operator wants it."""
+"""Faults of a window's channels, common wrong units and signs, and the motor's angle filtered for the play operator."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def faults(window: Window) -> tuple[str, ...]:
     """List the faults of theta_m and position, one sentence each."""
     assert window.theta_m is not None
     channels = {"theta_m": (window.theta_m, math.degrees(1.0), "deg"), "position": (window.position, 1e3, "mm")}
-    found = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
-    return tuple(sentence for sentence in found if sentence)
+    sentences = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
+    return tuple(sentence for sentence in sentences if sentence)
 
 
 def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
@@ -52,7 +52,7 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
 
 
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
-    """Samples that stay at an extreme value which was reached at speed."""
+    """Describe samples that stay at an extreme value which was reached at speed; empty without them."""
     run = np.abs(samples[_RUN:] - samples[:-_RUN])
     fastest = float(np.partition(run, -5)[-5])
     for extreme in (float(samples.max()), float(samples.min())):
@@ -67,10 +67,10 @@ def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: st
     return ""
 
 
-def encoder_noise(theta_m: Array) -> float:
+def _encoder_noise(theta_m: Array) -> float:
     """Standard deviation (rad) of the noise on an angle that moves smoothly: third differences leave little else.
 
-    Taken in blocks, of which the median counts: where the voltage jumps, an angle is not smooth. Blocks at rest, where
+    The median over blocks counts, because an angle is not smooth where the voltage jumps. Blocks at rest, where
     a quantised angle shows no noise, do not count.
     """
     differences = np.diff(theta_m, 3)
@@ -80,8 +80,10 @@ def encoder_noise(theta_m: Array) -> float:
 
 
 def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -> Array:
-    """(n,) theta_m, low-passed without phase where the encoder is noisy: the play operator ratchets to the extremes of
-    noise. The cut-off goes from 200 Hz for little noise down to 60 Hz.
+    """(n,) theta_m, low-passed without phase where the encoder is noisy.
+
+    The play operator would ratchet to the extremes of the noise. The cut-off goes from 200 Hz for little noise down to
+    60 Hz.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -
     assert window.theta_m is not None
     cutoff, rate = settings.prefilter_hz, window.sample_rate
     if cutoff is None:
-        noise = encoder_noise(window.theta_m)
+        noise = _encoder_noise(window.theta_m)
         if max(noise, resolution / math.sqrt(12.0)) <= _QUIET:
             return window.theta_m
         share = math.log(max(noise, _QUIET) / _QUIET) / math.log(_LOUD / _QUIET)
@@ -115,7 +117,7 @@ _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 
 
 def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float) -> tuple[str, ...]:
-    """The first fault that, undone, lets the model explain the window; nothing when none does, or none is needed."""
+    """Find the first fault whose correction lets the model explain the window; empty where none does or is needed."""
     if unexplained <= _EXPLAINS:
         return ()
     for sentence, angle, position, rate in _candidates(window, theta_m):
@@ -125,7 +127,7 @@ def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: floa
 
 
 def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Array, float]]:
-    """Yield possible faults, with angle, position and rate as they were if that were undone."""
+    """Yield possible faults, each with the corrected angle, position and rate."""
     position, rate = window.position, window.sample_rate
     yield "position and theta_m seem to be swapped", position, theta_m, rate
     yield "position or theta_m seems to have the wrong sign", theta_m, -position, rate
@@ -139,10 +141,10 @@ def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Ar
 
 
 def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> float:
-    """Slow part of what a plain fit leaves, over that of the position."""
+    """Slow part of a plain fit's residual over that of the position."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
-    angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
-    reduction = Reduction.of(angle, seen, response(servo, rate / reduce.factor), skew=False)
+    angle, reduced = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
+    reduction = Reduction.of(angle, reduced, response(servo, rate / reduce.factor), skew=False)
     span = float(np.ptp(angle))
     fit = min(search(reduction.coarse(), gaps_to_try(span, 9), span, 1e-4 * span), key=lambda fit: fit.slopes.cost)
     table = reduction.table(fit.point)

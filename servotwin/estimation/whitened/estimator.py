@@ -1,7 +1,7 @@
 """The default estimator: play operator and exact structure at the full rate, nuisances projected out, noise whitened.
 
 The residual and its derivatives are filtered, never the motor's angle: a filter commutes with the structure, not with
-the play operator. docs/estimator.md explains it and says how well it does.
+the play operator. docs/estimator.md explains it, with its measured accuracy.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def shortest_window(_settings: WhitenedSettings, sample_rate: float) -> tuple[fl
 def estimate(
     window: Window, servo: Servo, prior: float | GapEstimate | None, settings: WhitenedSettings | None
 ) -> GapEstimate:
-    """The total gap (rad) that a window with theta_m and position shows.
+    """Estimate the total gap (rad) from a window with theta_m and position.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def estimate(
     servo : Servo
         The model; that it fits the window is checked.
     prior : float or GapEstimate, optional
-        Total gap, rad: one of the starts, and what is given back when the window says nothing.
+        Total gap, rad: one of the starts, and the result where the window does not show the gap.
     settings : WhitenedSettings, optional
 
     Raises
@@ -67,7 +67,7 @@ def estimate(
 
 @dataclass(frozen=True, eq=False)
 class WindowFit:
-    """A window's fit, before anything is held against it, which takes longer than the fit.
+    """A window's fit before it is judged; judging takes longer than fitting.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class WindowFit:
     prior : float or GapEstimate, optional
     settings : WhitenedSettings
     blank : GapEstimate
-        What is known without the window; its status and reasons are final where the channels are broken.
+        Estimate without the window; its status and reasons are final where the channels are broken.
     angle : (n,) array
         rad, of the motor.
     aligned : AlignedFit, optional
@@ -92,22 +92,22 @@ class WindowFit:
     aligned: AlignedFit | None
 
     def one_sided(self) -> str:
-        """Reason why the window cannot show the gap, which is too little contact; empty when it has enough."""
-        return "" if self.aligned is None else one_sided(_travel(self.aligned.found), self.settings)
+        """Reason for which the window has too little contact to show the gap; empty when it has enough."""
+        return "" if self.aligned is None else one_sided(_travel(self.aligned.whitened), self.settings)
 
     def rms(self) -> float:
-        """m, what the fit leaves."""
-        return math.nan if self.aligned is None else _left(self.aligned.found)
+        """Root mean square of the fit's residual, m."""
+        return math.nan if self.aligned is None else _left(self.aligned.whitened)
 
     def concluded(self) -> GapEstimate:
-        """The estimate, judged."""
+        """Judge the fit and make the estimate."""
         if self.aligned is None:
             return self.blank
-        seen = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
-        status, reasons = judge(seen, self.settings)
+        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
+        status, reasons = judge(evidence, self.settings)
         if status is GapStatus.MODEL_MISMATCH:
-            reasons = (*likely_fault(self.window, self.angle, self.servo, seen.unexplained), *reasons)
-        return _stated(self.blank, seen, status, reasons, self.prior, self.settings)
+            reasons = (*likely_fault(self.window, self.angle, self.servo, evidence.unexplained), *reasons)
+        return _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
 
 
 def fit(
@@ -144,63 +144,63 @@ def _start(prior: float | GapEstimate | None) -> float:
 def _evidence(
     aligned: AlignedFit, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings
 ) -> FitEvidence:
-    found = aligned.found
-    std = settings.calibration * found.std * math.sqrt(max(1.0, found.variance))
-    gain = found.reduction.response.static_gain
-    identifiable = math.isfinite(found.std)
+    result = aligned.whitened
+    std = settings.calibration * result.std * math.sqrt(max(1.0, result.variance))
+    gain = result.reduction.response.static_gain
+    identifiable = math.isfinite(result.std)
     return FitEvidence(
-        aligned,
-        std,
-        profile_interval(found, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
-        _travel(found),
-        model_shift(found, servo, settings.order) if identifiable else ModelShift(0.0, math.inf, "", 0.0),
-        observer_shift(found, servo) if identifiable else (0.0, math.inf),
-        static_lost_motion(angle, window.position, window.sample_rate, gain, found.point.gap),
-        slow_share(found),
+        aligned=aligned,
+        std=std,
+        interval=profile_interval(result, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
+        travel=_travel(result),
+        shift=model_shift(result, servo, settings.order) if identifiable else ModelShift(0.0, math.inf, "", 0.0),
+        observer=observer_shift(result, servo) if identifiable else (0.0, math.inf),
+        lost_motion=static_lost_motion(angle, window.position, window.sample_rate, gain, result.point.gap),
+        unexplained=slow_share(result),
     )
 
 
-def _left(found: WhitenedFit) -> float:
-    """m rms, what the fit leaves."""
-    return float(np.sqrt(np.mean(found.left**2)))
+def _left(result: WhitenedFit) -> float:
+    """Root mean square of the residual, m."""
+    return float(np.sqrt(np.mean(result.left**2)))
 
 
-def _travel(found: WhitenedFit) -> Travel:
+def _travel(result: WhitenedFit) -> Travel:
     """Sum up the screw's motion without the end of the window, to which the last mass cannot have answered."""
-    reduction, model = found.reduction, found.reduction.response
-    kept = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
-    middle = found.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - kept)
-    at = found.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
-    return travel(reduction.theta_m[:kept], at)
+    reduction, model = result.reduction, result.reduction.response
+    count = max(2, reduction.theta_m.size - round(model.unseen / model.interval))
+    middle = result.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - count)
+    at = result.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
+    return travel(reduction.theta_m[:count], at)
 
 
 def _stated(
     blank: GapEstimate,
-    seen: FitEvidence,
+    evidence: FitEvidence,
     status: GapStatus,
     reasons: tuple[str, ...],
     prior: float | GapEstimate | None,
     settings: WhitenedSettings,
 ) -> GapEstimate:
-    """The estimate that the evidence makes of a blank one."""
-    found = seen.aligned.found
-    systematic = math.hypot(settings.model_error, seen.shift.gap)
+    """Fill a blank estimate from the evidence."""
+    fitted = evidence.aligned.whitened
+    systematic = math.hypot(settings.model_error, evidence.shift.gap)
     result = replace(
         blank,
         status=status,
         reasons=reasons,
-        rms=_left(found),
-        evaluations=found.evaluations,
+        rms=_left(fitted),
+        evaluations=fitted.evaluations,
     )
     if status is GapStatus.LOWER_BOUND:
-        bound = lower_bound(seen, settings)
+        bound = lower_bound(evidence, settings)
         return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
     if status is not GapStatus.OK:
         return result
-    total = math.hypot(seen.std, systematic)
-    first = seen.aligned.first + 0.5 * found.point.gap * found.point.place
-    result = replace(result, gap=found.point.gap, std=seen.std, std_total=total, theta_d0=first)
-    result = replace(result, interval=_widened(found.point.gap, seen.interval, systematic))
+    total = math.hypot(evidence.std, systematic)
+    first = evidence.aligned.first + 0.5 * fitted.point.gap * fitted.point.place
+    result = replace(result, gap=fitted.point.gap, std=evidence.std, std_total=total, theta_d0=first)
+    result = replace(result, interval=_widened(fitted.point.gap, evidence.interval, systematic))
     return _combined(result, prior) if settings.combine and isinstance(prior, GapEstimate) else result
 
 
@@ -211,7 +211,7 @@ def _widened(gap: float, interval: Interval, systematic: float) -> Interval:
 
 
 def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
-    """The mean of two estimates, weighted by their total variances."""
+    """Average two estimates, weighted by their total variances."""
     if not (math.isfinite(prior.gap) and math.isfinite(prior.std_total) and prior.std_total > 0.0):
         return estimate
     share = estimate.std_total**2 / (estimate.std_total**2 + prior.std_total**2)
@@ -222,7 +222,7 @@ def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
 
 
 def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:
-    """Make the estimate without the window: the prior."""
+    """Make the estimate without the window: from the prior alone."""
     blank = no_estimate(window.mid_time, model_version=servo.version, method=METHOD)
     if isinstance(prior, GapEstimate):
         return replace(blank, gap=prior.gap, std=prior.std, std_total=prior.std_total, interval=prior.interval)

@@ -45,8 +45,11 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 _PLAIN = 2  # passes before the fit's own share of the noise is put back: too early, it hides a notch
-_EARLY, _PLACES = 1, (-0.85, 0.0, 0.85)  # the pass in which a growing gap is looked at from other places, and these
-_GLANCE = 8  # steps from there
+_EARLY, _PLACES = (
+    1,
+    (-0.85, 0.0, 0.85),
+)  # the pass in which a growing gap is searched from other places, and these places
+_GLANCE = 8  # steps of that search
 _ROUGH, _FINE = 1e-5, 1e-7  # of the cost: what a descent may leave; 1e-7 is below a hundredth of a standard deviation
 _SAME = 1e-3  # of the cost: minima that are no deeper apart are one, or one plain on which the screw rests
 
@@ -95,7 +98,7 @@ class WhitenedFit:
 
 
 def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance: float, count: int) -> list[Point]:
-    """The best few different minima of a window at its low rate, where looking around costs a tenth.
+    """Find the best few different minima of a window at its low rate, at a tenth of the cost.
 
     Parameters
     ----------
@@ -106,7 +109,7 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
     largest, tolerance : float
         rad, of the search.
     count : int
-        At most as many.
+        Most minima.
     """
     misfit = slow.coarse()
     fits = sorted(search(misfit, gaps, largest, tolerance), key=lambda fit: fit.slopes.cost)
@@ -118,8 +121,10 @@ def candidates(slow: Reduction, gaps: Sequence[float], largest: float, tolerance
     return [fit.point for fit in different[:count]]
 
 
-def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60) -> SearchResult:
-    """The lowest of the minima nearest to some points, or of what so many steps lead to."""
+def _best_of(
+    misfit: Misfit, points: Sequence[Point], largest: float, tolerance: float, steps: int = 60
+) -> SearchResult:
+    """Find the lowest of the minima that at most `steps` steps from some points lead to."""
     fits = [descend(misfit, point, largest, tolerance, steps, gain=_ROUGH) for point in points]
     best = min(fits, key=lambda fit: fit.slopes.cost)
     return SearchResult(best.point, best.slopes, sum(fit.evaluations for fit in fits), best.converged)
@@ -128,12 +133,12 @@ def best_of(misfit: Misfit, points: Sequence[Point], largest: float, tolerance: 
 def refine(
     reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float, passes: int, order: int
 ) -> WhitenedFit:
-    """The fit in the noise that it leaves itself, after some passes with autoregressions of at most `order`.
+    """Fit in the noise of the fit's own residual, in some passes with autoregressions of at most `order`.
 
     The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
     """
     white = reduction.coarse()
-    fit = continued(white, best_of(white, points, largest, tolerance), largest, tolerance)
+    fit = continued(white, _best_of(white, points, largest, tolerance), largest, tolerance)
     fit = off_the_plain(white, fit, largest, tolerance)
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
@@ -142,9 +147,9 @@ def refine(
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
         starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
-        fit = best_of(misfit, starts, largest, tolerance)
+        fit = _best_of(misfit, starts, largest, tolerance)
         if reduction.growth and number == _EARLY:
-            others = best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
+            others = _best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
             fit = min(fit, others, key=lambda one: one.slopes.cost)
         evaluations += fit.evaluations
     fit = off_the_plain(misfit, fit, largest, tolerance)
@@ -154,7 +159,7 @@ def refine(
 
 
 def _elsewhere(point: Point) -> list[Point]:
-    """Other places in a growing gap: at a wrong rate a wrong place looks right, and holds the rate where it is."""
+    """Other places in a growing gap: at a wrong rate a wrong place fits, and the rate then stays wrong."""
     return [point._replace(place=place) for place in _PLACES]
 
 
@@ -180,18 +185,18 @@ def estimate_noise(reduction: Reduction, point: Point, noise: Autoregression, or
     return burg(with_noise_put_back(left, table[GAP:], root), order).at_least(reduction.rounding)
 
 
-PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
+_PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
 _ALIGNMENTS, _NARROWEST = 3, 0.01
 _FREE = 2.0  # ranges of the motor up to which gaps are searched: from one range on, the screw rests
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedFit:
-    """A fit, and what it says of the channels.
+    """A fit with the delay between its channels.
 
     Attributes
     ----------
-    found : WhitenedFit
+    whitened : WhitenedFit
     delay : float
         s, by which the position is late.
     span : float
@@ -200,20 +205,20 @@ class AlignedFit:
         rad, the motor's first angle of those that were used.
     """
 
-    found: WhitenedFit
+    whitened: WhitenedFit
     delay: float
     span: float
     first: float
 
     @property
     def largest(self) -> float:
-        """rad, up to where gaps were searched."""
+        """Largest gap of the search, rad."""
         return _FREE * self.span
 
     @property
     def tolerance(self) -> float:
-        """rad, of a search."""
-        return PRECISION * self.span
+        """Accuracy of the search, rad."""
+        return _PRECISION * self.span
 
 
 def align_and_fit(
@@ -228,13 +233,13 @@ def align_and_fit(
     for attempt in range(_ALIGNMENTS):
         ahead, behind = max(-shift, 0), max(shift, 0)
         angle = theta_m[ahead : theta_m.size - behind]
-        seen = position[behind : position.size - ahead]
-        fitted = _fit(angle, seen, rate, servo, points, settings)
-        late = _delay(fitted.found) * rate if settings.skew else 0.0
+        measured = position[behind : position.size - ahead]
+        fitted = _fit(angle, measured, rate, servo, points, settings)
+        late = _delay(fitted.whitened) * rate if settings.skew else 0.0
         if abs(late) <= 0.5 or abs(shift + late) > settings.largest_skew * rate or attempt == _ALIGNMENTS - 1:
             break
-        shift, points = shift + round(late), [fitted.found.point]
-    return AlignedFit(fitted.found, (shift + late) / rate, fitted.span, fitted.first)
+        shift, points = shift + round(late), [fitted.whitened.point]
+    return AlignedFit(fitted.whitened, (shift + late) / rate, fitted.span, fitted.first)
 
 
 def _look_around(
@@ -242,9 +247,11 @@ def _look_around(
 ) -> list[Point]:
     """Find the points from which the search at the full rate begins."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
-    angle, seen = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
+    angle, reduced = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
     model = response(servo, rate / reduce.factor)
-    slow = Reduction.of(angle, seen, model, _offset(settings, model.static_gain, float(theta_m[0]), float(position[0])))
+    slow = Reduction.of(
+        angle, reduced, model, _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
+    )
     span = float(np.ptp(angle))
     starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
     return candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
@@ -258,8 +265,8 @@ def _fit(
     growth = NuisancePrior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
     offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
     reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
-    found = refine(reduction, points, _FREE * span, PRECISION * span, settings.passes, settings.order)
-    return AlignedFit(found, 0.0, span, float(theta_m[0]))
+    result = refine(reduction, points, _FREE * span, _PRECISION * span, settings.passes, settings.order)
+    return AlignedFit(result, 0.0, span, float(theta_m[0]))
 
 
 def gaps_to_try(span: float, count: int) -> list[float]:
@@ -275,15 +282,12 @@ def _offset(settings: WhitenedSettings, gain: float, angle: float, position: flo
     return NuisancePrior(gain * (angle + mean) - position, abs(gain) * std)
 
 
-def _delay(found: WhitenedFit) -> float:
-    """s by which the position is late."""
-    nuisances = least_squares(found.rows[CONSTANT:], found.rows[RESIDUAL]).coefficients
-    fixed = len(found.reduction.fixed())
+def _delay(result: WhitenedFit) -> float:
+    """Delay of the position, s."""
+    nuisances = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients
+    fixed = len(result.reduction.fixed())
     moving = nuisances[fixed:]
     return -float(moving[-1])
-
-
-_PRECISION = 1e-9  # of the motor's range
 
 
 def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:
@@ -298,46 +302,46 @@ def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:
 
 
 _CHI_SQUARED_95 = 3.841458820694124
-_CLOSE, _TRIALS = 0.1, 12
+_CLOSE, _TRIALS = 0.1, 12  # of the allowed rise, at the end of the search; most trials
 _FURTHER = 3.0  # times as far, at most, the next trial lies
 _WELL_WITHIN = 1.0 / _FURTHER**2  # of what is allowed: any less makes no difference to the next trial
 _NEAR = 0.1  # of the gap: closer by, the best place is next to that of the fit, if the spread is not wider
 
 
-def profile_interval(found: WhitenedFit, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
+def profile_interval(result: WhitenedFit, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
     """95 % interval of the gap, rad; 0 or inf where the likelihood has no end on that side.
 
     Parameters
     ----------
     found : WhitenedFit
     std : float
-        rad: where to look first; inf is allowed.
+        rad: first trial; inf is allowed.
     calibration : float
-        Of the standard deviation.
+        Factor of the standard deviation.
     largest : float
         rad: gaps above this are not told from each other.
     tolerance : float
         rad, of the search for the screw's start.
     """
-    allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, found.variance)
+    allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, result.variance)
 
     def rise(gap: float) -> float:
         """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
-        near = abs(gap - found.point.gap) < min(3.0 * std, _NEAR * found.point.gap)
-        places = (found.point.place,) if near else (*same_way(found.point, gap), *PLACES)
+        near = abs(gap - result.point.gap) < min(3.0 * std, _NEAR * result.point.gap)
+        places = (result.point.place,) if near else (*_same_way(result.point, gap), *PLACES)
         lowest = math.inf
         for place in dict.fromkeys(places):
-            fit = descend(found.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
-            lowest = min(lowest, (fit.slopes.cost - found.fit.slopes.cost) / allowed)
+            fit = descend(result.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
+            lowest = min(lowest, (fit.slopes.cost - result.fit.slopes.cost) / allowed)
             if lowest <= _WELL_WITHIN:
                 break
         return lowest
 
     first = min(1.96 * std, 0.5 * largest)
-    return _end(rise, found.point.gap, -first, 0.0), _end(rise, found.point.gap, first, largest)
+    return _end(rise, result.point.gap, -first, 0.0), _end(rise, result.point.gap, first, largest)
 
 
-def same_way(point: Point, gap: float) -> tuple[float, float, float]:
+def _same_way(point: Point, gap: float) -> tuple[float, float, float]:
     """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
 
     A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact
@@ -351,9 +355,9 @@ def same_way(point: Point, gap: float) -> tuple[float, float, float]:
 
 
 def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
-    """Find where `rise` reaches 1 on one side; the far limit counts as 0 or inf.
+    """Find the gap at which `rise` reaches 1 on one side; the far limit counts as 0 or inf.
 
-    When the trials do not suffice, what is known to be above.
+    If the trials do not suffice, the nearest point known to lie outside.
     """
     beyond = math.inf if limit > 0.0 else 0.0
     room = abs(limit - middle)

@@ -1,10 +1,10 @@
 """Evidence for and against a fit, and the verdict: status of an estimate and the reasons for it.
 
-How much of the slow motion the fit leaves (noise is fast or small, a wrong channel is neither); static lost motion at
-rest; whether the gap would move if the model were free. Near the fit, a model that is a little off adds multiples of a
-few known motions to the position: those of a stiffer or more damped structure, of another pitch or scale, of a
-compliant screw. Free within wide tolerances, they take what they can of the residual, and the gap moves with them. So
-does a gap that grows within the window, where it counts as constant.
+Four views of a window count: the slow motion that the fit leaves (noise is fast or small, a wrong channel is neither),
+the static lost motion at rest, the gap in the paper's observer form, and the gap with a free model. Near the fit, a
+model that is a little off adds multiples of a few known motions to the position: those of a stiffer or more damped
+structure, of another pitch or scale, of a compliant screw. Free within wide tolerances, they take what they can of the
+residual, and the gap moves with them. So does a gap that grows within the window, where it counts as constant.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ _SLOW_S = 0.06  # s: motions faster than this are averaged away, twice
 _CHANCE = 6.0  # times what white noise would leave when averaged; decimated, it leaves twice that
 
 
-def slow_share(found: WhitenedFit) -> float:
-    """Slow part of what is left over the slow variation of the position, rms both; 0 where it can be noise.
+def slow_share(result: WhitenedFit) -> float:
+    """Slow part of the residual over the slow variation of the position, rms both; 0 where it can be noise.
 
     Where hardly anything moves, noise is most of the position's own variation, and that is no fault.
     """
-    interval = found.reduction.response.interval * found.reduction.decimation.factor
-    variation = float(np.std(slow(found.reduction.position, interval)))
-    left = found.left
+    interval = result.reduction.response.interval * result.reduction.decimation.factor
+    variation = float(np.std(slow(result.reduction.position, interval)))
+    left = result.left
     remains = _rms(slow(left, interval))
-    if remains <= _CHANCE * averaged_noise(left, interval) and _rms(left) <= loudest(found):
+    if remains <= _CHANCE * _averaged_noise(left, interval) and _rms(left) <= _loudest(result):
         return 0.0
     return remains / variation if variation > 0.0 else math.inf
 
 
-def averaged_noise(values: Array, interval: float) -> float:
-    """rms of the slow part of white noise that is from sample to sample as large as in a signal (m,)."""
-    weights = np.convolve(averaging(interval), averaging(interval))
+def _averaged_noise(values: Array, interval: float) -> float:
+    """rms of the slow part of white noise that has a signal's (m,) differences from sample to sample."""
+    weights = np.convolve(_averaging(interval), _averaging(interval))
     return _rms(np.diff(values)) * math.sqrt(0.5 * float(weights @ weights))
 
 
-def loudest(found: WhitenedFit) -> float:
-    """m: a sensor whose noise hides what the motor does, or does in a turn, measures something else."""
-    reduction = found.reduction
+def _loudest(result: WhitenedFit) -> float:
+    """Largest residual (m rms) that can be noise: as large as the motor's whole motion, or one turn of it."""
+    reduction = result.reduction
     return abs(reduction.response.static_gain) * max(float(np.ptp(reduction.theta_m)), 2.0 * math.pi)
 
 
-def averaging(interval: float) -> Array:
+def _averaging(interval: float) -> Array:
     """Weights (w,) of one average."""
     size = max(1, round(_SLOW_S / interval))
     return np.full(size, 1.0 / size)
@@ -66,7 +66,7 @@ def averaging(interval: float) -> Array:
 
 def slow(values: Array, interval: float) -> Array:
     """A signal (m,) averaged twice."""
-    window = averaging(interval)
+    window = _averaging(interval)
     return np.convolve(np.convolve(values, window, "valid"), window, "valid")
 
 
@@ -74,7 +74,7 @@ def _rms(values: Array) -> float:
     return math.sqrt(float(values @ values) / values.size)
 
 
-_BLOCK_S = 0.1
+_BLOCK_S = 0.1  # length of a block
 _STILL = 0.02  # of the gap: what moves less within a block rests
 
 
@@ -104,14 +104,16 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
 
 _STEP = 1e-3  # relative
 _STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
-TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
+_TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
 GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
 _ALPHA = 40.0  # rad/s, the paper's observer
 
 
 class ModelShift(NamedTuple):
-    """Change of the gap (rad) with the model free, its standard deviation, its main cause in words, and how much more
-    likely the window becomes: twice the logarithm of the ratio, a few for a right model."""
+    """Change of the gap (rad) with the model free, its standard deviation, its main cause in words, and the gain.
+
+    The gain is twice the logarithm of the likelihood ratio: a few for a right model.
+    """
 
     gap: float
     std: float
@@ -119,36 +121,38 @@ class ModelShift(NamedTuple):
     gain: float
 
 
-def model_shift(found: WhitenedFit, servo: Servo, order: int) -> ModelShift:
-    """The gap's move when the model is free within `TOLERANCES`, in the noise that is then left.
+def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
+    """Move of the gap when the model is free within `_TOLERANCES`, in the noise that is then left.
 
-    Whitening takes a wrong model for noise; with the model free it is seen for what it is.
+    Whitening takes the error of a wrong model for noise; a free model takes it up itself.
     """
-    model, reduction = found.reduction.response, found.reduction
-    seen = polygon(reduction.theta_m, found.point.screw(0.0, reduction.rate))
-    screw = seen[:1]
+    model, reduction = result.reduction.response, result.reduction
+    polygons = polygon(reduction.theta_m, result.point.screw(0.0, reduction.rate))
+    screw = polygons[:1]
     here = model.respond(screw)
     motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
     motions.insert(2, here)
-    sizes = list(TOLERANCES.values())
+    sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
-        motions.append(model.respond(seen[BY_RATE:]))
+        motions.append(model.respond(polygons[BY_RATE:]))
         sizes.append(GROWTH * model.interval)
     free = reduction.decimation.rows(np.vstack(motions)) * np.array(sizes)[:, None]
-    table, size = np.vstack([reduction.table(found.point), free]), len(free)
-    shares = _within_tolerance(reduction.prepared(found.noise, table, CONSTANT), size).coefficients
+    table, size = np.vstack([reduction.table(result.point), free]), len(free)
+    shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
     noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
     rows = reduction.prepared(noise, table, CONSTANT)
     solved = _within_tolerance(rows, size)
     own = spread(rows[GAP], rows[PLACE:-size])
     std = math.sqrt(max(0.0, float(solved.deviations[0]) ** 2 - own**2)) if math.isfinite(own) else math.inf
     words = _words(solved.coefficients[-size:], solved.deviations[-size:])
-    gain = 2.0 * table.shape[1] * math.log(found.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
+    gain = (
+        2.0 * table.shape[1] * math.log(result.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
+    )
     return ModelShift(float(solved.coefficients[0]), std, words, gain)
 
 
 def _within_tolerance(rows: Array, free: int) -> LeastSquares:
-    """All coefficients, the last `free` ones expected to be 0 with standard deviation 1."""
+    """Solve for all coefficients; the last `free` ones are expected to be 0 with standard deviation 1."""
     known = np.zeros((len(rows), free))
     known[-free:] = np.eye(free)
     columns = np.hstack([rows, known])
@@ -158,10 +162,10 @@ def _within_tolerance(rows: Array, free: int) -> LeastSquares:
 def _words(shares: Array, deviations: Array) -> str:
     """Describe the direction that is needed most, and its size."""
     index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
-    if index == len(TOLERANCES):
+    if index == len(_TOLERANCES):
         return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
-    name = list(TOLERANCES)[index]
-    return f"a {name} off by {100.0 * TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
+    name = list(_TOLERANCES)[index]
+    return f"a {name} off by {100.0 * _TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
 
 
 @lru_cache(maxsize=32)
@@ -177,16 +181,16 @@ def _neighbours(servo: Servo, sample_rate: float) -> tuple[tuple[Response, float
     return tuple((response(other, sample_rate), size) for other, size in pairs)
 
 
-def observer_shift(found: WhitenedFit, servo: Servo) -> tuple[float, float]:
+def observer_shift(result: WhitenedFit, servo: Servo) -> tuple[float, float]:
     """Return the change of the gap (rad) in the paper's observer form, and its standard deviation.
 
     The observer weights the residual by denominator / (s + alpha)^N; one step of Gauss and Newton in that weight.
     """
-    reduction = found.reduction
+    reduction = result.reduction
     interval = reduction.response.interval * reduction.decimation.factor
     model = observer(servo, _ALPHA)
     weight = LagFilter.sampled(model.denominator, model.order, _ALPHA, interval)
-    table = reduction.table(found.point)
+    table = reduction.table(result.point)
     rows = np.array([weight.respond(row) for row in table])
     basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, interval, table.shape[1])]))
     left = project_out(basis, rows[[RESIDUAL, GAP]])
@@ -194,8 +198,8 @@ def observer_shift(found: WhitenedFit, servo: Servo) -> tuple[float, float]:
     if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
         return 0.0, math.inf
     direction = np.array([weight.respond(left[1][::-1])])[0][::-1] / information
-    noise = found.noise.colour_back(direction)
-    own = found.std
+    noise = result.noise.colour_back(direction)
+    own = result.std
     return float(left[0] @ left[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
 
 
@@ -205,7 +209,7 @@ def _transients(order: int, interval: float, samples: int) -> Array:
     return np.array([time**i * np.exp(-time) for i in range(order)])
 
 
-_SIGMAS = 3.0
+_SIGMAS = 3.0  # standard deviations by which another view may disagree
 _SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
@@ -213,7 +217,7 @@ _UNEXPLAINED = 0.05  # of the position's own slow variation
 
 @dataclass(frozen=True, eq=False)
 class FitEvidence:
-    """Everything that is held against a fit, or for it.
+    """Evidence for and against a fit.
 
     Attributes
     ----------
@@ -229,7 +233,7 @@ class FitEvidence:
     observer : (float, float)
         rad: by the observer form, and the standard deviation of that.
     lost_motion : float
-        rad: range of the lead at rest.
+        rad, range of the lead at rest.
     unexplained : float
         Slow part of the residual over that of the position.
     """
@@ -244,31 +248,31 @@ class FitEvidence:
     unexplained: float
 
 
-def judge(seen: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
-    """Status and reasons.
+def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
+    """Decide status and reasons.
 
-    Where the screw was not pushed as it must, the fitted gap is nobody's: that other views put it elsewhere is no news.
+    Where the screw was not pushed far enough, the fitted gap means nothing, and other views need not agree with it.
     """
-    too_little = one_sided(seen.travel, settings)
-    disagreements = () if too_little else _disagreements(seen, settings)
-    mismatches = tuple(filter(None, (_unexplained(seen), _delayed(seen, settings), *disagreements)))
-    silence = tuple(filter(None, (too_little, _spread(seen, settings))))
-    bound = lower_bound(seen, settings) > _SMALLEST_BOUND and math.isinf(seen.interval[1])
-    if seen.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(seen.interval[1])):
+    too_little = one_sided(evidence.travel, settings)
+    disagreements = () if too_little else _disagreements(evidence, settings)
+    mismatches = tuple(filter(None, (_unexplained(evidence), _delayed(evidence, settings), *disagreements)))
+    silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
+    bound = lower_bound(evidence, settings) > _SMALLEST_BOUND and math.isinf(evidence.interval[1])
+    if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
         return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
 
 
-def lower_bound(seen: FitEvidence, settings: WhitenedSettings) -> float:
-    """rad: what the window contradicts every gap below of, were the model off by its usual error."""
-    return max(0.0, seen.interval[0] - NORMAL_95 * settings.model_error)
+def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:
+    """Gap (rad) below which the window contradicts every gap, even with the model's usual error."""
+    return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error)
 
 
-def one_sided(seen: Travel, settings: WhitenedSettings) -> str:
-    """Pushed both ways the screw shows the gap; pushed one way only when the encoder's offset is known."""
-    forwards, backwards = seen.forwards, seen.backwards
+def one_sided(motion: Travel, settings: WhitenedSettings) -> str:
+    """Reason for which the contacts do not show the gap; with a known offset of the encoder one contact is enough."""
+    forwards, backwards = motion.forwards, motion.backwards
     needed = settings.contact_travel
     enough = min(forwards, backwards) if settings.offset is None else max(forwards, backwards)
     if enough >= needed:
@@ -280,47 +284,49 @@ def one_sided(seen: Travel, settings: WhitenedSettings) -> str:
     )
 
 
-def _spread(seen: FitEvidence, settings: WhitenedSettings) -> str:
-    if math.isinf(seen.std):
+def _spread(evidence: FitEvidence, settings: WhitenedSettings) -> str:
+    if math.isinf(evidence.std):
         return "the measurements do not depend on the gap"
-    if math.isinf(seen.interval[1]):
+    if math.isinf(evidence.interval[1]):
         return "the window contradicts no large gap"
-    gap = seen.aligned.found.point.gap
-    widest = max(seen.std, (seen.interval[1] - gap) / NORMAL_95, (gap - seen.interval[0]) / NORMAL_95)
+    gap = evidence.aligned.whitened.point.gap
+    widest = max(evidence.std, (evidence.interval[1] - gap) / NORMAL_95, (gap - evidence.interval[0]) / NORMAL_95)
     if widest > settings.largest_std:
         return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     return ""
 
 
-def _unexplained(seen: FitEvidence) -> str:
-    if seen.unexplained <= _UNEXPLAINED:
+def _unexplained(evidence: FitEvidence) -> str:
+    if evidence.unexplained <= _UNEXPLAINED:
         return ""
-    return f"the model leaves {100.0 * seen.unexplained:.0f} % of the position's slow motion unexplained"
+    return f"the model leaves {100.0 * evidence.unexplained:.0f} % of the position's slow motion unexplained"
 
 
-def _delayed(seen: FitEvidence, settings: WhitenedSettings) -> str:
-    delay = seen.aligned.delay
+def _delayed(evidence: FitEvidence, settings: WhitenedSettings) -> str:
+    delay = evidence.aligned.delay
     if abs(delay) <= settings.largest_skew:
         return ""
     allowed = 1e3 * settings.largest_skew
     return f"position and theta_m would be {1e3 * delay:+.3g} ms apart, and {allowed:.3g} ms are allowed"
 
 
-def _disagreements(seen: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
+def _disagreements(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
     """List the disagreements of other views of the same window with the fit."""
-    found = []
-    shift, limit = seen.shift, settings.largest_shift
+    sentences = []
+    shift, limit = evidence.shift, settings.largest_shift
     if abs(shift.gap) > max(limit, _SIGMAS * shift.std):
-        found.append(f"with the model free the gap would move by {_deg(shift.gap)}: {shift.words}")
-    if shift.gain > _LIKELIER and _spread(seen, settings):
-        found.append(f"freeing the model makes the window far likelier: {shift.words}")
-    move, std = seen.observer
+        sentences.append(f"with the model free the gap would move by {_deg(shift.gap)}: {shift.words}")
+    if shift.gain > _LIKELIER and _spread(evidence, settings):
+        sentences.append(f"freeing the model makes the window far likelier: {shift.words}")
+    move, std = evidence.observer
     if abs(move) > max(2.0 * limit, _SIGMAS * std):
-        found.append(f"the observer form puts the gap {_deg(move)} away, with a joint spread of {_deg(std)}")
-    gap = seen.aligned.found.point.gap
-    if seen.lost_motion > 1.05 * gap + _SIGMAS * seen.std + settings.contact_travel:
-        found.append(f"the lost motion at rest is {_deg(seen.lost_motion)}, more than the fitted gap of {_deg(gap)}")
-    return tuple(found)
+        sentences.append(f"the observer form puts the gap {_deg(move)} away, with a joint spread of {_deg(std)}")
+    gap = evidence.aligned.whitened.point.gap
+    if evidence.lost_motion > 1.05 * gap + _SIGMAS * evidence.std + settings.contact_travel:
+        sentences.append(
+            f"the lost motion at rest is {_deg(evidence.lost_motion)}, more than the fitted gap of {_deg(gap)}"
+        )
+    return tuple(sentences)
 
 
 def _deg(angle: float) -> str:

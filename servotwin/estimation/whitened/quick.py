@@ -1,8 +1,8 @@
-"""A look at a window in a fraction of a millisecond: the plain fit at a low rate, and how sure that is.
+"""Quick fit of a window in a fraction of a millisecond: the plain fit at a low rate, with its spread.
 
-It says whether a gap is still what it was, and leaves to the estimator what it is now. What is known beforehand makes
-it right: the gap, next to which it looks, and the encoder's offset, without which a window of one contact says nothing
-of the gap. Without the offset the screw's place in the gap is one of several that are tried.
+It tells whether the gap has moved; the estimator tells where to. It needs the gap as known before, next to which it
+searches, and the encoder's offset, without which a window of one contact shows nothing of the gap. Where the offset is
+not known, several places of the screw in the gap are tried.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ from servotwin.plant.signals import Array
 PLACES = (-1.0, -0.6, -0.2, 0.2, 0.6, 1.0)
 STEPS = 16
 _FREE, _PRECISION, _GAIN = 2.0, 1e-5, 1e-7  # ranges of the motor; of the motor's range; of the cost
-_SETTLED, _CLOSE = 0.3, 1e-5  # standard deviations, or of the motor's range, that the gap would still move by
+_LAST_STEP, _CLOSE = 0.3, 1e-5  # largest last step of a converged gap: standard deviations; of the motor's range
 _FLAT = 1e-9  # of the derivative's square: below it nothing shows the gap
 _ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 to 1
 
 
 @dataclass(frozen=True)
 class QuickFit:
-    """The minimum next to a gap.
+    """Minimum next to a gap.
 
     Attributes
     ----------
     gap : float
         rad, total.
     std : float
-        rad: its spread, for noise as coloured as what is left over and an offset known as well as was said; inf where
-        nothing shows the gap.
+        rad: spread for noise coloured like the residual and for the offset's stated spread; inf where nothing shows the
+        gap.
     misfit : float
-        m, root mean square of what is left over.
-    settled : bool
-        Whether the gap would move no more: along a valley in which only the screw's place changes, it need not end.
+        m, root mean square of the residual.
+    converged : bool
+        True where the gap would move no more; the place may still move along a valley that does not change the gap.
     """
 
     gap: float
     std: float
     misfit: float
-    settled: bool
+    converged: bool
 
 
 def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, float] | None = None) -> QuickFit:
-    """Look at a window with theta_m next to a total gap (rad).
+    """Fit a window with theta_m next to a total gap (rad).
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
     costs = [misfit.cost(Point(gap, place)) for place in PLACES]
     start = Point(gap, PLACES[int(np.argmin(costs))])
     both = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
-    # Where noise hides the place, its steps are wild, and hold the gap's back.
+    # Where noise hides the place, its steps are wild and keep the gap from its minimum.
     fit = descend(misfit, both.point, _FREE * span, _PRECISION * span, STEPS, GAP_ONLY, gain=_GAIN)
     count = max(1, misfit.position.size - len(misfit.basis) - 2)
     rms, residual = math.sqrt(fit.slopes.cost / count), fit.slopes.residual
@@ -81,11 +81,11 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
         variance += (offset[1] * _by_offset(reduction, misfit, weights)) ** 2
     std = math.sqrt(variance)
     still = abs(float(weights @ residual))
-    return QuickFit(float(fit.point.gap), std, rms, still <= max(_SETTLED * std, _CLOSE * span))
+    return QuickFit(float(fit.point.gap), std, rms, still <= max(_LAST_STEP * std, _CLOSE * span))
 
 
 def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> Reduction:
-    """Both channels at the rate that the structure needs."""
+    """Decimate both channels to the rate that the structure needs."""
     assert window.theta_m is not None
     angle, position = window.theta_m, window.position
     reduce = decimation(factor_for(response(servo, window.sample_rate), angle.size))
@@ -102,7 +102,7 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> R
 def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
     """(m,) by how much the gap moves per change of each sample; None: nothing shows the gap.
 
-    The place lies within the gap: where the noise (m rms) hides it, it is that which is known of it.
+    The place lies within the gap; where the noise (m rms) hides it, only that is known of it.
     """
     by_gap, by_place = slopes.jacobian
     known = float(by_place @ by_place) + rms * rms / _ANYWHERE

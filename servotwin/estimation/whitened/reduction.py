@@ -24,7 +24,7 @@ class Point(NamedTuple):
     place: float
 
     def screw(self, first: float, rate: float = 0.0) -> Gap:
-        """The same as seen by the play operator, the motor's first angle being `first` (rad)."""
+        """Arguments of the play operator; `first` is the motor's first angle (rad)."""
         return Gap(self.gap, first + 0.5 * self.gap * self.place, rate)
 
 
@@ -55,7 +55,7 @@ class Misfit:
     extra : int
         Rows at the end that no screw's motion reaches: prior knowledge of nuisances.
     rate : float
-        rad per sample: how fast the gap grows.
+        rad per sample: growth of the gap.
     """
 
     theta_m: Array
@@ -83,10 +83,10 @@ class Misfit:
 
     def slopes(self, point: Point) -> MisfitSlopes:
         """Residual and derivatives at a point."""
-        seen = np.empty((4, self.theta_m.size))
-        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), seen)
-        mix_places(seen, point.gap, point.place)
-        rows = self.reduce(self.response.respond(seen[:3]))
+        screw = np.empty((4, self.theta_m.size))
+        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
+        mix_places(screw, point.gap, point.place)
+        rows = self.reduce(self.response.respond(screw[:3]))
         rows[0] -= self.position
         for row in rows:
             remove(self.basis, len(self.basis), row)
@@ -137,9 +137,9 @@ class Reduction:
     rate : float
         rad per sample: the rate at which the screw is followed; what is left of the rate is a nuisance.
     rounding : float
-        m: noise below this is rounding, which changes with every point, and proves nothing.
+        m: noise below this is rounding, which changes with every point and carries no information.
     skew : bool
-        Whether a delay between the channels is a nuisance.
+        True: a delay between the channels is a nuisance.
     """
 
     theta_m: Array
@@ -175,10 +175,10 @@ class Reduction:
 
     def table(self, point: Point) -> Array:
         """(k, m) residual, derivatives of the response by gap and place, nuisances; not whitened."""
-        seen = polygon(self.theta_m, point.screw(0.0, self.rate))
-        mix_places(seen, point.gap, point.place)
-        rows = self.response.respond(seen if self.growth else seen[:BY_RATE])
-        rows = np.vstack([rows, self.response.velocities(seen[:1])]) if self.skew else rows
+        screw = polygon(self.theta_m, point.screw(0.0, self.rate))
+        mix_places(screw, point.gap, point.place)
+        rows = self.response.respond(screw if self.growth else screw[:BY_RATE])
+        rows = np.vstack([rows, self.response.velocities(screw[:1])]) if self.skew else rows
         moving = self.decimation.rows(rows)
         return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:]])
 
@@ -197,8 +197,8 @@ class Reduction:
     def coarse(self) -> Misfit:
         """The misfit in white noise, with the fixed nuisances only: for the first search.
 
-        A constant that is known is taken off: as if it were free, the search would end where it is not, and the noise
-        would be made of what that leaves.
+        A known constant is subtracted. Were it free, the search would end at a wrong gap, and the noise would be
+        estimated from the residual there.
         """
         fixed = self.fixed()
         known = 0.0 if self.offset is None else self.offset.mean * fixed[0]
@@ -242,5 +242,5 @@ def factor_for(model: Response, samples: int) -> int:
     """Choose the decimation: the structure's fastest mode keeps its band, and the window enough samples."""
     rate = 1.0 / model.interval
     fastest = float(np.abs(model.poles).max()) / (2.0 * np.pi)
-    kept = max(_SLOWEST, _SAMPLES_PER_PERIOD * fastest)
-    return max(1, min(int(rate / kept), samples // _FEWEST))
+    least = max(_SLOWEST, _SAMPLES_PER_PERIOD * fastest)
+    return max(1, min(int(rate / least), samples // _FEWEST))

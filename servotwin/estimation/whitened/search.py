@@ -15,7 +15,7 @@ from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower
 _FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
-ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
+_ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
 
 
 class Free(NamedTuple):
@@ -25,7 +25,7 @@ class Free(NamedTuple):
     place: bool
 
 
-BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
+_BOTH, GAP_ONLY, PLACE_ONLY = Free(True, True), Free(True, False), Free(False, True)
 _ROUND = tuple(0.1 * step for step in range(-9, 10))
 _LOWER = 1e-3  # of the cost: how much another place must promise
 _PLAIN = 1e-4  # of the information: below it gap and place are not told apart
@@ -48,7 +48,7 @@ def descend(
     largest: float,
     tolerance: float,
     steps: int = 60,
-    free: Free = BOTH,
+    free: Free = _BOTH,
     gain: float = _GAIN,
 ) -> SearchResult:
     """Descend from a start to the nearest minimum with 0 <= gap <= largest (rad).
@@ -113,7 +113,7 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
         costs = [misfit.cost(point) for point in points]
         lowest = int(np.argmin(costs))
         best.append((costs[lowest], points[lowest]))
-    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, ROUGH) for _, point in best]
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, _ROUGH) for _, point in best]
     return [continued(misfit, fit, largest, tolerance) for fit in near]
 
 
@@ -123,10 +123,10 @@ def continued(misfit: Misfit, fit: SearchResult, largest: float, tolerance: floa
     In contact its place has no derivative, because the contact undoes it at once; that says nothing of a little further
     in. And from a little further in, where the motor only just began to move, next to nothing leads there.
     """
-    ends = [descend(misfit, fit.point, largest, tolerance, gain=ROUGH)]
+    ends = [descend(misfit, fit.point, largest, tolerance, gain=_ROUGH)]
     point = ends[0].point
     inside = [point._replace(place=share * point.place) for share in _WITHIN] if abs(point.place) == 1.0 else []
-    ends += [descend(misfit, start, largest, tolerance, _SHORT, gain=ROUGH) for start in (*inside, *in_contact(point))]
+    ends += [descend(misfit, start, largest, tolerance, _SHORT, gain=_ROUGH) for start in (*inside, *in_contact(point))]
     best = min(ends, key=lambda end: end.slopes.cost)
     evaluations = fit.evaluations + sum(end.evaluations for end in ends)
     return SearchResult(best.point, best.slopes, evaluations, best.converged)
@@ -148,7 +148,7 @@ def off_the_plateau(misfit: Misfit, fit: SearchResult, largest: float, tolerance
     lowest = int(np.argmin(costs))
     if not costs[lowest] < (1.0 - _LOWER) * fit.slopes.cost:
         return fit
-    other = descend(misfit, points[lowest], largest, tolerance, gain=ROUGH)
+    other = descend(misfit, points[lowest], largest, tolerance, gain=_ROUGH)
     best = min(fit, other, key=lambda one: one.slopes.cost)
     return SearchResult(best.point, best.slopes, fit.evaluations + other.evaluations, best.converged)
 
@@ -165,19 +165,19 @@ def off_the_plain(misfit: Misfit, fit: SearchResult, largest: float, tolerance: 
     if a * c - b * b > _PLAIN * a * c:
         return fit
     starts = _edges(misfit.theta_m, fit.point)
-    fits = [fit, *(descend(misfit, start, largest, tolerance, gain=ROUGH) for start in starts)]
+    fits = [fit, *(descend(misfit, start, largest, tolerance, gain=_ROUGH) for start in starts)]
     best = min(fits, key=lambda one: one.slopes.cost)
     return SearchResult(best.point, best.slopes, sum(one.evaluations for one in fits), best.converged)
 
 
 def _edges(theta_m: Array, point: Point) -> list[Point]:
     """Points a little beyond the edge of the plain on which `point` lies."""
-    seen = contacts(theta_m, point.screw(0.0))
-    touched = np.flatnonzero(seen[BY_START] == 0.0)
+    screw = contacts(theta_m, point.screw(0.0))
+    touched = np.flatnonzero(screw[BY_START] == 0.0)
     if not touched.size:
         return []
     first = int(touched[0])
-    side = 1.0 if seen[BY_GAP, first] < 0.0 else -1.0
+    side = 1.0 if screw[BY_GAP, first] < 0.0 else -1.0
     way = 0.5 * point.gap * (1.0 + side * point.place)
     edge = way - float(np.min(side * theta_m[: first + 1]))
     gaps = [(1.0 - share) * edge for share in _BEYOND]

@@ -14,8 +14,8 @@ from servotwin.reproduction.measures import MeasuredCycle, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, ESTIMATE_DEG, STRESS_DEG, FixedFamilyJob, Runs, Square, Trace
 
 GAPS_DEG = (5.0, 10.0, 15.0)  # Fig 9's, as far as the text tells
-OVER_DEG = np.arange(0.0, ESTIMATE_DEG, 0.5)
-UNDER_DEG = np.arange(ESTIMATE_DEG, STRESS_DEG + 0.25, 0.5)
+_OVER_DEG = np.arange(0.0, ESTIMATE_DEG, 0.5)
+_UNDER_DEG = np.arange(ESTIMATE_DEG, STRESS_DEG + 0.25, 0.5)
 MM = 1e3
 
 
@@ -38,15 +38,15 @@ def lost_motion(_runs: Runs) -> Finding:
 def gap_in_eq_16(runs: Runs) -> Finding:
     """Fig 11's angles read as half gaps."""
     total = tuple(2.0 * gap for gap in (0.0, *GAPS_DEG))
-    found = runs.sweep(total)
+    steps = runs.sweep(total)
     why = (
-        f"read so, the total gaps are {_list(total)} deg, of which {_settled(total, found)} settle; Fig 11's runs"
+        f"read so, the total gaps are {_list(total)} deg, of which {_settled(total, steps)} settle; Fig 11's runs"
         " settle when the angle is the total gap"
     )
     values = [
-        (f"amplitude, total gap {gap:g} deg", step.amplitude * MM, "mm") for gap, step in zip(total, found, strict=True)
+        (f"amplitude, total gap {gap:g} deg", step.amplitude * MM, "mm") for gap, step in zip(total, steps, strict=True)
     ]
-    return decided(all(step.settled for step in found), why, *values)
+    return decided(all(step.settled for step in steps), why, *values)
 
 
 @measures("limit-cycle")
@@ -75,31 +75,31 @@ def limit_cycle_growth(runs: Runs) -> Finding:
 def settle(runs: Runs) -> Finding:
     """Fig 11."""
     gaps = (0.0, *GAPS_DEG)
-    found = runs.sweep(gaps)
-    why = f"the runs with gaps of {_settled(gaps, found)} deg settle"
-    biases = [(f"bias, gap {gap:g} deg", step.bias * MM, "mm") for gap, step in zip(gaps, found, strict=True)]
-    return decided(all(step.settled for step in found), why, *_worst(found), *biases)
+    steps = runs.sweep(gaps)
+    why = f"the runs with gaps of {_settled(gaps, steps)} deg settle"
+    biases = [(f"bias, gap {gap:g} deg", step.bias * MM, "mm") for gap, step in zip(gaps, steps, strict=True)]
+    return decided(all(step.settled for step in steps), why, *_worst(steps), *biases)
 
 
 @measures("over-estimate-stable")
 def over_estimate(runs: Runs) -> Finding:
     """Gaps below the estimate; the share over an ensemble beside it."""
-    found = runs.sweep(OVER_DEG)
+    steps = runs.sweep(_OVER_DEG)
     members = [step for gap in (2.0, 5.0, 8.0) for step in runs.ensemble(gap, ESTIMATE_DEG)]
     share = _share(members)
     why = (
-        f"{sum(step.settled for step in found)} of {len(found)} gaps settle from rest; over other amplitudes and"
+        f"{sum(step.settled for step in steps)} of {len(steps)} gaps settle from rest; over other amplitudes and"
         f" initial screw angles {100 * share:.3g} % of {len(members)} runs do"
     )
     return decided(
-        all(step.settled for step in found), why, *_worst(found), ("share of the ensemble", 100 * share, "%")
+        all(step.settled for step in steps), why, *_worst(steps), ("share of the ensemble", 100 * share, "%")
     )
 
 
 @measures("over-estimate-bias")
 def over_estimate_bias(runs: Runs) -> Finding:
     """Spread of the biases over the gaps."""
-    biases = [step.bias for step in runs.sweep(OVER_DEG) if step.settled]
+    biases = [step.bias for step in runs.sweep(_OVER_DEG) if step.settled]
     spread = float(np.ptp(biases)) if biases else math.nan
     why = f"over gaps of 0 to 9.5 deg the bias varies from {min(biases) * MM:.3g} to {max(biases) * MM:.3g} mm"
     return decided(spread > 0.01 * AMPLITUDE, why, ("spread of the bias", spread * MM, "mm"))
@@ -108,7 +108,7 @@ def over_estimate_bias(runs: Runs) -> Finding:
 @measures("bias-not-transparent")
 def bias_not_transparent(runs: Runs) -> Finding:
     """Turns of the bias as a function of the gap."""
-    biases = [step.bias for step in runs.sweep(OVER_DEG) if step.settled]
+    biases = [step.bias for step in runs.sweep(_OVER_DEG) if step.settled]
     turns = int(np.count_nonzero(np.diff(np.sign(np.diff(biases)))))
     why = f"over {len(biases)} gaps in steps of 0.5 deg the bias changes its direction {turns} times"
     return decided(not measure.is_monotone(biases), why, ("changes of direction", turns))
@@ -117,12 +117,12 @@ def bias_not_transparent(runs: Runs) -> Finding:
 @measures("under-estimate-limit")
 def under_estimate(runs: Runs) -> Finding:
     """Largest gap up to which all settle, and largest gap that settles."""
-    found = runs.sweep(UNDER_DEG)
-    settled = [step.settled for step in found]
+    steps = runs.sweep(_UNDER_DEG)
+    settled = [step.settled for step in steps]
     first = settled.index(False) if False in settled else len(settled)
     last = max((i for i, yes in enumerate(settled) if yes), default=-1)
     reproduced = 0 < first < len(settled) and last < first
-    limit, latest = (float(UNDER_DEG[i]) if i >= 0 else math.nan for i in (first - 1, last))
+    limit, latest = (float(_UNDER_DEG[i]) if i >= 0 else math.nan for i in (first - 1, last))
     why = f"every gap settles up to {limit:g} deg, and the largest that settles is {latest:g} deg"
     return decided(reproduced, why, ("all settle up to", limit, "deg"), ("largest that settles", latest, "deg"))
 
@@ -130,10 +130,10 @@ def under_estimate(runs: Runs) -> Finding:
 @measures("dead-zone-too-small")
 def too_small(runs: Runs) -> Finding:
     """Dead zones for 1 and 2 deg with a gap of 10 deg."""
-    found = [runs.settle(10.0, dead_zone) for dead_zone in (1.0, 2.0)]
-    why = "they end with amplitudes of " + " and ".join(f"{step.amplitude * MM:.3g} mm" for step in found)
-    values = [(f"amplitude, dead zone for {n} deg", s.amplitude * MM, "mm") for n, s in enumerate(found, start=1)]
-    return decided(not any(step.settled for step in found), why, *values)
+    steps = [runs.settle(10.0, dead_zone) for dead_zone in (1.0, 2.0)]
+    why = "they end with amplitudes of " + " and ".join(f"{step.amplitude * MM:.3g} mm" for step in steps)
+    values = [(f"amplitude, dead zone for {n} deg", s.amplitude * MM, "mm") for n, s in enumerate(steps, start=1)]
+    return decided(not any(step.settled for step in steps), why, *values)
 
 
 @measures("dead-zone-other-cycle")
@@ -264,8 +264,8 @@ def _list(gaps: Sequence[float]) -> str:
     return ", ".join(f"{gap:g}" for gap in gaps)
 
 
-def _settled(gaps: Sequence[float], found: Sequence[MeasuredStep]) -> str:
-    return _list([gap for gap, step in zip(gaps, found, strict=True) if step.settled]) or "none"
+def _settled(gaps: Sequence[float], steps: Sequence[MeasuredStep]) -> str:
+    return _list([gap for gap, step in zip(gaps, steps, strict=True) if step.settled]) or "none"
 
 
 def _share(members: Sequence[MeasuredStep]) -> float:
@@ -277,5 +277,5 @@ def _worst_bias(members: Sequence[MeasuredStep]) -> float:
     return max((abs(step.bias) for step in members if step.settled), default=math.nan)
 
 
-def _worst(found: Sequence[MeasuredStep]) -> list[tuple[str, float, str]]:
-    return [("largest amplitude at the end", max(step.amplitude for step in found) * MM, "mm")]
+def _worst(steps: Sequence[MeasuredStep]) -> list[tuple[str, float, str]]:
+    return [("largest amplitude at the end", max(step.amplitude for step in steps) * MM, "mm")]

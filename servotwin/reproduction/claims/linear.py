@@ -15,8 +15,8 @@ from servotwin.reproduction import measures as measure
 from servotwin.reproduction.claims.registry import Finding, Verdict, decided, listed, measures
 from servotwin.reproduction.runs import PERIOD, Runs
 
-CROSSOVER, MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
-LOOP_FILTER_HZ = 20.0  # section 4.3
+_CROSSOVER, _MARGIN_DEG = 10.0, 10.0  # rad/s and deg, section 2.2
+_LOOP_FILTER_HZ = 20.0  # section 4.3
 
 
 @measures("crossover")
@@ -31,7 +31,7 @@ def crossover(runs: Runs) -> Finding:
     )
     values = [(f"gain crossover {i + 1}", omega, "rad/s") for i, omega in enumerate(crossovers)]
     return decided(
-        abs(first - CROSSOVER) < 0.01 * CROSSOVER, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s")
+        abs(first - _CROSSOVER) < 0.01 * _CROSSOVER, why, *values, ("-3 dB bandwidth", margins.bandwidth, "rad/s")
     )
 
 
@@ -44,7 +44,7 @@ def phase_margin(runs: Runs) -> Finding:
     count = len(margins.gain_crossovers)
     why = f"the smallest margin over {count} crossover{'s' if count > 1 else ''} is {smallest:.4g} deg"
     return decided(
-        margins.stable and smallest >= MARGIN_DEG,
+        margins.stable and smallest >= _MARGIN_DEG,
         why,
         ("smallest phase margin", smallest, "deg"),
         ("with the 20 Hz loop filter", filtered, "deg"),
@@ -58,12 +58,17 @@ def loop_filter(runs: Runs) -> Finding:
     controller = _with_loop_filter(runs.servo)
     margins = runs.servo.margins(controller)
     smallest = _smallest_margin_deg(margins)
-    kept = margins.stable and smallest >= MARGIN_DEG
+    reproduced = margins.stable and smallest >= _MARGIN_DEG
     state = "stable" if margins.stable else "unstable"
-    why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {MARGIN_DEG:g} deg asked for"
+    why = f"with the filter the loop is {state} and keeps {smallest:.4g} deg of the {_MARGIN_DEG:g} deg asked for"
     before = _smallest_margin_deg(runs.servo.margins())
-    values = (("phase margin with the filter", smallest, "deg"), ("without", before, "deg"), ("stable", margins.stable))
-    return decided(kept, why, *values)
+    return decided(
+        reproduced,
+        why,
+        ("phase margin with the filter", smallest, "deg"),
+        ("without", before, "deg"),
+        ("stable", margins.stable),
+    )
 
 
 @measures("pidtune")
@@ -111,9 +116,14 @@ def pd_bandwidth(runs: Runs) -> Finding:
         f" rad/s {len(stable)} are stable, the best with {best:.3g} deg (Kp = {law.Kp:.5g}, Kd = {law.Kd:.5g},"
         f" Tf = {law.Tf:.3g} s: in effect a lag)"
     )
-    values = (("crossover of the printed PD", first, "rad/s"), ("best margin of a PD at 10 rad/s", best, "deg"))
-    counts = (("filtered PDs tried", len(laws)), ("of them stable", len(stable)))
-    return decided(best < MARGIN_DEG, why, *values, *counts)
+    return decided(
+        best < _MARGIN_DEG,
+        why,
+        ("crossover of the printed PD", first, "rad/s"),
+        ("best margin of a PD at 10 rad/s", best, "deg"),
+        ("filtered PDs tried", len(laws)),
+        ("of them stable", len(stable)),
+    )
 
 
 def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller]:
@@ -123,14 +133,14 @@ def best_pd(servo: Servo, laws: Sequence[Controller]) -> tuple[float, Controller
 
 def pd_family(servo: Servo) -> list[Controller]:
     """Kp (1 + ratio s / (s/pole + 1)) with a gain of 1 at 10 rad/s: leads, lags and right-half-plane zeros."""
-    plant = complex(servo.plant().response(CROSSOVER))
+    plant = complex(servo.plant().response(_CROSSOVER))
     steps = np.geomspace(1e-3, 10.0, 17)
     pairs = [(float(ratio), float(pole)) for ratio in (0.0, *steps, *-steps) for pole in np.geomspace(1.0, 1e3, 25)]
     return [_pd(servo, plant, ratio, pole) for ratio, pole in pairs]
 
 
 def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
-    shape = 1.0 + ratio * 1j * CROSSOVER / (1j * CROSSOVER / pole + 1.0)
+    shape = 1.0 + ratio * 1j * _CROSSOVER / (1j * _CROSSOVER / pole + 1.0)
     gain = 1.0 / abs(shape * plant)
     return servo.controller.replace(Kp=gain, Ki=0.0, Kd=gain * ratio, Tf=1.0 / pole)
 
@@ -138,7 +148,7 @@ def _pd(servo: Servo, plant: complex, ratio: float, pole: float) -> Controller:
 def _pd_margin_deg(servo: Servo, law: Controller) -> float:
     """Smallest phase margin, deg; 0 when it crosses over below 10 rad/s too."""
     margins = servo.margins(law)
-    early = margins.gain_crossovers[0].omega < 0.99 * CROSSOVER
+    early = margins.gain_crossovers[0].omega < 0.99 * _CROSSOVER
     return 0.0 if early else _smallest_margin_deg(margins)
 
 
@@ -175,11 +185,11 @@ def two_resonances(runs: Runs) -> Finding:
     """Local maxima of the closed loop above 1."""
     omega = np.geomspace(0.1, 1000.0, 20001)
     magnitude = np.abs(runs.servo.closed_loop().response(omega))
-    found = [int(i) for i in measure.peaks(magnitude) if magnitude[i] > 1.0]
-    where = " and ".join(f"{omega[i]:.3g} rad/s (gain {magnitude[i]:.3g})" for i in found)
-    values = [(f"resonance {n + 1}", float(omega[i]), "rad/s") for n, i in enumerate(found)]
-    gains = [(f"its gain {n + 1}", float(magnitude[i])) for n, i in enumerate(found)]
-    return decided(len(found) == 2, f"maxima above 1 lie at {where or 'no frequency'}", *values, *gains)
+    maxima = [int(i) for i in measure.peaks(magnitude) if magnitude[i] > 1.0]
+    where = " and ".join(f"{omega[i]:.3g} rad/s (gain {magnitude[i]:.3g})" for i in maxima)
+    values = [(f"resonance {n + 1}", float(omega[i]), "rad/s") for n, i in enumerate(maxima)]
+    gains = [(f"its gain {n + 1}", float(magnitude[i])) for n, i in enumerate(maxima)]
+    return decided(len(maxima) == 2, f"maxima above 1 lie at {where or 'no frequency'}", *values, *gains)
 
 
 @measures("overshoot")
@@ -238,4 +248,4 @@ def _without_integral(servo: Servo) -> Controller:
 
 def _with_loop_filter(servo: Servo) -> Controller:
     """The printed gains with the 20 Hz first-order filter of section 4.3."""
-    return servo.controller.replace(loop_filter_hz=LOOP_FILTER_HZ)
+    return servo.controller.replace(loop_filter_hz=_LOOP_FILTER_HZ)

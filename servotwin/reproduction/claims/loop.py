@@ -14,8 +14,8 @@ from servotwin.reproduction.measures import Array, MeasuredStep
 from servotwin.reproduction.runs import AMPLITUDE, BIPOLAR, FixedFamilyJob, Runs, Square
 from servotwin.reproduction.twin_runs import CONTINUOUS, SAMPLED, TwinFamilyJob, TwinJob, TwinRun, WindowJob
 
-RATE_BITS = 100e6  # bit/s, section 4
-UNBIASED_DEG = 0.05
+_RATE_BITS = 100e6  # bit/s, section 4
+_UNBIASED_DEG = 0.05
 MM = 1e3
 Family = Sequence[Sequence[MeasuredStep]]
 
@@ -33,18 +33,20 @@ def family(runs: Runs, square: Square, exact: bool = False) -> Family:
 @measures_both("always-restabilised")
 def restabilised(runs: Runs, square: Square) -> Finding:
     """Every step of every run settles."""
-    found, sampled = family(runs, square), fig15(runs, square, SAMPLED).trace.steps
-    moving = _unsettled_counts(found)
+    runs_steps, sampled = family(runs, square), fig15(runs, square, SAMPLED).trace.steps
+    moving = _unsettled_counts(runs_steps)
     shown = ", ".join(f"{step} in {count}" for step, count in moving.items())
     why = (
-        f"of {len(found)} runs, whose reference amplitudes differ by 0.1 %, these steps still move after 20 s:"
+        f"of {len(runs_steps)} runs, whose reference amplitudes differ by 0.1 %, these steps still move after 20 s:"
         f" {shown or 'none'}; in one sampled at 5 kHz {_settled_counts([sampled])[0]} of 10 steps settle"
     )
     values = [
-        (f"step {step} not settled, share of the runs", 100.0 * n / len(found), "%") for step, n in moving.items()
+        (f"step {step} not settled, share of the runs", 100.0 * n / len(runs_steps), "%") for step, n in moving.items()
     ]
-    worst = max(step.amplitude for steps in found for step in steps)
-    return decided(not moving, why, *_mean_settled("twin", found), *values, ("largest amplitude", worst * MM, "mm"))
+    worst = max(step.amplitude for steps in runs_steps for step in steps)
+    return decided(
+        not moving, why, *_mean_settled("twin", runs_steps), *values, ("largest amplitude", worst * MM, "mm")
+    )
 
 
 @measures_both("wider-range-than-fixed")
@@ -65,8 +67,13 @@ def settling_lengthened(runs: Runs, square: Square) -> Finding:
         f"the median is {median:.3g} s (longest {max(times):.3g} s) against {linear:.3g} s of the linear loop; updates"
         " take effect 3 s after each step"
     )
-    values = (("median settling time", median, "s"), ("longest", max(times), "s"), ("linear", linear, "s"))
-    return decided(median > linear, why, *values)
+    return decided(
+        median > linear,
+        why,
+        ("median settling time", median, "s"),
+        ("longest", max(times), "s"),
+        ("linear", linear, "s"),
+    )
 
 
 @measures_both("bias-present")
@@ -89,9 +96,14 @@ def bias_under_5_percent(runs: Runs, square: Square) -> Finding:
         f"the worst bias of a run is {low:.2g} to {high:.2g} % of 1 mm, below 5 % in {share:.0f} % of {len(ours)}"
         " runs whose reference amplitudes differ by 0.1 %"
     )
-    values = (("worst bias", high, "%"), ("one run sampled", float(sampled.max()), "%"))
-    known = ("worst with the gap known exactly", float(exact.max()), "%")
-    return decided(high < 5.0, why, ("runs below 5 %", share, "%"), *values, known)
+    return decided(
+        high < 5.0,
+        why,
+        ("runs below 5 %", share, "%"),
+        ("worst bias", high, "%"),
+        ("one run sampled", float(sampled.max()), "%"),
+        ("worst with the gap known exactly", float(exact.max()), "%"),
+    )
 
 
 @measures_both("estimate-good-enough")
@@ -104,8 +116,13 @@ def good_enough(runs: Runs, square: Square) -> Finding:
         f"in the mean {ours:.3g} of 10 steps settle with estimates that are off by up to {error:.2g} deg, and"
         f" {best:.3g} with the true gap sent over the same delays"
     )
-    values = (*_mean_settled("estimates", estimated), *_mean_settled("truth", exact))
-    return decided(ours >= best, why, *values, ("largest error", error, "deg"))
+    return decided(
+        ours >= best,
+        why,
+        *_mean_settled("estimates", estimated),
+        *_mean_settled("truth", exact),
+        ("largest error", error, "deg"),
+    )
 
 
 @measures("update-delay")
@@ -129,18 +146,23 @@ def samples(runs: Runs) -> Finding:
 def transmission(runs: Runs) -> Finding:
     """Time for the two channels, and for the whole message, at 100 Mbit/s."""
     record = fig15(runs)
-    two, whole = (8e3 * max(count) / RATE_BITS for count in (record.channel_bytes, record.message_bytes))
+    two, whole = (8e3 * max(count) / _RATE_BITS for count in (record.channel_bytes, record.message_bytes))
     why = (
         f"two channels of int16 take {two:.4g} ms; our whole message, which also carries voltage and reference, takes"
         f" {whole:.4g} ms; int16 rounds the position by at most {record.quantisation * 1e6:.2g} µm"
     )
-    values = (("two channels", two, "ms"), ("whole message", whole, "ms"))
-    return decided(abs(two - 1.6) < 0.016, why, *values, ("rounding", record.quantisation * 1e6, "µm"))
+    return decided(
+        abs(two - 1.6) < 0.016,
+        why,
+        ("two channels", two, "ms"),
+        ("whole message", whole, "ms"),
+        ("rounding", record.quantisation * 1e6, "µm"),
+    )
 
 
 @measures("router-microseconds")
 def router(_runs: Runs) -> Finding:
-    """Nothing here routes packets."""
+    """No router is simulated."""
     why = "a simulated link has the delay it is given; a router would have to be measured"
     return Finding(Verdict.CANNOT_BE_CHECKED, why, listed())
 
@@ -173,31 +195,31 @@ def _seconds(runs: Runs) -> list[float]:
 def unbiased(runs: Runs) -> Finding:
     """The published estimator on noise-free windows, after 0.25 s and after 0.40 s."""
     errors = {settle: runs.get(WindowJob(runs.preset, settle)) for settle in (0.25, 0.30, 0.40)}
-    means = {settle: float(np.mean(list(found.values()))) for settle, found in errors.items()}
+    means = {settle: float(np.mean(list(by_gap.values()))) for settle, by_gap in errors.items()}
     why = (
         f"its mean error is {means[0.25]:.2g} deg when 0.25 s are left out, {means[0.3]:.2g} deg for 0.30 s and"
         f" {means[0.4]:.2g} deg for 0.40 s: the observer's leftover transient biases it"
     )
     each = [(f"mean error, gap {gap:g} deg", error, "deg") for gap, error in errors[0.25].items()]
     values = [(f"mean error, {settle:g} s left out", mean, "deg") for settle, mean in means.items()]
-    return decided(abs(means[0.25]) < UNBIASED_DEG, why, *values, *each)
+    return decided(abs(means[0.25]) < _UNBIASED_DEG, why, *values, *each)
 
 
-def _settled_counts(found: Family) -> list[int]:
+def _settled_counts(runs_steps: Family) -> list[int]:
     """Number of settled steps, for each run."""
-    return [sum(step.settled for step in steps) for steps in found]
+    return [sum(step.settled for step in steps) for steps in runs_steps]
 
 
-def _unsettled_counts(found: Family) -> dict[int, int]:
+def _unsettled_counts(runs_steps: Family) -> dict[int, int]:
     """Number of runs in which a step does not settle, by the step's number; steps that always settle left out."""
-    counts = Counter(i for steps in found for i, step in enumerate(steps, start=1) if not step.settled)
+    counts = Counter(i for steps in runs_steps for i, step in enumerate(steps, start=1) if not step.settled)
     return dict(sorted(counts.items()))
 
 
-def _mean_settled(name: str, found: Family) -> list[tuple[str, float, str]]:
-    return [(f"settled steps of 10, {name}", float(np.mean(_settled_counts(found))), "")]
+def _mean_settled(name: str, runs_steps: Family) -> list[tuple[str, float, str]]:
+    return [(f"settled steps of 10, {name}", float(np.mean(_settled_counts(runs_steps))), "")]
 
 
-def _worst_biases(found: Family) -> Array:
+def _worst_biases(runs_steps: Family) -> Array:
     """Largest bias of a step, in % of 1 mm, for each run."""
-    return 100.0 / AMPLITUDE * np.max(np.abs([[step.bias for step in steps] for steps in found]), axis=1)
+    return 100.0 / AMPLITUDE * np.max(np.abs([[step.bias for step in steps] for steps in runs_steps]), axis=1)

@@ -66,35 +66,39 @@ def spectrum(_runs: Runs) -> Finding:
 @measures_both("noise-linear-negligible")
 def linear_negligible(runs: Runs, square: Square) -> Finding:
     """The first step."""
-    found, without = (float(deviations(records)[0]) for records in (noisy(runs, square), [quiet(runs, square)]))
+    noisy_std, without = (float(deviations(records)[0]) for records in (noisy(runs, square), [quiet(runs, square)]))
     why = (
-        f"in the last 5 s of step 1 the position's standard deviation is {found * MM:.2g} mm ({without * MM:.2g} mm"
+        f"in the last 5 s of step 1 the position's standard deviation is {noisy_std * MM:.2g} mm ({without * MM:.2g} mm"
         f" without noise), under a measurement noise of {NOISE.std * MM:.2g} mm"
     )
-    values = (("standard deviation, step 1", found * MM, "mm"), ("without noise", without * MM, "mm"))
-    return decided(found < 0.02 * AMPLITUDE, why, *values)
+    return decided(
+        noisy_std < 0.02 * AMPLITUDE,
+        why,
+        ("standard deviation, step 1", noisy_std * MM, "mm"),
+        ("without noise", without * MM, "mm"),
+    )
 
 
 @measures_both("noise-steps-4-5")
 def steps_4_and_5(runs: Runs, square: Square) -> Finding:
     """Steps 4 and 5 with and without noise."""
-    found, without = deviations(noisy(runs, square))[3:5], deviations([quiet(runs, square)])[3:5]
-    reproduced = bool(np.all(found > 0.005 * AMPLITUDE) and np.all(found > 2.0 * without))
+    noisy_stds, without = deviations(noisy(runs, square))[3:5], deviations([quiet(runs, square)])[3:5]
+    reproduced = bool(np.all(noisy_stds > 0.005 * AMPLITUDE) and np.all(noisy_stds > 2.0 * without))
     why = (
-        f"standard deviations of {found[0] * MM:.2g} and {found[1] * MM:.2g} mm, against {without[0] * MM:.1g} and"
-        f" {without[1] * MM:.1g} mm without noise"
+        f"standard deviations of {noisy_stds[0] * MM:.2g} and {noisy_stds[1] * MM:.2g} mm, against"
+        f" {without[0] * MM:.1g} and {without[1] * MM:.1g} mm without noise"
     )
-    values = [(f"standard deviation, step {i}", value * MM, "mm") for i, value in zip((4, 5), found, strict=True)]
+    values = [(f"standard deviation, step {i}", value * MM, "mm") for i, value in zip((4, 5), noisy_stds, strict=True)]
     return decided(reproduced, why, *values)
 
 
 @measures_both("noise-larger-dead-zone")
 def larger_dead_zone(runs: Runs, square: Square) -> Finding:
     """Late steps against steps 4 and 5."""
-    found = deviations(noisy(runs, square))
-    early, late = float(found[3:5].mean()), float(found[7:10].mean())
+    stds = deviations(noisy(runs, square))
+    early, late = float(stds[3:5].mean()), float(stds[7:10].mean())
     why = f"the mean standard deviation is {early * MM:.2g} mm in steps 4 and 5 and {late * MM:.2g} mm in steps 8 to 10"
-    return decided(late < early, why, *_each(found))
+    return decided(late < early, why, *_each(stds))
 
 
 @measures_both("noise-larger-gain")
@@ -123,16 +127,21 @@ def bias_from_noise(runs: Runs, square: Square) -> Finding:
     joint = math.hypot(error, error_without)
     reproduced = abs(mean) - abs(without) > 2.0 * joint
     why = f"the mean error is {mean:.2g} deg with noise and {without:.2g} deg without (difference known to {joint:.1g})"
-    values = (("with noise", mean, "deg"), ("without", without, "deg"), ("joint standard error", joint, "deg"))
-    return decided(reproduced, why, *values)
+    return decided(
+        reproduced,
+        why,
+        ("with noise", mean, "deg"),
+        ("without", without, "deg"),
+        ("joint standard error", joint, "deg"),
+    )
 
 
 @measures_both("noise-copes")
 def copes(runs: Runs, square: Square) -> Finding:
     """Largest swing at the end of any step."""
-    found = [[step.amplitude for step in record.trace.steps] for record in noisy(runs, square)]
-    worst, count = float(np.max(found)), np.size(found)
-    loud = int(np.count_nonzero(np.array(found) >= 0.1 * AMPLITUDE))
+    amplitudes = [[step.amplitude for step in record.trace.steps] for record in noisy(runs, square)]
+    worst, count = float(np.max(amplitudes)), np.size(amplitudes)
+    loud = int(np.count_nonzero(np.array(amplitudes) >= 0.1 * AMPLITUDE))
     percent = 100.0 * worst / AMPLITUDE
     why = f"at the end of a step the position swings by up to {percent:.3g} % of 1 mm; {loud} of {count} exceed 10 %"
     return decided(loud == 0, why, ("largest amplitude", worst * MM, "mm"), ("steps over 10 %", loud))
@@ -144,8 +153,8 @@ def _bias(records: Sequence[TwinRun]) -> tuple[float, float]:
     return float(errors.mean()), float(errors.std(ddof=1) / math.sqrt(errors.size))
 
 
-def _each(found: Array) -> list[tuple[str, float, str]]:
-    return [(f"standard deviation, step {i}", float(value) * MM, "mm") for i, value in enumerate(found, start=1)]
+def _each(stds: Array) -> list[tuple[str, float, str]]:
+    return [(f"standard deviation, step {i}", float(value) * MM, "mm") for i, value in enumerate(stds, start=1)]
 
 
 def _noise() -> Array:

@@ -39,13 +39,13 @@ def matrix(runs: Runs) -> Finding:
     gains, (a3, a2) = one.L, one.denominator[-2:-4:-1]
     printed = one.A.copy()
     printed[1, 0] = -(a3 + gains[1])
-    wanted, found = _coefficients(one.A), _coefficients(printed)
-    error = float(np.abs(found / wanted - 1.0).max())
+    right, from_print = _coefficients(one.A), _coefficients(printed)
+    error = float(np.abs(from_print / right - 1.0).max())
     why = (
-        f"with a3 in the second row the polynomial's s² coefficient is {found[2]:.5g} instead of {wanted[2]:.5g};"
+        f"with a3 in the second row the polynomial's s² coefficient is {from_print[2]:.5g} instead of {right[2]:.5g};"
         f" with a2 ({a2:.5g}) it is right"
     )
-    return decided(error < 1e-9, why, ("largest relative error of a coefficient", error), *_poles(_roots(found)))
+    return decided(error < 1e-9, why, ("largest relative error of a coefficient", error), *_poles(_roots(from_print)))
 
 
 @measures("observer-gains")

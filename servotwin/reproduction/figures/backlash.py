@@ -18,9 +18,9 @@ from servotwin.reproduction.figures.spec import FigureSpec
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import AMPLITUDE, ESTIMATE_DEG, Runs, StepJob, Trace
 
-PLAY_DEG, PLAY_SPAN = 20.0, 5.0  # Fig 7: total gap, and seconds shown
-GAPS_DEG, GAPS_SPAN = (0.0, 5.0, 10.0, 15.0), 8.0  # Figs 9 and 11: total gaps, and seconds shown
-SWITCHING_SPAN = 4.0  # s, Fig 10(b)
+PLAY_DEG, _PLAY_SPAN = 20.0, 5.0  # Fig 7: total gap, and seconds shown
+GAPS_DEG, _GAPS_SPAN = (0.0, 5.0, 10.0, 15.0), 8.0  # Figs 9 and 11: total gaps, and seconds shown
+_SWITCHING_SPAN = 4.0  # s, Fig 10(b)
 
 TraceByGap = Mapping[float, Trace]  # by total gap, deg
 
@@ -36,7 +36,7 @@ class PlayMotion:
 
 def fig7_data(_runs: Runs | None = None) -> PlayMotion:
     """Compute theta_m = (1 + t/10) sin(2 pi t) in rad (erratum E21) through a total gap of 20 deg."""
-    time = np.linspace(0.0, PLAY_SPAN, 5001)
+    time = np.linspace(0.0, _PLAY_SPAN, 5001)
     theta_m = (1.0 + time / 10.0) * np.sin(2.0 * np.pi * time)
     return PlayMotion(time, theta_m, play(theta_m, math.radians(PLAY_DEG), 0.0))
 
@@ -47,7 +47,7 @@ def _fig7_plot(d: PlayMotion) -> Figure:
     waves, against = figure.subplots(1, 2, width_ratios=(1.6, 1.0))
     waves.plot(d.time, d.theta_m * style.DEG, color=style.BLUE, label="motor $θ_m$")
     waves.plot(d.time, d.theta_d * style.DEG, color=style.RED, label="screw $θ_d$")
-    waves.set(xlabel="Time (s)", ylabel="Angle (deg)", xlim=(0.0, PLAY_SPAN))
+    waves.set(xlabel="Time (s)", ylabel="Angle (deg)", xlim=(0.0, _PLAY_SPAN))
     style.legend(waves)
     against.plot(d.theta_m * style.DEG, d.theta_d * style.DEG, color=style.BLACK, linewidth=1.0)
     against.set(xlabel="Motor angle $θ_m$ (deg)", ylabel="Screw angle $θ_d$ (deg)", aspect="equal")
@@ -78,12 +78,12 @@ def _plot_by_gap(d: TraceByGap) -> Figure:
     style.legend(axes[0, 1])
     style.letter(axes[0])
     for last in axes[-1]:
-        last.set(xlabel="Time (s)", xlim=(0.0, GAPS_SPAN))
+        last.set(xlabel="Time (s)", xlim=(0.0, _GAPS_SPAN))
     return figure
 
 
 def _position(axes: Any, gap: float, trace: Trace) -> None:
-    shown = trace.time <= GAPS_SPAN
+    shown = trace.time <= _GAPS_SPAN
     axes.axhline(AMPLITUDE * style.MM, color=style.GREY, linewidth=1.0, linestyle="--", label="reference")
     if trace.tolerance[0] > 0.0:
         band = [(AMPLITUDE + sign * trace.tolerance[0]) * style.MM for sign in (-1.0, 1.0)]
@@ -94,7 +94,7 @@ def _position(axes: Any, gap: float, trace: Trace) -> None:
 
 
 def _angles(axes: Any, trace: Trace) -> None:
-    shown = trace.time <= GAPS_SPAN
+    shown = trace.time <= _GAPS_SPAN
     style.trace(axes, trace.time[shown], trace.theta_m[shown] * style.DEG, style.SKY, "motor $θ_m$", linewidth=2.6)
     style.trace(axes, trace.time[shown], trace.theta_d[shown] * style.DEG, style.RED, "screw $θ_d$", linewidth=1.0)
     axes.set_ylabel("Angle (deg)")
@@ -136,7 +136,7 @@ class DeadZoneJob:
 
 def fig10b_data(runs: Runs) -> DeadZoneSignals:
     """Simulate a 1 mm step with a gap of 10 deg and the dead zone for it, at the full rate."""
-    return runs.get(DeadZoneJob(StepJob(runs.preset, ESTIMATE_DEG, ESTIMATE_DEG, duration=SWITCHING_SPAN)))
+    return runs.get(DeadZoneJob(StepJob(runs.preset, ESTIMATE_DEG, ESTIMATE_DEG, duration=_SWITCHING_SPAN)))
 
 
 def _fig10b_plot(d: DeadZoneSignals) -> Figure:
@@ -150,7 +150,7 @@ def _fig10b_plot(d: DeadZoneSignals) -> Figure:
     upper.set_ylabel("Error (mm)")
     style.legend(upper)
     lower.plot(d.time, d.voltage, color=style.BLACK, linewidth=1.0, label="voltage $u$")
-    lower.set(ylabel="Voltage (V)", xlabel="Time (s)", xlim=(0.0, SWITCHING_SPAN))
+    lower.set(ylabel="Voltage (V)", xlabel="Time (s)", xlim=(0.0, _SWITCHING_SPAN))
     for begin, end in d.open_intervals:
         lower.axvspan(begin, end, color=style.YELLOW, alpha=0.5, linewidth=0.0)
     style.legend(lower)

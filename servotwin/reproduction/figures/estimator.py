@@ -29,11 +29,11 @@ from servotwin.simulation import Run, simulate
 
 GAP = math.radians(10.0)
 FLOOR = 1e-6  # m: white noise on the position
-HALF_PERIOD = 6.0  # s, of the reference
+_HALF_PERIOD = 6.0  # s, of the reference
 SPAN = 1.0  # s, of a window
-WIDEST = math.radians(25.0)
+_WIDEST = math.radians(25.0)
 GAPS, PLACES = 101, 61
-CALM, BEFORE_STEP = 0.0, 0.75  # integral gain over its own, and how long before the step the other windows begin, s
+CALM, _BEFORE_STEP = 0.0, 0.75  # integral gain over its own, and how long before the step the other windows begin, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,17 +80,17 @@ def estimator_data(runs: Runs) -> tuple[WindowPanel, ...]:
     servo = runs.servo
     lively, calm = _run(servo, 1.0), _run(servo, CALM)
     return (
-        _panel("two contacts", servo, lively, HALF_PERIOD),
-        _panel("one contact", servo, calm, HALF_PERIOD - BEFORE_STEP),
-        _panel("at rest", servo, calm, HALF_PERIOD - SPAN - 0.5),
+        _panel("two contacts", servo, lively, _HALF_PERIOD),
+        _panel("one contact", servo, calm, _HALF_PERIOD - _BEFORE_STEP),
+        _panel("at rest", servo, calm, _HALF_PERIOD - SPAN - 0.5),
     )
 
 
 def _run(servo: Servo, integral: float) -> Run:
     controller = servo.controller.replace(Ki=integral * servo.controller.Ki)
-    reference = SquareWave(AMPLITUDE, 2.0 * HALF_PERIOD)
+    reference = SquareWave(AMPLITUDE, 2.0 * _HALF_PERIOD)
     return simulate(
-        servo, HALF_PERIOD + SPAN + 0.1, controller=controller, reference=reference, gap=GAP, sample_rate=RATE
+        servo, _HALF_PERIOD + SPAN + 0.1, controller=controller, reference=reference, gap=GAP, sample_rate=RATE
     )
 
 
@@ -143,7 +143,7 @@ def cost(window: Window, model: Response) -> tuple[Array, Array, Array]:
     """Gap, screw's start and rms residual, (PLACES, GAPS) each; the linear unknowns are at their best everywhere."""
     assert window.theta_m is not None
     misfit = Reduction.of(window.theta_m, window.position, model).coarse()
-    gaps, places = np.meshgrid(np.linspace(0.0, WIDEST, GAPS), np.linspace(-1.0, 1.0, PLACES))
+    gaps, places = np.meshgrid(np.linspace(0.0, _WIDEST, GAPS), np.linspace(-1.0, 1.0, PLACES))
     points = zip(gaps.ravel().tolist(), places.ravel().tolist(), strict=True)
     squares = np.array([misfit.cost(Point(gap, place)) for gap, place in points]).reshape(gaps.shape)
     return gaps, 0.5 * gaps * places, np.sqrt(squares / misfit.position.size)
@@ -210,7 +210,7 @@ def _misfit(axes: Axes, panel: WindowPanel) -> QuadMesh:
     mesh = axes.pcolormesh(gaps, starts, values, norm=norm, cmap="viridis", shading="gouraud", rasterized=True)
     axes.contour(gaps, starts, values, levels=np.geomspace(0.2, 100.0, 12), colors="white", linewidths=0.4, alpha=0.7)
     axes.plot(GAP * style.DEG, panel.start * style.DEG, "o", color="white", markeredgecolor=style.BLACK, markersize=6)
-    axes.set(xlabel="Gap (deg)", xlim=(0.0, WIDEST * style.DEG), facecolor="#EEEEEE")
+    axes.set(xlabel="Gap (deg)", xlim=(0.0, _WIDEST * style.DEG), facecolor="#EEEEEE")
     axes.grid(False)
     axes.set_title(answer(panel.estimate), loc="right", fontsize=8.0)
     return mesh

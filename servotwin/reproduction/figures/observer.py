@@ -17,7 +17,7 @@ from servotwin.reproduction.figures.spec import FigureSpec
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import RATE, Runs
 
-GAP_DEG = 30.0
+_GAP_DEG = 30.0
 INITIAL = np.array([-1.5, 5.0, 0.1, 0.0]) * 1e-3  # y and its first three derivatives: m, m/s, m/s^2, m/s^3
 ALPHAS = (20.0, 40.0, 80.0)
 SPAN = 1.0
@@ -38,7 +38,7 @@ def figA1_data(runs: Runs) -> ObserverOutputs:
     """Simulate Eq 19 through a gap of 30 deg into G2 from the paper's initial state; the observers start at zero."""
     time = np.arange(round(SPAN * RATE) + 1) / RATE
     theta_m = (1.0 + time / 10.0) * np.sin(2.0 * np.pi * time)
-    theta_d = play(theta_m, math.radians(GAP_DEG), 0.0)
+    theta_d = play(theta_m, math.radians(_GAP_DEG), 0.0)
     observers = {alpha: observer(runs.servo, alpha) for alpha in ALPHAS}
     plant = observers[ALPHAS[0]]
     system = (plant.A_o, plant.B[:, None], plant.C[None, :], 0.0)

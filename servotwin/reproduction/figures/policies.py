@@ -41,7 +41,7 @@ class _LineStyle(NamedTuple):
     marker: str
 
 
-LINE_STYLES = {
+_LINE_STYLES = {
     "paper": _LineStyle(style.ORANGE, 3.4, "s"),
     "margin": _LineStyle(style.GREEN, 2.6, "^"),
     "hysteresis": _LineStyle(style.PINK, 1.8, "D"),
@@ -56,7 +56,7 @@ RunsByPolicy = list[tuple[str, TwinRun]]
 
 @dataclass(frozen=True, eq=False)
 class PolicyComparison:
-    """PolicyOutcome of each policy, the servo's own gains, and time (s), reference (m) and gap (rad) of all of them."""
+    """Outcome of each policy, the servo's own gains, and time (s), reference (m) and gap (rad) of all of them."""
 
     outcomes: tuple[PolicyOutcome, ...]
     own: Gains
@@ -127,7 +127,7 @@ def _error(axes: Axes, outcome: PolicyOutcome, reach: float) -> None:
         if not step.settled:
             axes.axvspan(step.begin, step.end, color=style.GREY, alpha=0.22, linewidth=0.0)
     error = (trace.reference - trace.position)[:-1] * style.MM
-    style.trace(axes, trace.time[:-1], error, LINE_STYLES[outcome.policy].color, linewidth=0.9)
+    style.trace(axes, trace.time[:-1], error, _LINE_STYLES[outcome.policy].color, linewidth=0.9)
 
 
 def _title(outcome: PolicyOutcome) -> str:
@@ -146,7 +146,7 @@ def _gap(axes: Axes, ran: RunsByPolicy, d: PolicyComparison) -> None:
         known = [one for one in run.estimates if one.ok]
         times = [one.time + APART * later for one in known]
         values, half = ([getattr(one, name) * style.DEG for one in known] for name in ("gap", "std"))
-        look = LINE_STYLES[policy]
+        look = _LINE_STYLES[policy]
         spread = np.multiply(2.0, half)
         axes.errorbar(
             times, values, spread, fmt=look.marker, color=look.color, markersize=3.5, capsize=1.5, label=policy
@@ -159,8 +159,8 @@ def _in_force(
     axes: Axes, ran: RunsByPolicy, value: Callable[[SettingChange], float], label: str, line: str = "-"
 ) -> None:
     """Draw a value of the setting in force, one staircase per policy."""
-    for policy, run in sorted(ran, key=lambda one: -LINE_STYLES[one[0]].width):
-        look = LINE_STYLES[policy]
+    for policy, run in sorted(ran, key=lambda one: -_LINE_STYLES[one[0]].width):
+        look = _LINE_STYLES[policy]
         axes.step(*_stairs(run, value), line, where="post", color=look.color, linewidth=look.width, label=policy)
     axes.set_ylabel(label)
 
