@@ -18,9 +18,9 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.window import Window
 from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, WindowMessage
 from servotwin.redesign.registry import policy_of
+from servotwin.twin.estimating import Expectation
 from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import Expectation
 
 HONEST = 2  # windows that are answered before a twin falls silent
 FACTOR = 3.0  # of a lie, either way

@@ -16,7 +16,7 @@ from typing import Any
 
 from servotwin.control.controller import Controller
 from servotwin.edge.drive import DriveSample
-from servotwin.edge.packing import CHANNELS, pack
+from servotwin.edge.outlet import CHANNELS, pack
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.recorder import Cut, as_floats
 from servotwin.edge.settings import AgentSettings, Supervision

@@ -18,8 +18,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Policy
+from servotwin.redesign.policy import Evidence, Policy
 from servotwin.simulation import Run, Simulation
 
 REST, DURATION, LAST = 10.0, 60.0, 10.0

@@ -20,9 +20,8 @@ from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import estimator_of
+from servotwin.twin.estimating import Wear, estimator_of
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.wear import Wear
 
 WINDOW = 1.0  # s
 _ROUNDING = 1e-6  # of a sample

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 from servotwin.config.keys import key, settings
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision

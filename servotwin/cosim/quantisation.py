@@ -8,8 +8,7 @@ from servotwin.cosim.loop import Loop
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.simulation import Run
-from servotwin.twin.estimating import decode_window, estimator_of
-from servotwin.twin.wear import Expectation
+from servotwin.twin.estimating import Expectation, decode_window, estimator_of
 
 
 @dataclass(frozen=True)

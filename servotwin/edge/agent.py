@@ -17,8 +17,7 @@ from typing import NamedTuple
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.edge.guard import Instant
-from servotwin.edge.outlet import LocalOutlet, Outlet
-from servotwin.edge.packing import CHANNELS
+from servotwin.edge.outlet import CHANNELS, LocalOutlet, Outlet
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import TIMED, Cut, Floats, Recorder, as_floats

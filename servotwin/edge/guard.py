@@ -1,21 +1,156 @@
-"""Guard: decides whether an update may be applied. A pure function, so that nothing unsafe depends on its caller.
+"""Guard: decides whether an update may be applied, within its limits. Pure: nothing unsafe depends on a caller.
 
 Several updates may be in flight. Each names the version it replaces, and only one that replaces the version in force
 is applied (compare-and-swap); so of two made on the same base the first to arrive wins, and the other is refused.
 Every receipt, every window and every hello names the version in force. The twin has only its newest estimate as its
 goal and, when a receipt says that the goal was refused for its base or version, sends it again on the base the receipt
 names. The newest data therefore win in the end, and no update is ever applied on an assumption that does not hold.
-A repeated update gets its first answer again, so that a lost receipt costs nothing. `servotwin.edge.switch` chooses the
-instant at which an admissible update is applied.
+A repeated update gets its first answer again, so that a lost receipt costs nothing. `servotwin.edge.supervisor` chooses
+the instant at which an admissible update is applied.
 """
 
 from dataclasses import dataclass
+from math import inf
+from typing import Annotated
 
 from msgspec.structs import replace
 
-from servotwin.edge.limits import Limits
+from servotwin.config.keys import check, key, settings
 from servotwin.edge.parameters import Parameters
+from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Reason, Receipt, Update
+
+_SCALED = ("Kp", "Ki", "Kd", "Tf")
+
+
+@settings("limits")
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Limits that an update must respect.
+
+    Where a limit on the tolerance is given in mm and in m, the one in mm counts.
+    """
+
+    minimum: Annotated[float, key("minimum_m", "minimum_mm", minimum=0.0, help="Smallest tolerance.")] = 0.0
+    maximum: Annotated[
+        float,
+        key("maximum_m", "maximum_mm", minimum=0.0, infinite=True, help="Largest tolerance."),
+    ] = inf
+    max_step: Annotated[
+        float,
+        key("max_step_m", "max_step_mm", above=0.0, infinite=True, help="Largest change of it by one update."),
+    ] = inf
+    lifetime_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Largest age of the data when the update is applied, whatever the update itself says.",
+        ),
+    ] = inf
+    interval_s: Annotated[float, key(minimum=0.0, help="Shortest time between two applied updates.")] = 0.0
+    max_rate: Annotated[
+        float,
+        key(
+            "max_rate_m_per_s",
+            "max_rate_mm_per_s",
+            above=0.0,
+            infinite=True,
+            help="Largest change of the tolerance per second since the last update.",
+        ),
+    ] = inf
+    gain_factor: Annotated[
+        float,
+        key(
+            minimum=1.0,
+            infinite=True,
+            help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above.",
+        ),
+    ] = 4.0
+    integral_factor: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            infinite=True,
+            help="Largest Ki, as a multiple of the servo's own: integral action is what makes a loop with a gap cycle. "
+            "0: none.",
+        ),
+    ] = 1.0
+    gain_step: Annotated[
+        float,
+        key(
+            "gain_step_factor",
+            minimum=1.0,
+            infinite=True,
+            help="Largest factor by which one update may change a gain. Ki may fall at once; a gain counts as at least "
+            "the box's lower edge, so that Ki can leave zero.",
+        ),
+    ] = inf
+    gain_rate: Annotated[
+        float,
+        key(
+            "gain_factor_per_s",
+            minimum=1.0,
+            infinite=True,
+            help="Largest factor by which a gain may change per second since the last update.",
+        ),
+    ] = inf
+    feedforward: Annotated[
+        float, key("feedforward_v", minimum=0.0, infinite=True, help="Largest feedforward, either sign.")
+    ] = 0.25
+    patience_s: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            help="Longest time that an update waits for an instant at which the change of the dead zone neither opens "
+            "nor closes the loop; after that it is applied wherever the error is. 0: at once.",
+        ),
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not self.minimum <= self.maximum:
+            raise InvalidInput(f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be in order")
+
+    def allows_tolerance(self, tolerance: float) -> bool:
+        """True where a tolerance (m) is in bounds."""
+        return self.minimum <= tolerance <= self.maximum
+
+    def allows_tolerance_step(self, old: float, new: float, since: float) -> bool:
+        """True where the tolerance (m) may change so far, `since` seconds after the last change."""
+        return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
+
+    def allows_gains(self, gains: Gains, own: Gains) -> bool:
+        """True where gains lie in the box around the servo's own."""
+        scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
+        return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
+
+    def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
+        """True where gains may change so far, `since` seconds after the last change."""
+        factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
+        if factor == inf:
+            return True
+        return all(
+            _in_step(name, getattr(old, name), getattr(new, name), abs(getattr(own, name)) / self.gain_factor, factor)
+            for name in _SCALED
+        )
+
+    def _in_box(self, name: str, value: float, own: float) -> bool:
+        if name == "Ki":
+            return value * own >= 0.0 and abs(value) <= abs(own) * self.integral_factor
+        return value * own >= 0.0 and abs(own) <= self.gain_factor * abs(value) <= self.gain_factor**2 * abs(own)
+
+
+def _in_step(name: str, old: float, new: float, smallest: float, factor: float) -> bool:
+    rises_little = abs(new) <= factor * max(abs(old), smallest)
+    return rises_little and (name == "Ki" or abs(new) * factor >= abs(old))
+
+
+def _power(base: float, exponent: float) -> float:
+    try:
+        return base**exponent
+    except OverflowError:
+        return inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
 from servotwin.control.controller import Controller
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.watch import WatchSettings

@@ -9,7 +9,7 @@ from pathlib import Path
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileParameterStore
-from servotwin.edge.switch import Rules
+from servotwin.edge.supervisor import Rules
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput

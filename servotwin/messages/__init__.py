@@ -5,13 +5,22 @@ known tag are ignored. A window's channels are planar int16 with a scale and an 
 JSON too. SI units throughout. Values that are not known, or bounds that do not exist, are None on the wire.
 """
 
-from servotwin.messages.channels import FINE, Channel, checksum, pack_channel, pack_finely, unpack_channel
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome
 from servotwin.messages.setting import Band, Gains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
-from servotwin.messages.windows import Acknowledge, Hello, WindowMessage
+from servotwin.messages.windows import (
+    FINE,
+    Acknowledge,
+    Channel,
+    Hello,
+    WindowMessage,
+    checksum,
+    pack_channel,
+    pack_finely,
+    unpack_channel,
+)
 
 __all__ = [
     "FINE",

@@ -12,8 +12,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.uncertainty import Range
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.redesign.settling import settling_map
 
 

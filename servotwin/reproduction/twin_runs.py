@@ -20,8 +20,7 @@ from servotwin.estimation.window import Window
 from servotwin.plant.signals import as_pieces
 from servotwin.reproduction.measures import MeasuredStep
 from servotwin.reproduction.runs import BIPOLAR, PERIOD, RATE, Square, Trace
-from servotwin.twin.estimating import Estimator, estimator_of, known_gap
-from servotwin.twin.wear import Expectation
+from servotwin.twin.estimating import Estimator, Expectation, estimator_of, known_gap
 
 PUBLISHED, OURS = paper.METHOD, whitened.METHOD
 SEEDS = (2023, 2024, 2025)  # of the noise; the first is the packaged scenario's

@@ -8,7 +8,7 @@ from typing import TypeVar
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.store import incoming, leases, queries, results
+from servotwin.store import incoming, queries, results
 from servotwin.store.engine import (
     Engines,
     StoreUnavailable,
@@ -117,12 +117,12 @@ class Store:
         servo : str, optional
             Only this one.
         """
-        leased = self._write(lambda c: leases.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
+        leased = self._write(lambda c: results.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
         if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            loaded = leases.load(connection, leased, kinds, per_servo)
-            due = leases.due(connection, leased, now)
+            loaded = results.load(connection, leased, kinds, per_servo)
+            due = results.due(connection, leased, now)
         idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
         if idle:
             self.release(owner, idle)
@@ -130,7 +130,7 @@ class Store:
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
-        self._write(lambda connection: leases.release(connection, owner, servos))
+        self._write(lambda connection: results.release(connection, owner, servos))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first.

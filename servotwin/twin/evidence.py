@@ -32,9 +32,9 @@ from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
+from servotwin.twin.estimating import Expectation, TrendState
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.triage import Glance
-from servotwin.twin.wear import Expectation, TrendState
 
 MAX_STATUS = 300
 """Characters of a status; the rest is in the body."""

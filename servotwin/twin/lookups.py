@@ -17,8 +17,7 @@ from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.uncertainty import Region
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
 
 
 class VerificationRequest(Struct, frozen=True, tag="proof/1"):

@@ -13,14 +13,13 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import Estimator, Observer, estimator_of
+from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of
 from servotwin.twin.lookups import Lookups, LookupState
 from servotwin.twin.requests import Requests, RequestState
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import TwinState, decode_state
 from servotwin.twin.triage import Triage, TriageState
 from servotwin.twin.versions import Versions
-from servotwin.twin.wear import Wear
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from msgspec import Struct
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Setting
 from servotwin.messages.legacy import upgrade
+from servotwin.twin.estimating import Wear
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import RequestState
 from servotwin.twin.triage import TriageState
 from servotwin.twin.versions import Attempts, Versions
-from servotwin.twin.wear import Wear
 
 
 class TwinState(Struct, frozen=True, tag="twin-state/2"):

@@ -28,8 +28,7 @@ from servotwin.messages import (
     finite,
 )
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.estimating import UNUSABLE, DecodedWindow
 from servotwin.twin.evidence import (
     DisturbanceRecord,

@@ -22,8 +22,8 @@ from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
+from servotwin.twin.estimating import Expectation
 from servotwin.twin.settings import TriageSettings
-from servotwin.twin.wear import Expectation
 
 ROUTINE = ("reference", "periodic")
 """Reasons of windows that come anyway; any other says that something is new, or was asked for."""

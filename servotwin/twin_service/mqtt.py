@@ -30,9 +30,9 @@ from servotwin.link.seal import key_of
 from servotwin.messages import InvalidMessage, Refusal
 from servotwin.store.records import PutResult
 from servotwin.twin_service.auth import EdgeGate
+from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
-from servotwin.twin_service.long_poll import LongPolls, seal_messages
 from servotwin.twin_service.monitoring import Metrics
 
 log = logging.getLogger(__name__)

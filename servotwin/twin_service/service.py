@@ -25,12 +25,11 @@ from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
 from servotwin.twin_service.http_app import HttpApp
-from servotwin.twin_service.http_edge import EdgeApi
+from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, BodyReader, RateLimiter, SampleTimeLimiter
-from servotwin.twin_service.long_poll import LongPolls
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.store_executor import FutureBridge, StoreExecutor

@@ -9,7 +9,7 @@ import pytest
 
 from servotwin.cosim import Loop, cosimulate, quantisation
 from servotwin.cosim.scenario import Recording, Scenario
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.estimation.estimate import GapStatus
 from servotwin.link.simulated import Fate, LinkSettings
 from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, WindowMessage

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from servotwin.cosim import Cosimulation
 from servotwin.cosim.scenario import Recording, Scenario
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.estimation import paper
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.link.simulated import Fate, LinkSettings

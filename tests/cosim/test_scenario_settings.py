@@ -9,7 +9,7 @@ from scenario_files import PAPER, SHORT, load, refusal
 from servotwin.config.keys import items_of
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
 from servotwin.edge.watch import WatchSettings

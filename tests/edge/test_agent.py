@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.edge.agent import Agent, ScheduledMessage
-from servotwin.edge.limits import Limits
-from servotwin.edge.packing import MAX_CHANGES
+from servotwin.edge.guard import Limits
+from servotwin.edge.outlet import MAX_CHANGES
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput

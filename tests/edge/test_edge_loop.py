@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servotwin.edge.agent import Agent, ScheduledMessage
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox

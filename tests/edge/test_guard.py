@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from servotwin.edge.guard import Instant, judge
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.switch import Rules, Switch, offer
+from servotwin.edge.supervisor import Rules, Switch, offer
 from servotwin.errors import InvalidInput
 from servotwin.messages import Reason, Receipt, Setting, Update
 

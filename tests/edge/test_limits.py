@@ -8,8 +8,7 @@ from msgspec.structs import replace
 
 from servotwin.control import Controller
 from servotwin.control.gains import gains_of
-from servotwin.edge.guard import Instant, judge
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Reason, Setting, Update

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from servotwin.control import Controller
 from servotwin.control.gains import gains_of
 from servotwin.edge.agent import Agent, ScheduledMessage
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.store import MemoryParameterStore

@@ -10,10 +10,9 @@ from msgspec.structs import replace
 
 from servotwin.control import Controller
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.edge.guard import Instant
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Instant, Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
-from servotwin.edge.switch import PendingUpdate, Rules, Switch, apply_pending, fall_back, is_safe, offer
+from servotwin.edge.supervisor import PendingUpdate, Rules, Switch, apply_pending, fall_back, is_safe, offer
 from servotwin.edge.watch import Violation
 from servotwin.messages import Band, Cause, Fallback, Gains, Reason, Receipt, Setting, Update
 

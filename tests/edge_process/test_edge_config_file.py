@@ -13,7 +13,7 @@ from servotwin.config.table import parse_toml
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision

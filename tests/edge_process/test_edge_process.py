@@ -19,7 +19,7 @@ from stubmachine import StubMachine
 
 import servotwin
 from servotwin.control.controller import Controller
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml

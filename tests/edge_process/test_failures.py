@@ -13,15 +13,14 @@ import pytest
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.edge.drive import DriveLost
-from servotwin.edge.limits import Limits
-from servotwin.edge.outlet import UNFILTERED
-from servotwin.edge.packing import CHANNELS
+from servotwin.edge.guard import Limits
+from servotwin.edge.outlet import CHANNELS, UNFILTERED
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge_process import frame_handler, frames, monitoring
+from servotwin.edge_process import frames, link_process, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
-from servotwin.edge_process.frame_handler import FrameHandler
+from servotwin.edge_process.link_process import FrameHandler
 from servotwin.edge_process.monitoring import TickHistogram
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import StopSignal, run_role
@@ -85,7 +84,7 @@ def test_a_window_that_the_twin_has_is_confirmed_without_the_disk(handler: Frame
 
 
 def test_unwritten_frames_are_bounded(handler: FrameHandler, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_handler, "MOST_UNWRITTEN", 3 * 64)
+    monkeypatch.setattr(link_process, "MOST_UNWRITTEN", 3 * 64)
     assert [handler.handle(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import FileParameterStore, StoredParameters
 from servotwin.edge_process import frames
-from servotwin.edge_process.frame_handler import FrameHandler
+from servotwin.edge_process.link_process import FrameHandler
 from servotwin.edge_process.monitoring import TickHistogram, TroubleLog, summarise
 from servotwin.edge_process.startup import next_boot, stored_parameters
 from servotwin.link.sqlite_outbox import SqliteOutbox

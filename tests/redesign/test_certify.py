@@ -26,7 +26,7 @@ from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy, gap_range
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Evidence
 from servotwin.redesign.settling import settling_map
 from servotwin.simulation import simulate
 

@@ -32,7 +32,7 @@ from servotwin.redesign.certified.lookup_file import build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
+from servotwin.redesign.policy import Evidence
 from servotwin.redesign.registry import policy_of
 from servotwin.twin.settings import TwinSettings
 

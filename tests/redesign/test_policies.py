@@ -6,7 +6,7 @@ import pytest
 
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.limits import Limits
+from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.servo import Servo

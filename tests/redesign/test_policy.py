@@ -8,8 +8,7 @@ import pytest
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.servo import Servo
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import PaperPolicy
+from servotwin.redesign.policy import Evidence, PaperPolicy
 
 SERVO = Servo.preset("paper")
 GOOD = GapEstimate(0.2, 0.01, 0.02, (0.16, 0.24), GapStatus.OK, 0.5)

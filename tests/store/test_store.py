@@ -8,8 +8,8 @@ from store_cases import bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
-from servotwin.store.leases import MAX_LEASE_BYTES
 from servotwin.store.records import Backlog, EvidenceRecord, Lease, MessageKind, OutgoingMessage, PutResult
+from servotwin.store.results import MAX_LEASE_BYTES
 from servotwin.store.schema import bodies, contexts, evidence, messages, outgoing, twins
 from servotwin.store.store import Store, open_store
 

@@ -4,8 +4,8 @@ import socket
 from array import array
 
 from servotwin.control.controller import Controller
-from servotwin.edge.limits import Limits
-from servotwin.edge.packing import CHANNELS
+from servotwin.edge.guard import Limits
+from servotwin.edge.outlet import CHANNELS
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings

@@ -16,9 +16,9 @@ from servotwin.store.group_commit import GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import AccessControl, EdgeGate, Verifiers
+from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
-from servotwin.twin_service.long_poll import LongPolls
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.store_executor import FutureBridge

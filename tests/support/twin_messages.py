@@ -11,12 +11,11 @@ from servotwin.messages import (
     Setting,
     pack_channel,
 )
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
+from servotwin.twin.estimating import Expectation
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import Expectation
 
 PITCH = 3e-4
 

@@ -27,13 +27,12 @@ from servotwin.estimation.window import Window
 from servotwin.messages import pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import decode_window, estimator_of
+from servotwin.twin.estimating import Expectation, decode_window, estimator_of
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import Expectation
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")

@@ -20,12 +20,11 @@ from servotwin.messages import (
     Setting,
     pack_channel,
 )
-from servotwin.twin.estimating import decode_channel, decode_window
+from servotwin.twin.estimating import Expectation, decode_channel, decode_window
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import Expectation
 
 
 def test_a_window_is_acknowledged_and_answered_with_an_update():

@@ -20,13 +20,12 @@ from servotwin.messages import (
 )
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import PaperPolicy, Redesign
+from servotwin.redesign.policy import Evidence, PaperPolicy, Redesign
 from servotwin.simulation import simulate
+from servotwin.twin.estimating import TrendState
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin
-from servotwin.twin.wear import TrendState
 
 
 def test_the_policy_smooths_from_the_gap_it_last_tuned_for():

@@ -38,6 +38,7 @@ from servotwin.messages import (
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
+from servotwin.twin.estimating import TrendState
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.model import TwinModel
@@ -46,7 +47,6 @@ from servotwin.twin.state import decode_state, encode_state
 from servotwin.twin.step import WindowArrival, step
 from servotwin.twin.twin import Twin
 from servotwin.twin.versions import MAX_ENDED_BOOTS, MAX_SETTINGS, Versions
-from servotwin.twin.wear import TrendState
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")

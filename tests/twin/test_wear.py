@@ -14,9 +14,8 @@ from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.trend import Trend, TrendSettings
-from servotwin.twin.estimating import decode_window
+from servotwin.twin.estimating import Expectation, Wear, decode_window
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.wear import Expectation, Wear
 
 STD = math.radians(0.02)
 SETTINGS = TrendSettings.for_wear(math.radians(20.0), 200.0)

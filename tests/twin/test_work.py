@@ -23,11 +23,10 @@ from servotwin.messages.compression import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import step as stepping
-from servotwin.twin.estimating import DecodedWindow
+from servotwin.twin.estimating import DecodedWindow, TrendState
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.wear import TrendState
 from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=65.0, name="axis")

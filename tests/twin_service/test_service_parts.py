@@ -19,6 +19,7 @@ from servotwin.messages import Refusal
 from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
+from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.limits import (
     STATUS,
     BodyReader,
@@ -27,7 +28,6 @@ from servotwin.twin_service.limits import (
     RequestRejected,
     SampleTimeLimiter,
 )
-from servotwin.twin_service.long_poll import LongPolls
 from servotwin.twin_service.monitoring import Counter, Gauge, Histogram, Metrics, configure_logging
 from servotwin.twin_service.twin_file import read_twin
 

@@ -24,8 +24,7 @@ from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Range, Region
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
 _PREFERRED_LEVELS = 2

@@ -20,8 +20,7 @@ from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
-from servotwin.redesign.evidence import Evidence
-from servotwin.redesign.policy import Redesign
+from servotwin.redesign.policy import Evidence, Redesign
 
 # Relative, and V: a smaller change is not worth an update.
 _SAME, _SAME_FEEDFORWARD = 1e-3, 1e-3
