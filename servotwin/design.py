@@ -98,28 +98,20 @@ def stability_map(
     servo : Servo
     controller : Controller, optional
         Continuous; the servo's own by default.
-    tolerance : sequence of float, optional
-        Dead-zone half-width / (p b), b half the gap.
-    gap : sequence of float, optional
-        Total gap, rad.
+    tolerance, gap : sequence of float, optional
+        Dead-zone half-width / (p b), b half the gap; total gap, rad.
     k_dz, estimate : sequence of float
         With `gap`: dead zone / (p estimate), and the estimate of the total gap, rad; without an estimate the true gap.
     amplitude : sequence of float, optional
         Reference step: in p b with `tolerance` (35 by default), in m with `gap` (1 mm by default).
     members : int
         Initial states in each cell.
-    motion : float
-        Extent of the motion that half of them start in.
-    seed : int
-        Seed of the initial states.
-    duration : float
-        Length of every run, s.
-    window : float
-        End of the run in which the position must rest, s.
-    still : float
-        Half the peak-to-peak below which the position rests, m.
+    motion, seed : float, int
+        Extent of the motion that half of them start in; seed of the initial states.
+    duration, window, still : float
+        Length of every run, s; end of it in which the position must rest, s; half the peak-to-peak below which it
+        rests, m.
     threads : int, optional
-        As many as there are processors by default.
 
     Returns
     -------
@@ -131,13 +123,12 @@ def stability_map(
     InvalidInput
         Both or neither of `tolerance` and `gap` are given, or a value is out of its range.
     """
-    if (tolerance is None) == (gap is None):
-        raise InvalidInput("stability map: give either tolerance (in p b) or gap (rad)")
     axes: Axes
-    if tolerance is not None:
+    if tolerance is not None and gap is None:
         axes = RatioAxes(tuple(tolerance), tuple(amplitude or (35.0,)))
+    elif gap is None or tolerance is not None:
+        raise InvalidInput("stability map: give either tolerance (in p b) or gap (rad)")
     else:
-        assert gap is not None
         axes = PhysicalAxes(tuple(gap), tuple(k_dz), tuple(amplitude or (1e-3,)), tuple(estimate))
     settings = MapSettings(servo, axes, controller, members, motion, seed, duration, window, still)
     return StabilityMap(settings, compute_cells(settings, threads))

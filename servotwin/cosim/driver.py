@@ -131,8 +131,15 @@ class Cosimulation:
         self.twin = twin or Twin(
             scenario.name, TwinModel.of(scenario.model, scenario.twin, start, estimator), self.store
         )
-        ways = self._at_twin, self._at_edge, scenario.uplink, scenario.downlink
-        self.link = SimulatedLink(scenario.name, self.clock, *ways, scenario.seed)
+        self.link = SimulatedLink(
+            scenario.name,
+            self.clock,
+            self._at_twin,
+            self._at_edge,
+            scenario.uplink,
+            scenario.downlink,
+            scenario.seed,
+        )
         self.receipts: list[Receipt] = []
         self.fallbacks: list[Fallback] = []
         self.answers: list[Answer] = []

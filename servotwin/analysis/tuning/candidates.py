@@ -140,14 +140,14 @@ class Candidate(NamedTuple):
     integral: float
 
 
-class SearchResult(NamedTuple):
+class ControllerSearch(NamedTuple):
     """The stable candidates, at least one, and the number of candidates evaluated."""
 
     stable: list[Candidate]
     evaluated: int
 
 
-def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Candidate], float]) -> SearchResult:
+def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Candidate], float]) -> ControllerSearch:
     """Search the stable candidates of a type for a crossover (rad/s) and a phase margin (rad), densest where `cost` is
     low.
 
@@ -179,7 +179,7 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
             best = min(stable, key=cost).factors
             be, al = (best.be, _HIGHEST / 4 ** (zoom + 1)), (best.al, _HIGHEST / 4 ** (zoom + 1))
         if stable:
-            return SearchResult(stable, count)
+            return ControllerSearch(stable, count)
     if not possible:
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
     where = f"{wc:g} rad/s and {math.degrees(margin):g} deg there"
