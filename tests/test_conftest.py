@@ -34,6 +34,7 @@ def test_clean():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("body", "errors"), [(THREAD, 1), (TASK, 1), (CLEAN, 0)])
 def test_a_leak_fails_the_test_that_leaks(pytester, request, body, errors):
     pytester.makeconftest((request.path.parent / "conftest.py").read_text())

@@ -36,6 +36,7 @@ def simulated(servo, gap, tolerance, controller, duration, step=1e-3):
     return releases, run.position
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "frequency", "amplitude"),
     [
@@ -110,6 +111,7 @@ def test_scaling_everything_by_a_power_of_two_changes_no_bit():
     assert four.motor_amplitude == 4.0 * one.motor_amplitude
 
 
+@pytest.mark.slow
 def test_the_extremes_are_the_signal_s_own():
     found = orbit(share=0.5)
     _, position = found.signal("position", 20_001)
@@ -133,6 +135,7 @@ def test_the_second_half_mirrors_the_first():
     assert phases[half:] - phases[:half] == pytest.approx(0.5, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_an_orbit_of_148_events_comes_as_one_of_two_mirror_images():
     """A dead zone of 0.4 p gap: ten seconds of hunting, off centre to one side or to the other."""
     one, other = orbit(share=0.4), orbit(share=0.4, gap=2.0 * GAP)
@@ -160,6 +163,7 @@ def random_servo(rng, n):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 5])
 @settings(max_examples=4)
 @given(seed=st.integers(0, 10_000), gap_deg=st.floats(0.5, 30.0), share=st.sampled_from([0.0, 0.3, 0.6]))

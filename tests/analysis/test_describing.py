@@ -44,6 +44,7 @@ def test_paper_is_predicted_at_22_26_degrees():
     assert found.stable
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "table1"])
 @pytest.mark.parametrize("integral", [0.0, 200.0, 18907.6])
 @pytest.mark.parametrize("gain", [1.0, 2.6])
@@ -71,6 +72,7 @@ def _changes(values):
     return corners.any(axis=0) & ~corners.all(axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
 def test_shooting_from_the_prediction_gives_the_orbit_of_the_run(preset):
     servo = Servo.preset(preset)

@@ -3,6 +3,8 @@
 import time
 import warnings
 
+import pytest
+
 from servotwin.analysis.maps.pool import shared, workplace
 
 
@@ -11,6 +13,7 @@ def wait_and_return(task: int) -> int:
     return task
 
 
+@pytest.mark.slow
 def test_closing_with_unfinished_tasks_gives_no_warning():
     """As Ctrl-C does: joblib's warning would stand before the message."""
     with workplace(workers=2), warnings.catch_warnings(record=True) as noted:

@@ -82,6 +82,7 @@ def test_a_proportional_controller_takes_the_margin_it_gets():
         tune(system, Specification(6.0, math.radians(100.0), "P"))
 
 
+@pytest.mark.slow
 @given(
     st.floats(1.0, 8.0),
     st.floats(20.0, 80.0),

@@ -99,6 +99,7 @@ def written(tmp_path_factory):
     return results, json.loads(path.read_text()), console.file.getvalue()
 
 
+@pytest.mark.slow
 def test_json_holds_every_run(written):
     results, document, _ = written
     assert document["schema"] == "servotwin-bench/1"
@@ -142,6 +143,7 @@ def test_contestants_that_are_missing_are_listed(monkeypatch):
     assert "(pip install servotwin[bench])" in console.file.getvalue()
 
 
+@pytest.mark.slow
 def test_start_runs_in_processes_of_their_own():
     (own, *others) = catalogue.start(QUICK).contestants
     assert own.prepare()().size == 0

@@ -45,6 +45,7 @@ def test_threads_change_nothing():
     np.testing.assert_array_equal(one, three)
 
 
+@pytest.mark.slow
 def test_solver_agrees():
     wear = WearWorkload(duration=2.0, period=1.0)
     assert error(solver.wearing(wear), ours.refined_wear(wear)) < 1e-6
@@ -57,6 +58,7 @@ def test_heyoka_agrees():
         assert error(taylor.sweeping(SWEEP, lanes, threads), ours.refined_sweep(SWEEP)) < 1e-8
 
 
+@pytest.mark.slow
 def test_predictors_are_the_observer():
     case, model = fits.cases(WearWorkload(duration=8.0, period=4.0))[2], observer(WEAR.servo, fits.ALPHA)
     theta_m, position = case.window.theta_m, case.window.position

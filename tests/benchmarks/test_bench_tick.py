@@ -13,6 +13,7 @@ from benchmarks.tickloop import PacedDrive
 from servotwin.edge_process.monitoring import BINS, TickHistogram, summarise
 
 
+@pytest.mark.slow
 def test_a_run_counts_every_instant_as_a_sample_or_as_missed() -> None:
     run = tick.measured((1000.0, True, False), 2.5)
     assert run["wake"]["number"] + run["missed"] >= 2500

@@ -52,6 +52,7 @@ def test_scores_are_those_of_the_closed_form() -> None:
     assert (found.scale, found.integral, found.width) == (1.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
     machine = max(machines(MODEL, KNOWN, "bias", 10, 1), key=lambda m: abs(m.input_bias))
     learnt = run_machine(machine, "bias", MODEL, contender("certified", MODEL, KNOWN))
@@ -67,6 +68,7 @@ def test_constants_are_all_different_and_hold_the_calm_one() -> None:
     assert CALM in found.values()
 
 
+@pytest.mark.slow
 def test_the_table_and_its_document() -> None:
     rows = list(compare(MODEL, KNOWN, 3, seed=3, blocks=("clean",)))
     assert [row.name for row in rows[:5]] == ["no dead zone", "paper", "margin", "hysteresis", "certified"]

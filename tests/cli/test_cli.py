@@ -100,6 +100,7 @@ def test_a_bad_scenario_is_refused_before_anything_is_written(scenario, change, 
     assert [path.name for path in scenario.parent.iterdir()] == [scenario.name]
 
 
+@pytest.mark.slow
 def test_a_process_ends_with_2_and_without_traceback(tmp_path):
     result = run_process("simulate", tmp_path / "no.toml", "-o", tmp_path / "run.csv")
     assert result.returncode == 2
@@ -115,6 +116,7 @@ def test_an_interrupt_is_130_and_one_line(scenario, monkeypatch):
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_a_reproduction_can_be_interrupted(tmp_path):
     """Ctrl-C reaches the whole foreground group: parent and workers."""

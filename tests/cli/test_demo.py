@@ -15,6 +15,7 @@ def shown(tmp_path_factory):
     return path, console.file.getvalue()
 
 
+@pytest.mark.slow
 def test_the_terminal_shows_every_step_within_eighty_columns(shown):
     _, text = shown
     rows = [line for line in text.splitlines() if line[:2].strip().isdigit()]
@@ -32,6 +33,7 @@ def test_the_report_stands_alone(shown):
     assert sorted(p.name for p in path.parent.iterdir()) == ["demo.png", "demo.svg", "report.html"]
 
 
+@pytest.mark.slow
 def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does():
     result = demo.compare(*demo.scenarios("paper"), Console(file=io.StringIO()))
     rows = demo.demo_steps(result)

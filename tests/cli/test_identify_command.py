@@ -56,6 +56,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.csv", "run.npz", "run.parquet"])
 def test_every_format_gives_the_gap_and_its_trend(folder, name):
     found = identify(IdentifyOptions(folder / name, gap_limit_deg=10.0))
@@ -128,6 +129,7 @@ def test_the_method_and_the_cut_can_be_chosen(folder):
     assert [window.start for window in cut.windows] == pytest.approx([0.0, 4.7, 9.7])
 
 
+@pytest.mark.slow
 def test_a_calm_loops_log_carries_its_cut(tmp_path):
     calm = SCENARIO.replace("[twin]", "[controller]\nki_v_per_m_s = 0\n[twin]")
     (tmp_path / "calm.toml").write_text(calm)
@@ -183,6 +185,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BAD)
 def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
     change, message = BAD[kind]
@@ -193,6 +196,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
     assert result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

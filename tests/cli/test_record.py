@@ -54,6 +54,7 @@ def expected(written):
     return st.cosimulate(st.Scenario.load(written[".npz"].parent / "scenario.toml")).run
 
 
+@pytest.mark.slow
 def test_npz(written, expected):
     with np.load(written[".npz"]) as result:
         assert [name for name in result.files if name != "metadata"] == COLUMNS
@@ -93,6 +94,7 @@ def test_metadata_describes_the_run(written):
     assert parquet.read_schema(written[".parquet"]).metadata[b"scenario"].decode() == SCENARIO
 
 
+@pytest.mark.slow
 def test_a_failing_writer_leaves_nothing(written, tmp_path, monkeypatch):
     def fail(_found, path):
         path.write_text("half")

@@ -61,6 +61,7 @@ def windows(folder: Path) -> int:
     return number
 
 
+@pytest.mark.slow
 def test_every_estimate_comes_out_again_bit_for_bit(folder: Path) -> None:
     code, output = replayed(folder)
     assert code == 0
@@ -93,6 +94,7 @@ def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     assert f"{windows(folder) - 1} the same, bit for bit" in output
 
 
+@pytest.mark.slow
 def test_a_changed_model_is_named_with_its_changes(folder: Path) -> None:
     code, _ = replayed(folder, "--present")
     assert code == 0

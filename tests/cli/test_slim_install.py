@@ -55,6 +55,7 @@ def test_every_optional_package_of_the_table_is_in_its_extra():
     assert "servotwin[all]" in project["optional-dependencies"]["dev"]
 
 
+@pytest.mark.slow
 def test_a_slim_install_simulates_estimates_and_redesigns(tmp_path):
     (tmp_path / "wear.toml").write_text(SCENARIO, encoding="utf-8")
     result = slim(
@@ -85,6 +86,7 @@ MISSING = {
 }
 
 
+@pytest.mark.slow
 def test_a_command_without_its_extra_is_one_sentence_and_exit_code_2(tmp_path):
     result = slim(tmp_path, *([name] for name in MISSING))
     for name, (code, stdout, stderr, _) in zip(MISSING, result, strict=True):

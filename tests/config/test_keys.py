@@ -126,6 +126,7 @@ def test_the_constructor_checks_the_same_ranges(values: dict[str, object], expec
     assert str(caught.value).startswith(expected)
 
 
+@pytest.mark.slow
 @given(
     st.floats(0.0, inf), st.floats(0.0, 0.9), st.tuples(st.floats(-9, 9), st.floats(-9, 9)), st.floats(1e-9, 1e9),
     st.text(max_size=9).filter(str.isprintable),

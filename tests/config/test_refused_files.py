@@ -78,6 +78,7 @@ def text_store(folder: Path) -> str:
     return ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("service", "expected"),
     [
@@ -100,6 +101,7 @@ def test_a_twin_with_an_invalid_file_names_the_fault_and_does_not_start(
     assert "secret" not in sentence
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as taken:
         port = taken.getsockname()[1]

@@ -227,6 +227,7 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "controller", [PAPER, LIMITED, BIASED], ids=["paper", "limits, hysteresis, filter", "offset, feedforward"]
 )

@@ -29,6 +29,7 @@ def test_it_is_fig15s_wear_under_the_default_policy():
     assert (scenario.twin.policy, scenario.input_bias) == ("certified", 0.05)
 
 
+@pytest.mark.slow
 def test_estimates_are_right_or_refused():
     truth = loop().scenario.gap
     good = [e for e in loop().estimates if e.status is GapStatus.OK]
@@ -72,6 +73,7 @@ def test_evidence_goes_with_the_update_and_stays_in_the_store():
         assert update.setting.band == redesign.setting.band
 
 
+@pytest.mark.slow
 def test_the_same_scenario_gives_the_same_bytes():
     """A certificate's wall time goes nowhere."""
     short = Scenario.preset("certified").replace(duration=10.0)
@@ -90,6 +92,7 @@ def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
     assert left < proved.tail < proved.within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["margin", "hysteresis"])
 def test_the_other_policies_close_the_loop_too(policy):
     """What hysteresis sends passes the limits that are made for it."""
@@ -103,6 +106,7 @@ def test_the_other_policies_close_the_loop_too(policy):
     assert error[round(30.0 * found.run.sample_rate) : round(40.0 * found.run.sample_rate) - 1].max() < 0.1e-3
 
 
+@pytest.mark.slow
 def test_noise_and_a_loop_filter_are_no_reason_to_fall_back():
     found = cosimulate(Scenario.preset("fig16").replace(duration=45.0, twin=TwinSettings()))
     assert not found.fallbacks

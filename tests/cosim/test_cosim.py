@@ -123,6 +123,7 @@ def test_the_digest_sees_every_difference(change):
     assert cosimulate(short(duration=2.5)).digest() != cosimulate(short(duration=2.5, **change)).digest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("controller", [None, SAMPLED], ids=["continuous", "sampled"])
 def test_no_fate_of_the_link_breaks_the_order(seed, controller):
@@ -200,6 +201,7 @@ def test_progress_rises_to_one_in_few_blocks():
     assert 9 <= len(shares) < 50
 
 
+@pytest.mark.slow
 def test_quantisation_to_int16_moves_the_estimate_by_less_than_a_thousandth_of_a_degree():
     found = quantisation(fig15())
     assert len(found) == 10
@@ -208,6 +210,7 @@ def test_quantisation_to_int16_moves_the_estimate_by_less_than_a_thousandth_of_a
     assert max(q.theta_m_step for q in found) < math.radians(0.011)
 
 
+@pytest.mark.slow
 def test_fig_15_with_the_gap_known_exactly():
     scenario = Scenario.preset("fig15")
     loop = cosimulate(scenario, estimator=known_gap(scenario.gap, scenario.duration))
@@ -231,6 +234,7 @@ def test_fig_15_with_the_papers_own_estimates():
     assert sum(settled) >= 8
 
 
+@pytest.mark.slow
 def test_fig_16_survives_its_noise():
     loop = cosimulate(Scenario.preset("fig16"))
     errors = [math.degrees(e.gap - float(loop.run.gap[round(e.time * 5000)])) for e in loop.estimates]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,6 +81,7 @@ TWINS = st.builds(
 SEEDS = st.integers(0, 2**63)
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(LINKS, LINKS, SEEDS, TWINS, st.sampled_from([0.0, 4.0]))
 def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, seed, twin, interval_s):
@@ -100,6 +102,7 @@ def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, s
     assert all(m.arrival > DURATION - 2.0 / RATE for m in in_flight)
 
 
+@pytest.mark.slow
 @given(
     st.floats(0.0, 0.4),
     st.floats(0.0, 1.0),

@@ -81,6 +81,7 @@ def test_steps_within_the_gap_lead_to_a_probing_move_and_to_the_gap(rate: float 
     assert np.max(np.abs(loop.run.position)) < 2e-5 + 1.2 * request.ask.size
 
 
+@pytest.mark.slow
 def test_what_a_probing_move_showed_spares_the_next_one() -> None:
     """It tells the encoder's offset too, with which the small steps show the gap in one contact."""
     loop = cosimulate(calm(MAY_PROBE, recording=PROBED, reference=SMALL, duration=50.0))
@@ -89,6 +90,7 @@ def test_what_a_probing_move_showed_spares_the_next_one() -> None:
     assert all(error(loop, index) < 5e-3 for index in range(2, 6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "recording", "words", "requests"),
     [
@@ -120,6 +122,7 @@ WHILE_PROBING: list[tuple[float, SignalLike]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1000.0])
 @pytest.mark.parametrize(("time", "wanted"), WHILE_PROBING)
 def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
@@ -135,6 +138,7 @@ def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
     assert loop.windows[2].reference_changes[-1][1] == pytest.approx(float(wanted.pieces(19.0).value(19.0)))  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
     bad = LinkSettings(delay_s=0.5, loss=0.5, duplicate=0.3)
     for seed in range(4):
@@ -214,6 +218,7 @@ def test_bad_configuration_is_named(change: tuple[str, str], words: str, tmp_pat
         load(tmp_path, TOML.replace(*change))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [3.0, 15.0, 25.0])
 def test_noise_makes_estimates_of_a_probe_worse_or_none_but_not_wrong(degrees: float) -> None:
     scenario = calm(
@@ -232,6 +237,7 @@ def test_noise_makes_estimates_of_a_probe_worse_or_none_but_not_wrong(degrees: f
     assert all(estimate.interval[0] < degrees * DEG < estimate.interval[1] for estimate in probed)
 
 
+@pytest.mark.slow
 def test_the_page_shows_a_scenario_that_probes(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/excitation.md").read_text(encoding="utf-8")
     scenario = load(tmp_path, page.split("```toml\n")[1].split("```")[0])

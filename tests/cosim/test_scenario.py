@@ -133,6 +133,7 @@ def test_kinds_of_reference(tmp_path, text, signal):
     assert load(tmp_path, SHORT.replace('kind = "step"\nsize_mm = 1.0', text)).reference == signal
 
 
+@pytest.mark.slow
 def test_a_servos_path_is_relative_to_the_scenario(tmp_path):
     servo = Servo.preset("paper").replace(k=9e3)
     (tmp_path / "mine.toml").write_text(servo.dumps(), encoding="utf-8")

@@ -68,6 +68,7 @@ def test_the_default_twin_is_the_default_estimators(tmp_path):
     assert {Scenario.preset(name).twin.method for name in ("fig15", "fig15-sampled", "fig16")} == {"paper"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recording", "window", "pre_trigger"),
     [("", 2.0, 0.3), ("window_s = 1.5", 1.5, 0.3), ("pre_trigger_s = 0", 2.0, 0.0)],

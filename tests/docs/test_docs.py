@@ -57,6 +57,7 @@ def test_named_objects_exist(page):
         assert pkgutil.resolve_name(name) is not None, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=label)
 def test_named_files_and_tests_exist(page):
     for name, function in FILE.findall(page.read_text()):
@@ -91,6 +92,7 @@ def test_every_page_is_reached_from_the_index():
     assert not [page for page in PAGES if page.parent != ROOT and page.name != "index.md" and page not in reached]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_samples_run(code, tmp_path, monkeypatch, capsys):
     """To the end: everything that they print is there."""
@@ -99,6 +101,7 @@ def test_python_samples_run(code, tmp_path, monkeypatch, capsys):
     assert len(capsys.readouterr().out.splitlines()) >= code.count("print(")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", blocks("toml"))
 def test_toml_samples_load(text, tmp_path):
     file = tmp_path / "sample.toml"

@@ -239,6 +239,7 @@ def asked(line: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_the_first_five_minutes(tmp_path: Path) -> None:
     """Every file and every command as printed, but for the port, which somebody else may have."""
     title = "First servo in five minutes"

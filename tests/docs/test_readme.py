@@ -26,6 +26,7 @@ def test_the_table_is_found():
     assert len(ROWS) >= 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
 def test_verdicts_are_measured(row):
     claim, *said = row

@@ -49,6 +49,7 @@ def read_all(drive: SupervisedDrive, most: int) -> list[Block]:
     return blocks
 
 
+@pytest.mark.slow
 def test_control_ticked_through_the_socket_is_the_sampled_simulation(tmp_path: Path) -> None:
     """25 s at 5 kHz with noise, a dead zone and a gap that grows from nothing, contacts inside samples included."""
     path = plant_file(tmp_path, "control")
@@ -71,6 +72,7 @@ def test_control_ticked_through_the_socket_is_the_sampled_simulation(tmp_path: P
     assert {"contact", "release", "enter", "leave"} <= set(run.events.kind)
 
 
+@pytest.mark.slow
 def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(tmp_path: Path) -> None:
     path = plant_file(tmp_path, "supervise", 10.0)
     scenario = Scenario.load(tmp_path / "scenario.toml")
@@ -98,6 +100,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
         assert np.array_equal(values, run.measured(name)[:-1]), name
 
 
+@pytest.mark.slow
 def test_a_dead_zone_without_gains_is_set_as_it_is(tmp_path: Path) -> None:
     path = plant_file(tmp_path, "supervise", 4.0)
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
@@ -111,6 +114,7 @@ def test_a_dead_zone_without_gains_is_set_as_it_is(tmp_path: Path) -> None:
     assert np.array_equal(joined(blocks)[3], whole(same).voltage[:-1])
 
 
+@pytest.mark.slow
 def test_parameters_of_no_controller_are_refused_and_nothing_changes(tmp_path: Path) -> None:
     gains = Gains(1.0, 2.0, 3.0, 0.1)
     path = plant_file(tmp_path, "supervise", 4.0)
@@ -124,6 +128,7 @@ def test_parameters_of_no_controller_are_refused_and_nothing_changes(tmp_path: P
         assert drive.read(10).version == 0
 
 
+@pytest.mark.slow
 def test_a_killed_edge_reconnects_to_the_running_machine(tmp_path: Path) -> None:
     """In supervise nothing is missing either, as long as the machine keeps it."""
     path = plant_file(tmp_path, "supervise", speed=20.0, endless=True)
@@ -143,6 +148,7 @@ def test_a_killed_edge_reconnects_to_the_running_machine(tmp_path: Path) -> None
             assert another.read().first > first.last
 
 
+@pytest.mark.slow
 def test_a_paced_machine_runs_on_without_its_edge(tmp_path: Path) -> None:
     path = plant_file(tmp_path, "control", speed=5.0, endless=True)
     with machine(path) as (address, _), closing(SimulatedControl(address)) as drive:
@@ -154,6 +160,7 @@ def test_a_paced_machine_runs_on_without_its_edge(tmp_path: Path) -> None:
         assert _ticked(drive).number >= numbers[-1] + 1
 
 
+@pytest.mark.slow
 def test_an_edge_that_sleeps_misses_its_ticks(tmp_path: Path) -> None:
     """Beyond the slack the machine does not wait: the next number says how many samples are missing."""
     path = plant_file(tmp_path, "control", speed=5.0, endless=True, slack_s=0.02)
@@ -173,6 +180,7 @@ def test_an_edge_that_sleeps_misses_its_ticks(tmp_path: Path) -> None:
         assert process.wait(10) == 0
 
 
+@pytest.mark.slow
 def test_a_voltage_that_is_no_number_lets_the_last_one_hold(tmp_path: Path) -> None:
     with machine(plant_file(tmp_path, "control", 1.0)) as (address, _), closing(SimulatedControl(address)) as drive:
         drive.connect()
@@ -186,6 +194,7 @@ def test_a_voltage_that_is_no_number_lets_the_last_one_hold(tmp_path: Path) -> N
     assert all(np.diff(positions) > 0.0)
 
 
+@pytest.mark.slow
 def test_wrong_roles_protocols_and_missing_machines_are_refused(tmp_path: Path) -> None:
     with machine(plant_file(tmp_path, "control", 1.0, listen="unix:here.sock")) as (address, process):
         assert address == f"unix:{tmp_path / 'here.sock'}"
@@ -210,6 +219,7 @@ def test_wrong_roles_protocols_and_missing_machines_are_refused(tmp_path: Path) 
         assert not (tmp_path / "here.sock").exists()
 
 
+@pytest.mark.slow
 def test_rubbish_from_a_client_ends_that_client_only(tmp_path: Path) -> None:
     with machine(plant_file(tmp_path, "supervise", 1.0)) as (address, _):
         for rubbish in (b"", b"GET / HTTP/1.1\r\n\r\n", wire.HELLO.pack(wire.MAGIC, 99, wire.SUPERVISE)):

@@ -85,6 +85,7 @@ def same(blocks: list[Block], run: Run) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
     with server(tmp_path, ring=LONG) as (url, _), closing(drive_at(url)) as drive:
         scenario = Scenario.load(tmp_path / "scenario.toml")
@@ -111,6 +112,7 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
     assert same(blocks, whole(simulation))
 
 
+@pytest.mark.slow
 def test_a_server_that_hangs_is_reconnected_without_missing_samples(tmp_path: Path) -> None:
     with server(tmp_path, ring=LONG) as (url, process), closing(drive_at(url, silence_s=1.0)) as drive:
         drive.connect()
@@ -128,6 +130,7 @@ def test_a_server_that_hangs_is_reconnected_without_missing_samples(tmp_path: Pa
         assert [block.first for block in blocks[1:]] == [block.last for block in blocks[:-1]]
 
 
+@pytest.mark.slow
 def test_a_restarted_server_is_another_machine(tmp_path: Path) -> None:
     url = free_url()
     with server(tmp_path, url=url), closing(drive_at(url, silence_s=1.0)) as drive:
@@ -142,6 +145,7 @@ def test_a_restarted_server_is_another_machine(tmp_path: Path) -> None:
     assert first.last > 0
 
 
+@pytest.mark.slow
 def test_overwritten_samples_are_missing_and_never_old_ones(tmp_path: Path) -> None:
     with server(tmp_path, ring=500, speed=2.0) as (url, _), closing(drive_at(url)) as drive:
         drive.connect()
@@ -157,6 +161,7 @@ def test_overwritten_samples_are_missing_and_never_old_ones(tmp_path: Path) -> N
     assert same(blocks, whole(simulation_of(Scenario.load(tmp_path / "scenario.toml"))))
 
 
+@pytest.mark.slow
 def test_passwords_and_certificates(tmp_path: Path) -> None:
     (mine, key), (other, _) = _certificate(tmp_path, "one"), _certificate(tmp_path, "two")
     files = {"certificate": str(mine), "private_key": str(key)}
@@ -177,6 +182,7 @@ def test_passwords_and_certificates(tmp_path: Path) -> None:
             drive.connect()
 
 
+@pytest.mark.slow
 def test_servers_that_have_no_such_drive(tmp_path: Path) -> None:
     url = free_url()
     with closing(drive_at(url, silence_s=1.0)) as drive, pytest.raises(DriveLost):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -191,6 +192,7 @@ def check_bytes(loop: Loop) -> None:
         )
 
 
+@pytest.mark.slow
 @settings(max_examples=1000, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES, st.booleans())
 def test_windows_and_parameters_are_consistent_over_any_link(
@@ -204,6 +206,7 @@ def test_windows_and_parameters_are_consistent_over_any_link(
     check_bytes(loop)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(LINKS, SEEDS)
 def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed: int) -> None:
@@ -218,6 +221,7 @@ def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed:
     assert twin.pending is None
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES)
 def test_equal_seeds_give_equal_bytes(link: LinkSettings, seed: int, capacity: int, lifetime_s: float) -> None:

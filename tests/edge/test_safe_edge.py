@@ -58,11 +58,13 @@ def test_a_swap_does_not_move_the_voltage_on_identical_inputs(rate: float | None
     assert abs(voltages[0] - voltages[1]) <= 0.01
 
 
+@pytest.mark.slow
 def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -> None:
     for seed in range(500, 510):
         assert hostile.endured(seed, TwinFault.NONE, QUICK).worst < 1.0
 
 
+@pytest.mark.slow
 def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
     """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be."""
     policy = CertifiedPolicy(hostile.model())
@@ -72,6 +74,7 @@ def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
         assert outcome.tail.max() < hostile.band().error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", hostile.KINDS)
 def test_the_loop_stays_in_the_certified_band(kind: TwinFault) -> None:
     outcome = hostile.endured(20, kind, QUICK)
@@ -79,18 +82,21 @@ def test_the_loop_stays_in_the_certified_band(kind: TwinFault) -> None:
     assert outcome.outside == 0.0
 
 
+@pytest.mark.slow
 def test_silence_ends_in_the_fallback_set() -> None:
     outcome = hostile.endured(21, TwinFault.SILENT, QUICK)
     assert outcome.fallbacks == (Cause.SILENCE,)
     assert 1 <= outcome.applied <= HONEST
 
 
+@pytest.mark.slow
 def test_old_updates_are_refused_however_they_are_numbered() -> None:
     outcome = hostile.endured(24, TwinFault.REPLAYS, QUICK)
     assert outcome.refused[Reason.OLD_DATA] > 0
     assert outcome.refused[Reason.OLD_VERSION] > 0
 
 
+@pytest.mark.slow
 def test_a_loop_that_leaves_the_band_is_brought_back() -> None:
     """Settings that nobody certified, in bounds and a little beyond: every loop recovers."""
     outcomes = [hostile.endured(seed, TwinFault.WANTON, QUICK) for seed in (33, 36)]
@@ -121,6 +127,7 @@ def test_equal_seeds_give_equal_bytes() -> None:
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_the_machine_runs_on_what_the_edge_put_in_force() -> None:
     machine = replace(hostile.case(3), input_bias=0.03, friction=0.0)
     loop, plant, twin = cosimulated(TwinFault.LIES_LOW, 0.3, machine)

@@ -145,6 +145,7 @@ def test_windows_of_an_earlier_boot_wait_for_an_answer_too() -> None:
 STEPS = st.lists(st.tuples(st.integers(1, 400), st.sampled_from([0.0, 2e-5, 1.5e-4, 9e-4]), st.booleans()), max_size=12)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(steps=STEPS)
 def test_blocks_and_single_samples_decide_the_same(steps: list[tuple[int, float, bool]]) -> None:

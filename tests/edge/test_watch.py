@@ -75,6 +75,7 @@ def test_cycles_inside_the_band_are_allowed() -> None:
     assert watched(cycle(4e-5)) is None  # sqrt(2) 3e-5 is predicted
 
 
+@pytest.mark.slow
 def test_noise_is_no_limit_cycle() -> None:
     noise = random.Random(5)
     for _ in range(20):

@@ -56,6 +56,7 @@ def test_what_a_scenario_tells_its_edge_comes_back_bit_for_bit(preset: str) -> N
 METRES = st.floats(1e-7, 1e-2)
 
 
+@pytest.mark.slow
 @given(METRES, METRES, METRES, st.text(max_size=20).filter(lambda text: text.isprintable()), st.booleans())
 def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text: str, stay: bool) -> None:
     gains = gains_of(LAW.replace(Kp=1.0 + a, leave=1.0 + b))

@@ -58,6 +58,7 @@ def windows_of(folder: Path) -> list[WindowMessage]:
         outbox.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "count"), [(replayed, 6), (simulated, 6), (over_opcua, 2)])
 def test_windows_hold_what_the_machine_did(tmp_path: Path, kind: Any, count: int) -> None:
     with ExitStack() as stack:

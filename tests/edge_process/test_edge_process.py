@@ -130,6 +130,7 @@ def is_complete(sequence: list[int]) -> bool:
     return sequence == list(range(len(sequence)))
 
 
+@pytest.mark.slow
 def test_an_edge_controls_records_and_sends_without_numpy(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -150,6 +151,7 @@ def test_an_edge_controls_records_and_sends_without_numpy(
     assert "secret" not in edge.log()
 
 
+@pytest.mark.slow
 def test_the_link_process_is_killed_again_and_again_and_the_controller_ticks_on(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -168,6 +170,7 @@ def test_the_link_process_is_killed_again_and_again_and_the_controller_ticks_on(
     assert edge.log().count("link process gone") == 3
 
 
+@pytest.mark.slow
 def test_kill_9_of_the_whole_edge_loses_at_most_the_window_being_cut(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -187,6 +190,7 @@ def test_kill_9_of_the_whole_edge_loses_at_most_the_window_being_cut(
     assert all(map(is_complete, sequences(twin).values()))
 
 
+@pytest.mark.slow
 def test_without_a_twin_an_edge_controls_and_stores_windows(edge: RunningEdge, machine: StubMachine) -> None:
     edge.write(twin=None)
     edge.start()
@@ -195,6 +199,7 @@ def test_without_a_twin_an_edge_controls_and_stores_windows(edge: RunningEdge, m
     assert "up" not in edge.status()
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_closed_leaves_the_safe_voltage(edge: RunningEdge, machine: StubMachine) -> None:
     edge.start()
     until(lambda: edge.status().get("samples", 0) > 0)
@@ -211,6 +216,7 @@ def update(window: WindowMessage, version: int) -> Update:
     return Update("axis-1", version, version - 1, identity, window.start, *known, "OK", *values)
 
 
+@pytest.mark.slow
 def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -251,6 +257,7 @@ def test_over_a_bad_link_every_window_arrives_and_every_update_is_applied_once(
     assert edge.status()["down"]["broken seal"] > 0
 
 
+@pytest.mark.slow
 def test_a_wrong_token_costs_no_window(edge: RunningEdge, machine: StubMachine, twin: FakeTwin) -> None:
     twin.token = "changed"
     edge.start()
@@ -263,6 +270,7 @@ def test_a_wrong_token_costs_no_window(edge: RunningEdge, machine: StubMachine, 
     assert is_complete(found)
 
 
+@pytest.mark.slow
 def test_samples_that_are_not_finite_hold_the_voltage_then_make_it_safe(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -279,6 +287,7 @@ def test_samples_that_are_not_finite_hold_the_voltage_then_make_it_safe(
     assert edge.status()["windows"]["dropped"] == {"sample not finite": 1}
 
 
+@pytest.mark.slow
 def test_a_few_missing_samples_cost_their_window_only(edge: RunningEdge, machine: StubMachine, twin: FakeTwin) -> None:
     machine.spoil = lambda n, *rest: (n if n < 300 else n + 7, *rest)
     edge.start()
@@ -291,6 +300,7 @@ def test_a_few_missing_samples_cost_their_window_only(edge: RunningEdge, machine
     assert twin.windows[next(reversed(twin.windows))].start * RATE % machine.every == 7
 
 
+@pytest.mark.slow
 def test_many_missing_samples_begin_a_new_boot_and_the_law_goes_on(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -313,6 +323,7 @@ def test_a_wrong_configuration_ends_with_one_sentence(edge: RunningEdge, machine
     assert "Traceback" not in edge.log()
 
 
+@pytest.mark.slow
 def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     edge: RunningEdge, machine: StubMachine
 ) -> None:
@@ -334,6 +345,7 @@ def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     assert edge.signal(signal.SIGTERM) == 0
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_neither_the_controller_nor_the_link(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
@@ -354,6 +366,7 @@ def test_a_full_disk_stops_neither_the_controller_nor_the_link(
     assert edge.status()["link_process"] == link
 
 
+@pytest.mark.slow
 def test_a_link_process_that_is_killed_on_a_full_disk_takes_no_window_along(
     edge: RunningEdge, machine: StubMachine
 ) -> None:

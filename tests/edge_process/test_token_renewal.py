@@ -48,6 +48,7 @@ def linked(tmp_path: Path):
     assert not running.is_alive()
 
 
+@pytest.mark.slow
 def test_the_link_process_ends_when_its_token_is_replaced(linked, capfd):
     folder, running = linked
     running.join(1.5)
@@ -61,6 +62,7 @@ def test_the_link_process_ends_when_its_token_is_replaced(linked, capfd):
     assert "second" not in log
 
 
+@pytest.mark.slow
 def test_the_link_process_goes_on_while_its_token_is_missing(linked):
     folder, running = linked
     (folder / "token").unlink()

@@ -49,6 +49,7 @@ def one_sided() -> list[int]:
     return [k for k, e in enumerate(loop().estimates) if isinstance(e.offset, CarriedOffset)]
 
 
+@pytest.mark.slow
 def test_one_contact_is_enough_after_a_window_with_two():
     assert len(one_sided()) >= 5
     for k in one_sided():
@@ -95,6 +96,7 @@ def carried(trend: Trend) -> tuple[float, float]:
     return trend.prior.offset, trend.prior.offset_std
 
 
+@pytest.mark.slow
 def test_spreads_and_the_trend_hold_what_they_say():
     """An encoder that is 40 deg off, 1 um of noise: the trend's gap and offset after one window of each kind."""
     settings = whitened.WhitenedSettings(model_error=0.0, largest_std=DEG)

@@ -52,12 +52,14 @@ def test_with_feedforward_the_total_voltage_counts():
     assert abs(np.mean(plain.reference[-100:] - plain.position[-100:])) > 1e-5
 
 
+@pytest.mark.slow
 def test_in_the_papers_noise():
     found = seen(loop(CALM, 0.1, 4.0, Noise(std=0.22e-3, band=(10.0, 50.0))))
     assert abs(found.bias - 0.1) < 3.0 * found.bias_std < 6e-3
     assert found.noise == pytest.approx(0.22e-3, rel=0.15)
 
 
+@pytest.mark.slow
 def test_white_noise_is_measured_beside_a_slow_drift():
     found = seen(loop(CALM, 0.0, 4.0, Noise(std=2e-6)))
     assert found.noise == pytest.approx(2e-6, rel=0.05)
@@ -85,6 +87,7 @@ def coloured(rng: np.random.Generator, memory: float, size: int) -> np.ndarray:
     return math.sqrt(1.0 - memory**2) * lfilter([1.0], [1.0, -memory], rng.standard_normal(size + 2000))[2000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory", "size"), [(0.0, 2500), (0.0, 500), (0.95, 2500), (0.99, 5000)])
 def test_the_spread_holds_what_it_says(memory, size):
     """Voltage noise of 1 V, white or with a memory of up to 20 ms, and a bias of 0.2 V."""

@@ -39,6 +39,7 @@ def window_of(gap_deg: float, start: float = 5.0, stiffer: float = 1.0) -> Windo
     return window.replace(position=window.position + FLOOR * noise)
 
 
+@pytest.mark.slow
 def test_windows_of_a_growing_gap_share_the_machine():
     """Each has its own gap, all have one machine: every spread is smaller than alone, every gap right."""
     gaps = (6.0, 10.0, 14.0)
@@ -61,6 +62,7 @@ def test_one_window_is_a_sequence_of_one():
     assert one.gaps == (one.gap,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffer", [1.002, 1.02])
 def test_windows_of_two_machines_contradict_each_other(stiffer):
     """The second machine's springs are 0.2 or 2 % stiffer; alone, each window is fine."""
@@ -72,6 +74,7 @@ def test_windows_of_two_machines_contradict_each_other(stiffer):
     assert "the machine is not the same" in reasons
 
 
+@pytest.mark.slow
 def test_a_useless_window_harms_no_other():
     good = window_of(10.0)
     still = Window(good.position, theta_m=np.full(good.position.size, 0.3), sample_rate=RATE)
@@ -106,6 +109,7 @@ def test_derivatives_of_the_whole_are_those_of_its_cost():
         assert 0.5 * (up - down) == pytest.approx(slope, rel=2e-3, abs=1e-6 * here.cost), index
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voltage", [False, True])
 def test_the_recorders_windows_meet_the_target(voltage):
     """2 s from 0.3 s before the step on, in `table1`, whose screw moves half as far: 0.03 and 0.02 deg."""
@@ -117,6 +121,7 @@ def test_the_recorders_windows_meet_the_target(voltage):
     assert found.coverage >= 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [bench.CONTINUOUS, bench.SAMPLED], ids=["continuous", "sampled"])
 def test_without_noise_the_voltages_jumps_cost_nothing(loop):
     """The dead zone opens and the reference steps between samples; the stated spread covers what is left."""
@@ -135,6 +140,7 @@ def test_the_residual_is_the_noise():
         assert estimate_jointly(window, DESCRIBED).gap.rms == pytest.approx(noise, rel=0.05, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_lower_bound_is_one_number():
     """Where one way's travel is not enough: value and interval agree, and the bound is one."""
     window = window_of(10.0)
@@ -175,6 +181,7 @@ def _gain(noise: Autoregression) -> float:
     return float(noise.spread[-1] / abs(noise.predictors[-1].sum()))
 
 
+@pytest.mark.slow
 def test_the_bound_grows_with_what_is_unknown():
     """By code of its own; an estimator below it would have known the answer, one far above it wastes data."""
     groups = bench.windows(bench.CONTINUOUS, "paper", 2, 3)

@@ -57,6 +57,7 @@ LOOPS = [(False, False, False), (False, True, False), (True, True, False), (True
 NAMES = ["continuous", "dead zone", "sampled", "paper's noise"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS, ids=NAMES)
 @pytest.mark.parametrize(
     ("preset", "gap_deg", "limit"), [("paper", 4.0, 0.03), ("paper", 18.0, 0.03), ("table1", 10.0, 0.05)]
@@ -75,6 +76,7 @@ def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, limit, loop):
         assert abs(found.gap.theta_d0 - window.theta_m[0]) <= 0.5 * found.gap.gap + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS, ids=NAMES)
 @pytest.mark.parametrize(
     ("preset", "gap_deg", "limit"), [("paper", 4.0, 0.02), ("paper", 18.0, 0.02), ("table1", 10.0, 0.04)]
@@ -133,6 +135,7 @@ def test_a_gap_that_grows_within_the_window():
     assert stiff.gap.std > 3.0 * found.gap.std
 
 
+@pytest.mark.slow
 def test_stated_spread_is_that_of_many_fits():
     """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.2."""
     run = run_of("paper", 10.0, False, False)
@@ -147,6 +150,7 @@ def test_stated_spread_is_that_of_many_fits():
     assert 0.8 < ratio < 2.0
 
 
+@pytest.mark.slow
 def test_random_windows_are_right_or_refused():
     """Quiet, one contact, straddling a step, calm loops; wrong structures, and k_B wrong without the angle."""
     rng, accepted, travelled = np.random.default_rng(21), 0, 0
@@ -244,6 +248,7 @@ def test_an_elastic_screw_is_refused():
         estimate_jointly(Window(signal, theta_m=signal, sample_rate=5000.0), Servo.preset("paper").replace(k_d=1e6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [True, False])
 @pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
 def test_a_gap_beyond_the_largest_is_a_lower_bound_with_its_reason(preset, angle):
@@ -260,6 +265,7 @@ def test_a_gap_beyond_the_largest_is_a_lower_bound_with_its_reason(preset, angle
         assert found.reasons
 
 
+@pytest.mark.slow
 def test_a_window_at_the_bound_does_not_bend_the_other_windows():
     servo = Servo.preset("paper")
     far = simulate(servo, 7.1, reference=SquareWave(1e-3, 10.0), gap=math.radians(62.0))
@@ -271,6 +277,7 @@ def test_a_window_at_the_bound_does_not_bend_the_other_windows():
     assert "60 deg" in together.gaps[0].reasons[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [16_000.0, 20_000.0, 50_000.0])
 def test_short_fast_windows_are_refused_in_one_sentence(rate):
     """After the decimation there was nothing left, and numpy said so."""

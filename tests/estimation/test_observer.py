@@ -76,6 +76,7 @@ def test_initial_state_has_the_given_derivatives():
     assert derivatives == pytest.approx(FIG_A1, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "servo",
     [

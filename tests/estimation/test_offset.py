@@ -42,6 +42,7 @@ def test_a_shifted_encoder_is_read(wearing, shift_deg):
     assert abs(found.covariance) <= found.std * estimate.std_total * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 def test_its_spread_is_that_of_many_readings(wearing):
     errors, stated = [], []
     for seed in range(30):

@@ -32,6 +32,7 @@ def slow(t):
     return np.interp(t, [0.0, 1.7, 1.9, 3.0], [0.0, 6.0, 5.93, 5.93])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", [0.5, 3.0, 10.0, 25.0, 60.0])
 @pytest.mark.parametrize("prior_deg", [0.0, 8.0, 40.0])
 def test_finds_the_gap_once_the_observer_has_settled(gap_deg, prior_deg):
@@ -41,6 +42,7 @@ def test_finds_the_gap_once_the_observer_has_settled(gap_deg, prior_deg):
     assert estimate.interval[0] < math.radians(gap_deg) < estimate.interval[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "servo",
     [
@@ -82,6 +84,7 @@ def test_scaling_every_signal_scales_the_estimate_bit_for_bit(scale):
     )
 
 
+@pytest.mark.slow
 def test_gaps_of_zero_come_out_as_zero_not_below():
     for start in (0.9, 1.0, 1.1, 1.2, 1.3):
         estimate = estimate_gap(measured(0.0, start=start), SERVO)
@@ -116,6 +119,7 @@ def test_without_motion_or_reversal_nothing_is_known(theta_m, reason):
     assert reason in estimate.reasons[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", [5.0, 10.0, 30.0])
 def test_one_contact_gives_a_lower_bound(gap_deg):
     """The motor turns back by 4 deg within the gap: it is at least as wide as that."""
@@ -127,6 +131,7 @@ def test_one_contact_gives_a_lower_bound(gap_deg):
     assert "needed both ways" in estimate.reasons[0]
 
 
+@pytest.mark.slow
 def test_a_motion_smaller_than_the_spread_shows_no_gap():
     """0.8 deg to and fro within a gap of 3 deg, or in contact without any: too little to tell."""
     estimate = estimate_gap(measured(0.0, motor=trembling), SERVO)

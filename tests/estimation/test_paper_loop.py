@@ -50,6 +50,7 @@ def errors(run: Run, gap_deg: float, settings: PaperSettings, steps: int = 8) ->
     return np.array([math.degrees(estimate.gap) - gap_deg for estimate in estimates])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize(
     ("preset", "settle_s", "bias", "margin"),
@@ -99,6 +100,7 @@ def test_far_from_zero_the_published_reading_is_refused():
     assert abs(first.theta_d0 - farther.theta_m[0]) <= 0.5 * first.gap * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize(
     ("settings", "bias", "scatter"),
@@ -117,6 +119,7 @@ def test_in_the_papers_noise(settings, bias, scatter, gap_deg):
     assert scatter[0] < np.std(found) < scatter[1]
 
 
+@pytest.mark.slow
 def test_windows_at_any_time_are_refused_or_right():
     """Random gaps, steps, dead zones, calm loops, window times: quiet, straddling a step, one contact."""
     rng = np.random.default_rng(7)

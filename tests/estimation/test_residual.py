@@ -67,6 +67,7 @@ def test_the_first_screw_angle_has_no_effect_beyond_the_gap():
     assert residual.slope(np.array([gap, first - gap]))[1][1] == 0.0
 
 
+@pytest.mark.slow
 def test_the_cost_is_smooth_through_zero():
     """A negative gap mirrors the screw at the motor: value and slope continue."""
     residual = of(measured(math.radians(1.0)))

@@ -146,6 +146,7 @@ def test_intervals_cover_simulated_wear():
     assert np.all(np.abs(np.mean(inside, axis=0) - 0.95) < 0.03)
 
 
+@pytest.mark.slow
 def test_the_time_to_a_limit_covers_when_wear_reaches_it():
     """Constant rates: the truth's arrival lies in the 95 % interval in 95 % of the cases."""
     settings = TrendSettings(rate_std_rad_per_s=5e-3, rate_walk_rad_per_s_per_sqrt_s=0.0, shared_error_rad=0.0)

@@ -46,6 +46,7 @@ def failures(figures) -> list:
     return [figure for figure in figures if not figure.met]
 
 
+@pytest.mark.slow
 def test_noise_free_windows_of_every_kind():
     """Two contacts, gaps 0 .. 60 deg, 2, 3, 5 masses: all right to a thousandth of a degree."""
     found = bench.answers(random_cases(np.random.default_rng(11), 40, math.radians(60.0), True, constant=True))
@@ -74,16 +75,19 @@ def test_evidence_of_picometres(preset, share, gap, begun, amplitude, period, st
     assert abs(error(estimate_gap(case.window, servo), case)) < 1e-3
 
 
+@pytest.mark.slow
 def test_random_windows_are_refused_or_right():
     found = bench.random_windows(60, 3)
     assert failures(found) == []
 
 
+@pytest.mark.slow
 def test_in_white_noise_it_reaches_the_bound():
     """Two-sided: an estimator below the Cramer-Rao bound would have known the answer."""
     assert failures(bench.in_white_noise(5, 3)) == []
 
 
+@pytest.mark.slow
 def test_in_the_papers_noise():
     """Bias, spread, and how much better than the published method; the bound beside it is for the bench."""
     cases = bench.paper_noise_cases(3, 9, FLOOR)
@@ -94,6 +98,7 @@ def test_in_the_papers_noise():
     assert bench.against_the_paper(cases[:8], found.errors[:8]).value > 20.0
 
 
+@pytest.mark.slow
 def test_the_spread_in_coloured_noise_and_in_steps():
     figures = [*conditions.in_coloured_noise(8, 4, 0.9), *conditions.quantised(8, 4)]
     assert all(0.88 <= figure.value <= 1.0 for figure in figures), figures
@@ -138,6 +143,7 @@ def test_a_wrong_model_is_named(change, words):
         assert off < 1.96 * mild.std_total
 
 
+@pytest.mark.slow
 def test_a_compliant_screw_taken_as_rigid():
     assert failures(conditions.compliant_screw(3, (1e6,))) == []
 
@@ -168,6 +174,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 @pytest.mark.parametrize("number", [1, 7])
 def test_bad_channels_are_named_and_never_a_number(name, number):
@@ -317,6 +324,7 @@ def at_rest(span: float = 1.0) -> tuple[WindowCase, ...]:
     return tuple(cut(run, start, span) for start in (4.0, 4.5, 5.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor", [1e-8, 1e-6, 1e-5, 1e-4])
 def test_noise_at_rest_is_no_wrong_model(floor):
     for seed, case in enumerate(at_rest()):
@@ -326,6 +334,7 @@ def test_noise_at_rest_is_no_wrong_model(floor):
             assert estimate.gap <= np.ptp(case.window.theta_m)
 
 
+@pytest.mark.slow
 def test_bounds_are_below_the_gap():
     """Calm loops show one contact: what they say of the gap is a bound, and never more than the gap."""
     found = [estimate_gap(window, SERVO) for window, _ in one_contact()]
@@ -361,6 +370,7 @@ def test_rounding_carries_no_information():
         assert estimate.status is not GapStatus.LOWER_BOUND or estimate.gap <= gap
 
 
+@pytest.mark.slow
 def test_a_gap_taken_for_constant_that_grows_is_covered_or_refused():
     """Accepted once as 0.8 deg where it was 15.6: one contact, and the growth looked like another."""
     servo = Servo.preset("paper").replace(n=5)

@@ -29,6 +29,7 @@ def stamps(seed: int) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_stamps_do_not_depend_on_the_process() -> None:
     """Otherwise every other run would compile again."""
     first = stamps(0)  # seeds 0 and 4 order a set of two words differently
@@ -111,6 +112,7 @@ print(first({name}(np.array([2.5]))))
 """
 
 
+@pytest.mark.slow
 def test_a_cache_that_names_a_renamed_type_is_compiled_anew(tmp_path):
     """As after an update of servotwin: the old cache lies beside the new code."""
     outputs = []

@@ -76,6 +76,7 @@ def ours(flows: list[Array], rows: list[Array], reset: Array | None, step: float
     return Trajectory(Automaton(modes, tuple(f"x{i}" for i in range(size))), np.eye(size)[-1], 0, step, refine)
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(seeds)
 def test_random_relay_loops(seed: int) -> None:
@@ -129,6 +130,7 @@ def two_oscillators(slow: float, fast: float, level: float) -> Automaton:
     return Automaton((below, above), ("x", "v", "y", "u", "one"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.2, 0.6, 1.3, 2.5])
 def test_no_event_of_undamped_oscillations_is_missed(turn: float) -> None:
     """Two undamped oscillators reach a level now and then, however coarse the samples: `turn` is radians per sample."""

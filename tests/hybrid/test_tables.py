@@ -20,6 +20,7 @@ def loop(shape: Shape, **changes: float) -> tuple[Automaton, float]:
     return automaton, search_step(automaton, 0.01)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_jumps_are_exponentials(shape: Shape) -> None:
     automaton, step = loop(shape)

@@ -74,6 +74,7 @@ def test_a_connection_that_the_server_closed_is_opened_again(twin: FakeTwin, lin
     assert len(twin.windows) == 3
 
 
+@pytest.mark.slow
 def test_messages_of_the_twin_are_returned_until_they_are_acknowledged(twin: FakeTwin, link: HttpTransport) -> None:
     assert link.listen(0) == []
     for k in range(3):
@@ -81,6 +82,7 @@ def test_messages_of_the_twin_are_returned_until_they_are_acknowledged(twin: Fak
     assert [len(link.listen(after)) for after in (0, 0, 2, 3)] == [3, 3, 1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "status"), [(code, 400) for code in Refusal])
 def test_a_refusal_is_understood(twin: FakeTwin, link: HttpTransport, code: Refusal, status: int) -> None:
     def refuse(handler: Handler, _: bytes) -> bool:

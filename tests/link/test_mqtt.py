@@ -75,6 +75,7 @@ def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> Non
         assert kept(store) == kept(store, "axis-2") == list(range(20))
 
 
+@pytest.mark.slow
 def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store), edge(at, timeout_s=3.0) as here:
@@ -97,6 +98,7 @@ def test_a_twin_that_begins_late_gets_all(server: Mosquitto, store: Store) -> No
         assert kept(store) == [0]
 
 
+@pytest.mark.slow
 def test_a_poll_outlives_a_cut_connection(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store) as there, Relay(server.port) as relay:
@@ -109,6 +111,7 @@ def test_a_poll_outlives_a_cut_connection(server: Mosquitto, store: Store) -> No
             assert len(polled.result(PATIENCE)) == 1
 
 
+@pytest.mark.slow
 def test_a_delayed_and_cut_line_stores_each_window_once(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store), Relay(server.port, Weather((0.0, 0.05), (0.5, 1.5)), seed=5) as relay:
@@ -119,6 +122,7 @@ def test_a_delayed_and_cut_line_stores_each_window_once(server: Mosquitto, store
     assert kept(store) == list(range(30))
 
 
+@pytest.mark.slow
 def test_news_that_a_twin_is_gone_ends_a_poll(server: Mosquitto, store: Store) -> None:
     """A twin's connection that breaks without a good-bye, as when it is killed."""
     at = Broker(server.url)
@@ -249,6 +253,7 @@ def test_closing_ends_requests_under_way(server: Mosquitto) -> None:
             here.listen(0)
 
 
+@pytest.mark.slow
 def test_without_a_broker_the_twin_is_unreachable() -> None:
     with edge(Broker(f"mqtt://127.0.0.1:{free_port()}"), timeout_s=0.5) as here, pytest.raises(Unreachable):
         here.deliver(parcel(0))

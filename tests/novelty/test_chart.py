@@ -50,6 +50,7 @@ def after(gaps: np.ndarray, rules: NoveltyRules = RULES, std: float = STD, chart
     return news
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("allowance", "limit"), [(0.5, 3.0), (0.5, 4.0), (0.25, 5.0)])
 def test_run_lengths_are_those_of_the_markov_chain(allowance: float, limit: float) -> None:
     two_sided = 0.5 * exact_run_length(allowance, limit)
@@ -63,12 +64,14 @@ def test_the_limits_of_the_default_allow_a_thousand_windows() -> None:
     assert 1.0 / (slow + sudden) > 8000.0
 
 
+@pytest.mark.slow
 def test_false_alarms_are_rare_with_a_baseline_that_is_learnt() -> None:
     gaps = np.random.default_rng(7).normal(0.2, STD, 60_000)
     tight = NoveltyRules(resolution=0.02 * STD)
     assert len(after(gaps, tight)) <= 40  # 1500 windows each
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 3.0, 10.0])
 def test_a_scatter_that_windows_do_not_know_of_is_learnt(factor: float) -> None:
     gaps = np.random.default_rng(8).normal(0.2, factor * STD, 30_000)

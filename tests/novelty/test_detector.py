@@ -167,6 +167,7 @@ def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
 _NUMBERS = st.floats(width=64) | st.sampled_from([0.0, 1e308, -1e308, 1e-320, math.inf, math.nan])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(_NUMBERS, _NUMBERS), min_size=1, max_size=40), st.integers(1, 300), st.integers(0, 3))
 def test_nothing_that_a_sensor_gives_stops_the_judge(steps: list[tuple[float, float]], hold: int, warm: int) -> None:

@@ -38,6 +38,7 @@ def looped(name: str, growth_deg: float, duration: float, rules: NoveltyRules | 
     return cosimulate(packaged.replace(duration=duration, gap=gap, recording=recording))
 
 
+@pytest.mark.slow
 def test_without_wear_next_to_nothing_is_sent() -> None:
     loop = looped("fig15", 0.0, 200.0, NoveltyRules())
     assert Counter(window.reason for window in loop.windows) == {FIRST: 1}
@@ -52,6 +53,7 @@ def test_one_is_sent_every_period() -> None:
     assert [window.reason for window in loop.windows] == [FIRST, PERIODIC, PERIODIC, PERIODIC]
 
 
+@pytest.mark.slow
 def test_fast_wear_has_every_window_sent_and_the_same_estimates() -> None:
     every, news = (looped("fig15", 10.0, 200.0, rules) for rules in (None, NoveltyRules()))
     assert {window.reason for window in news.windows[1:]} <= set(NEWS)
@@ -59,6 +61,7 @@ def test_fast_wear_has_every_window_sent_and_the_same_estimates() -> None:
     assert len(news.applied) == len(every.applied) == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fig15", "fig16"])
 def test_what_is_sent_keeps_the_twin_right(name: str) -> None:
     rules = NoveltyRules(worth=math.radians(0.5))
@@ -69,6 +72,7 @@ def test_what_is_sent_keeps_the_twin_right(name: str) -> None:
     assert few.error < 1.02 * all_of_them.error
 
 
+@pytest.mark.slow
 def test_the_trend_is_right_on_fewer_windows() -> None:
     loop = looped("calm", 2.5, 200.0, NoveltyRules(worth=math.radians(0.5)))
     assert len(loop.windows) <= 7
@@ -142,6 +146,7 @@ def test_a_model_for_another_rate_is_refused() -> None:
         AgentSettings("axis", "b0", 1000.0, window_filter=NoveltySettings(model_of(Servo.preset("paper"), 500.0)))
 
 
+@pytest.mark.slow
 def test_the_bench_measures_and_writes_its_figures() -> None:
     tiny = replace(QUICK, quiet=40, changed=20, drawn=2000, trials=5)
     figures = {figure.name: figure.value for figure in charted(CONDITIONS[2], tiny)}

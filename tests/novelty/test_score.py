@@ -68,6 +68,7 @@ def test_a_change_is_recovered_without_noise(gap_deg: float, off_deg: float) -> 
     assert max(map(abs, errors)) < 1e-3, errors
 
 
+@pytest.mark.slow
 def test_in_the_papers_noise_the_spread_is_what_it_says() -> None:
     cases = paper_loop_cases(np.radians([6.0, 12.0]), 30, 5, Noise(0.22e-3))
     rng = np.random.default_rng(0)

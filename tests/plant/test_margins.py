@@ -92,6 +92,7 @@ def servos(draw: st.DrawFn) -> Servo:
     return servo.replace(**gains)
 
 
+@pytest.mark.slow
 @given(servos(), st.sampled_from([None, 20.0]))
 def test_crossovers_and_margins_against_python_control(servo: Servo, filter_hz: float | None) -> None:
     law = servo.controller.replace(loop_filter_hz=filter_hz)
@@ -106,6 +107,7 @@ def test_crossovers_and_margins_against_python_control(servo: Servo, filter_hz: 
     assert np.ravel(mine) == pytest.approx(np.ravel(theirs), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k_d", [math.inf, 1e6])
 @pytest.mark.parametrize("n", [40, 100])
 def test_a_long_chain_has_margins(n: int, k_d: float) -> None:
@@ -123,6 +125,7 @@ def test_a_long_chain_has_margins(n: int, k_d: float) -> None:
     assert found.stable is bool(np.max(servo.closed_loop().poles().real) < 0.0)
 
 
+@pytest.mark.slow
 @given(servos())
 def test_responses_agree_in_both_forms_and_with_python_control(servo: Servo) -> None:
     omega = np.logspace(-1, 3, 41)
@@ -131,6 +134,7 @@ def test_responses_agree_in_both_forms_and_with_python_control(servo: Servo) -> 
         np.testing.assert_allclose(judge(1j * omega), system.response(omega), rtol=1e-6)
 
 
+@pytest.mark.slow
 @given(servos())
 def test_sensitivity_peak_against_a_fine_grid(servo: Servo) -> None:
     loop, found = servo.loop(), servo.margins()
@@ -143,6 +147,7 @@ def test_sensitivity_peak_against_a_fine_grid(servo: Servo) -> None:
     assert np.max(seen) >= found.Ms * (1.0 - 1e-6)
 
 
+@pytest.mark.slow
 @given(servos())
 def test_bandwidth_is_the_first_fall_by_3_db(servo: Servo) -> None:
     closed, width = servo.closed_loop(), servo.margins().bandwidth

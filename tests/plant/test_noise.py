@@ -51,6 +51,7 @@ def test_long_samples_have_the_stated_standard_deviation(noise: Noise) -> None:
     assert np.mean(drawn) == pytest.approx(0.0, abs=5e-3 * noise.std)
 
 
+@pytest.mark.slow
 def test_noise_is_stationary_from_the_first_sample() -> None:
     runs = np.array([Noise(1.0).samples(60, RATE, np.random.default_rng(seed)) for seed in range(4000)])
     np.testing.assert_allclose(np.std(runs, axis=0), 1.0, atol=5.0 / math.sqrt(2 * 4000))

@@ -69,6 +69,7 @@ def evidence(degrees=10.0, bias=0.05, noise=0.0, std=0.02, **changes) -> Evidenc
 # --- the grid
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 60.0), st.floats(0.0, 60.0), st.floats(0.5, 100.0))
 def test_every_interval_lies_in_a_cell_at_most_four_times_as_wide(one: float, other: float, finest: float) -> None:
     stated, grid = (2.0 * DEG, 62.0 * DEG), Grid(finest * DEG)
@@ -101,6 +102,7 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
 # --- what is looked up
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=25)
 @given(
     st.floats(0.0, 30.0),
@@ -198,6 +200,7 @@ def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
     assert isinstance(replace(table(), cells=cells).find(region(left=2e-2)), Certificate)
 
 
+@pytest.mark.slow
 def test_a_cell_whose_voltage_reaches_its_limit_is_not_verified() -> None:
     """There a feedforward would leave less on one side."""
     tight = replace(POLICY, servo=SERVO.replace(voltage_limit=1.0))
@@ -255,10 +258,12 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(tmp_path_factory.mktemp("tables") / "paper.table")
 
 
+@pytest.mark.slow
 def test_a_table_survives_its_file_unchanged(file: Path) -> None:
     assert load(file, POLICY) == table()
 
 
+@pytest.mark.slow
 def test_an_interrupted_table_is_continued(file: Path, tmp_path: Path, monkeypatch) -> None:
     path = built(tmp_path / "part.table", cells=3)
     with pytest.raises(InvalidInput, match=r"part\.table: \d+ cells of this table are not verified yet"):

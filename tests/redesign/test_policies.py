@@ -79,6 +79,7 @@ def test_certified_designs_for_the_controller_that_runs():
     assert policy.fallback().Ms != pytest.approx(PAPER.margins(law.replace(loop_filter_hz=None)).Ms, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_ranges_and_demands_carry_their_units(tmp_path):
     twin = load(tmp_path, NARROW).twin
     assert twin.uncertainty == Uncertainty(
@@ -118,6 +119,7 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
         load(tmp_path, "[twin.demands]\nMs = 1.0")
 
 
+@pytest.mark.slow
 def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"no fallback set for the servo's stated range: none of \d+ candidates"):
         load(tmp_path, "[twin.uncertainty]\ninput_bias_v = [0, 0]\n[twin.demands]\novershoot_percent = 0.5")
@@ -146,6 +148,7 @@ def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_pat
     assert fallback.silence_s == certified_policy(scenario.model, scenario.twin).horizon
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["[controller]\nki_v_per_m_s = 100.0\n", "[edge]\nwatched = true\n"])
 def test_the_loop_begins_on_the_controller_that_the_scenario_gives(tmp_path, text):
     scenario = load(tmp_path, text)

@@ -16,6 +16,7 @@ def drawn() -> tuple[estimator.WindowPanel, ...]:
     return estimator.estimator_data(Runs("paper"))
 
 
+@pytest.mark.slow
 def test_only_two_contacts_show_the_gap(drawn):
     both, one, none = drawn
     assert set(np.sign(both.pushed)) == {-1.0, 0.0, 1.0}
@@ -65,6 +66,7 @@ def test_the_sensitivity_is_the_derivative(drawn):
     assert np.linalg.norm(left) <= np.linalg.norm(raw)
 
 
+@pytest.mark.slow
 def test_drawn(drawn, tmp_path):
     with style.look():
         figure = estimator.plot(drawn)

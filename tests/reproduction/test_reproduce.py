@@ -45,11 +45,13 @@ def test_the_envelope_keeps_extremes_and_ends(size, seed, columns):
     assert np.all(np.diff(t) > 0.0)
 
 
+@pytest.mark.slow
 def test_the_same_figure_is_the_same_bytes(runs):
     vectors = [style.svg(reproduce.figure_spec("fig7").draw(runs), "fig7") for _ in range(2)]
     assert vectors[0] == vectors[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fig4", "fig5", "fig10b", "fig12", "figA1"])
 def test_figures_have_labels_with_units_and_a_legend(runs, name):
     drawn = reproduce.figure_spec(name).draw(runs)
@@ -90,6 +92,7 @@ def small(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_a_small_reproduction_writes_its_report_and_claims(small):
     names = ["claims.json", "fig4.png", "fig4.svg", "fig7.png", "fig7.svg", "report.html"]
     assert sorted(path.name for path in small.iterdir()) == names
@@ -97,6 +100,7 @@ def test_a_small_reproduction_writes_its_report_and_claims(small):
     assert (small / "fig4.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_pool_of_processes_gives_the_same(small, tmp_path):
     reproduce.reproduce(tmp_path, only=("fig7", "crossover"), workers=2, console=quiet())
     assert (tmp_path / "fig7.svg").read_bytes() == (small / "fig7.svg").read_bytes()

@@ -102,6 +102,7 @@ def test_the_verdict_on_the_crossover_follows_the_preset(runs):
     assert verdicts == [Verdict.REPRODUCED, Verdict.NOT_AS_STATED, Verdict.REPRODUCED]
 
 
+@pytest.mark.slow
 def test_a_filtered_pd_with_the_required_bandwidth_exists():
     """That the printed sentence is not a law: an independent computation of the best one found."""
     servo = st.Servo.preset("paper")
@@ -119,6 +120,7 @@ def test_the_limit_cycle_is_the_known_one(runs):
     assert number(found, "amplitude, gap 10 deg") == pytest.approx(0.179574563547, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_fig_12_is_lost_where_it_is_known_to_be(runs):
     found = finding(runs, "lost-near-17")
     assert found.verdict is Verdict.REPRODUCED

@@ -50,6 +50,7 @@ def test_only_the_policy_differs():
         assert [one.commissioning.window for one in scenarios] == [1.0, 1.0, 1.0, 2.0, 2.0]
 
 
+@pytest.mark.slow
 def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_does_not(outcomes):
     certified, alone = outcomes["certified"], outcomes[ALONE]
     assert certified.steps[1].error < 1e-6
@@ -121,6 +122,7 @@ def test_a_policy_that_cannot_design_states_the_reason(monkeypatch):
     assert any("voltage limit" in text for text in rest)
 
 
+@pytest.mark.slow
 def test_every_policy_designs_in_noise():
     """The map behind `margin` is that of the loop that runs, its loop filter included."""
     found = PolicyJob("paper", "margin", NOISE, SHORT).run()
@@ -177,6 +179,7 @@ def test_the_chapter_stands_after_the_papers_figures(biased):
     assert "Beyond the paper" not in report.report([], drawn[:1], "paper")
 
 
+@pytest.mark.slow
 def test_one_figure_is_reproduced_with_its_numbers(tmp_path, monkeypatch):
     figure = replace(policies.FIGURES[0], data=policies.data_of(CLEAN, SHORT))
     monkeypatch.setattr(figures, "FIGURES", (figure,))

@@ -74,17 +74,20 @@ def servo(request):
     return Servo.preset(request.param)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 def test_zero_error_and_zero_voltage_inside_settle(servo, gap_deg):
     assert swing(servo, GATED, gap_deg) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS[1:])
 @pytest.mark.parametrize("reading", [UNGATED, KEPT, SHIFTED_UNGATED])
 def test_any_voltage_inside_keeps_the_loop_oscillating(servo, reading, gap_deg):
     assert swing(servo, reading, gap_deg) > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize("name", ["paper", "paper-gain2"])
 def test_resetting_the_controller_inside_diverges(name, gap_deg):

@@ -100,6 +100,7 @@ def test_what_is_forgotten_is_not_given() -> None:
         endless(Scenario.preset("fig15"), keep=100)
 
 
+@pytest.mark.slow
 def test_a_held_voltage_is_the_law_s_own_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Across stretches of the reference, the gap's knots and chunks of the inputs."""
     monkeypatch.setattr("servotwin.simulation.endless.STRETCH", 11.0)

@@ -79,6 +79,7 @@ def test_the_motor_starts_at_the_friction_s_voltage(rate: float | None, side: in
         assert final == pytest.approx(side * threshold * (ratio - 1.0) / PAPER.k_B, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("masses", "ki", "degrees", "growth", "zone", "volts", "bias"),
     [
@@ -183,6 +184,7 @@ def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
     assert np.all(np.abs(run.theta_m - run.theta_d) <= 0.5 * run.gap + slack)
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(**(FRICTION_CASES | {"rate": st.just(None)}))
 @example(degrees=9.864783163098648, volts=0.001, ki=18907.6, zone=4.0, rate=None, wearing=False)

@@ -86,6 +86,7 @@ def test_most_random_runs_can_be_compared(cases: list[tuple[int, Case, float]]) 
     }
 
 
+@pytest.mark.slow
 def test_against_solve_ivp(cases: list[tuple[int, Case, float]]) -> None:
     """DOP853 at 1e-12, restarted at every event, on the first eight."""
     for seed, case, sensitive in cases[:8]:
@@ -96,6 +97,7 @@ def test_against_solve_ivp(cases: list[tuple[int, Case, float]]) -> None:
         assert count == np.count_nonzero(run.events.state_triggered) >= 10, seed
 
 
+@pytest.mark.slow
 def test_against_exponentials(cases: list[tuple[int, Case, float]]) -> None:
     """scipy's expm on a grid and brentq, on all; the events agree in kind and time."""
     for seed, case, sensitive in cases:
@@ -112,6 +114,7 @@ def test_against_exponentials(cases: list[tuple[int, Case, float]]) -> None:
         assert np.all(off[bounce] < 2e-4), seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
 def test_the_presets_against_exponentials(preset: str) -> None:
     servo = Servo.preset(preset)
@@ -129,6 +132,7 @@ def elastic_case(seed: int) -> Case:
     return replace(case, servo=case.servo.replace(k_d=10.0 ** np.random.default_rng(seed).uniform(5.0, 6.5)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_elastic_screw_whose_load_acts_back(seed: int) -> None:
     case = elastic_case(seed)

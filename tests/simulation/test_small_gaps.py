@@ -29,6 +29,7 @@ def tiny(seed: int) -> tuple[Servo, dict[str, object]]:
     return servo, signals
 
 
+@pytest.mark.slow
 def test_the_coarse_search_misses_nothing() -> None:
     """30 runs of 20 s: the same events when every sample is looked at (refine 8), and four times finer still."""
     differing, events = [], 0
@@ -82,6 +83,7 @@ def degenerate(seed: int) -> tuple[Servo, dict[str, object]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", range(4))
 def test_degenerate_inputs_run(block: int) -> None:
     for seed in range(30 * block, 30 * block + 30):

@@ -41,6 +41,7 @@ def options_of(rate: float | None, **changes: object) -> dict:
     } | changes
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     at=st.integers(1, 3999),

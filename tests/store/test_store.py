@@ -23,6 +23,7 @@ def rows(store: Store, table: sa.Table) -> int:
         return connection.execute(sa.select(sa.func.count()).select_from(table)).scalar_one()
 
 
+@pytest.mark.slow
 def test_a_message_is_kept_once(store: Store) -> None:
     assert store.put([window(), window(sequence=2), window("b")]) == [NEW, NEW, NEW]
     assert store.put([window(), window(sequence=3)]) == [KNOWN, NEW]
@@ -241,6 +242,7 @@ def test_a_message_that_arrives_while_its_servo_is_leased_is_not_lost(store: Sto
     assert (again.serial, len(again.messages)) == (1, 1)
 
 
+@pytest.mark.slow
 def test_no_message_is_lost_when_results_and_messages_are_committed_at_once(store: Store) -> None:
     total, done = 150, threading.Event()
 

@@ -151,6 +151,7 @@ def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, lat
 # Retention
 
 
+@pytest.mark.slow
 def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_update(new_address: NewAddress) -> None:
     store = open_store(new_address())
     store.put([window(sequence=n, body=bytes(1000), received=100.0 + n) for n in range(10)])

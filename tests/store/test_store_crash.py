@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 import sqlalchemy as sa
 import store_process
 from store_cases import NewAddress, window
@@ -82,6 +83,7 @@ def check_each_once(store: Store) -> None:
         assert serials == list(range(1, servo.posted + 1))
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_of_group_commits(new_address: NewAddress) -> None:
     url = new_address()
     safe: set[tuple[str, int]] = set()
@@ -110,6 +112,7 @@ def no_process() -> Iterator[None]:
     yield None
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_the_middle_of_results(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
@@ -122,6 +125,7 @@ def test_a_worker_killed_in_the_middle_of_results(new_address: NewAddress) -> No
     store.close()
 
 
+@pytest.mark.slow
 def test_the_leases_of_a_killed_process_go_to_another_one(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)
@@ -135,6 +139,7 @@ def test_the_leases_of_a_killed_process_go_to_another_one(new_address: NewAddres
     store.close()
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_work_and_one_is_killed(new_address: NewAddress) -> None:
     url = new_address()
     store = open_store(url)

@@ -31,6 +31,7 @@ SECRET = "unspeakable"
 # Migrations
 
 
+@pytest.mark.slow
 def test_the_migrations_make_the_tables_that_the_code_knows(new_address: NewAddress) -> None:
     store = open_store(new_address())
     with transaction(store.engines.reader) as connection:
@@ -47,6 +48,7 @@ def test_the_newest_migration_is_the_revision_of_the_code() -> None:
     assert ScriptDirectory(str(migrations.SCRIPTS)).get_current_head() == REVISION
 
 
+@pytest.mark.slow
 def test_an_old_database_is_brought_up_to_date_with_all_it_holds(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     store = filled(url)
@@ -173,6 +175,7 @@ def test_a_password_of_its_own_replaces_that_of_the_address() -> None:
     assert parse_address("postgresql://u:old@h/d").password == "old"
 
 
+@pytest.mark.slow
 def test_without_psycopg_the_error_names_the_extra() -> None:
     program = """
 import sys
@@ -191,6 +194,7 @@ except InvalidInput as error:
     assert SECRET not in output
 
 
+@pytest.mark.slow
 def test_a_server_that_cuts_its_connections_is_survived() -> None:
     with postgres.running() as server:
         store = open_store(server.database("cut"))
@@ -203,6 +207,7 @@ def test_a_server_that_cuts_its_connections_is_survived() -> None:
         store.close()
 
 
+@pytest.mark.slow
 def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in() -> None:
     """Two twins that lock rows in different orders wait for each other until the server ends one of them."""
     names = ["ax-1", "Ax-2", "AX-3", "b", "B"]

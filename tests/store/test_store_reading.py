@@ -1,5 +1,6 @@
 """Queries of the store: outgoing messages, summaries, windows, and the evidence chain in one query."""
 
+import pytest
 import sqlalchemy as sa
 from store_cases import NewAddress, bodies_of, claim, letter, outcome, verification, window
 
@@ -9,6 +10,7 @@ from servotwin.store.store import Store, open_store
 pytest_plugins = ("store_fixtures",)
 
 
+@pytest.mark.slow
 def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
     for sequence in (1, 2):
         store.put([window(sequence=sequence), window("b", sequence)])

@@ -50,6 +50,7 @@ def estimated(name: str) -> tuple[list[tuple[bytes, bytes, str]], ServoModel]:
     return found, model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("given_model", [False, True])
 def test_every_stored_estimate_comes_out_again(name, given_model):
@@ -60,6 +61,7 @@ def test_every_stored_estimate_comes_out_again(name, given_model):
         assert (again.same, again.differs, again.changed) == (True, (), ())
 
 
+@pytest.mark.slow
 def test_in_another_process_too():
     script = (
         "import sys, pickle; from servotwin.twin.replay import replay\n"

@@ -72,6 +72,7 @@ def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
     assert model.first_setting.gains != gains_of(scenario.law)
 
 
+@pytest.mark.slow
 def test_where_nothing_is_proved_nothing_is_known_of_the_start():
     settings = TwinSettings(uncertainty=TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0)))
     assert ServoModel("axis", Servo.preset("paper"), settings).first_setting is None

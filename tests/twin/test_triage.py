@@ -107,6 +107,7 @@ def test_its_spread_is_honest_in_coloured_noise() -> None:
     assert max(fit.std for fit, _ in found) < 0.1 * DEG
 
 
+@pytest.mark.slow
 def test_one_contact_shows_the_gap_with_the_offset_and_nothing_without() -> None:
     for message in calm_windows()[4:]:
         window = decode_window(message)
@@ -149,6 +150,7 @@ def test_where_nothing_moved_a_glance_is_enough(noisy: bool) -> None:
     assert [one.why for one in glances] == ["nothing moved"] * len(glances)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("moved", [0.4, -0.4, 2.0])
 def test_a_gap_that_moved_is_always_seen(noisy: bool, moved: float) -> None:
@@ -260,6 +262,7 @@ def test_a_twin_without_triage_estimates_every_window() -> None:
     assert len(store.estimates) == 4
 
 
+@pytest.mark.slow
 def test_wear_is_followed_as_closely_as_without_triage() -> None:
     """Fig 15's, in the calm loop: the gap grows by some degrees from window to window, and none is spared."""
     scenario = Scenario.preset("calm").replace(duration=100.0)
@@ -269,6 +272,7 @@ def test_wear_is_followed_as_closely_as_without_triage() -> None:
     assert [one.gap for one in loop.estimates] == [one.gap for one in plain.estimates]
 
 
+@pytest.mark.slow
 def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
     before = calm_windows()
     after = cosimulate(Scenario.preset("certified").replace(gap=26.0 * DEG, duration=85.0)).windows[3:]
@@ -334,6 +338,7 @@ def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
 # --- the bench
 
 
+@pytest.mark.slow
 def test_the_bench_says_how_often_a_glance_errs(tmp_path) -> None:
     output = tmp_path / "triage.json"
     rows = bench(output=output, gaps=2, console=Console(file=io.StringIO()))

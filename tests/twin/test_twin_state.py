@@ -112,6 +112,7 @@ def both(name: str) -> tuple[Loop, Loop, Reborn]:
     return run(scenario), run(scenario, remote), remote
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_twin_that_dies_after_every_message_says_the_same(name):
     living, reborn, remote = both(name)

@@ -106,6 +106,7 @@ def begun(fleet: ModelRegistry) -> tuple[Queue, Update, Incoming]:
     return queue, update, asked
 
 
+@pytest.mark.slow
 def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: ModelRegistry) -> None:
     _, update, asked = begun(fleet)
     question = decode_request(asked.body)
@@ -158,6 +159,7 @@ def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: M
     assert said["redesign"].endswith("are asked; the fallback set is sent")
 
 
+@pytest.mark.slow
 def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, asked = begun(fleet)
     with monkeypatch.context() as patched:

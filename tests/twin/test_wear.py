@@ -121,6 +121,7 @@ def errors_deg(loop: Loop) -> np.ndarray:
     return np.degrees([e.gap for e in loop.estimates if e.ok] - truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "largest"), [("fig15", 0.003), ("fig15-sampled", 0.003), ("calm", 0.003)])
 def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
     loop = loop_of(name)
@@ -131,6 +132,7 @@ def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
     assert [update.gap for update in loop.updates] == [e.gap for e in loop.estimates]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2023, 2024, 2025])
 def test_in_the_papers_noise_what_is_accepted_is_right(seed):
     loop = cosimulate(ours(Scenario.preset("fig16")).replace(seed=seed))
@@ -181,6 +183,7 @@ def test_the_first_window_has_no_time_before_its_step():
     assert loop.windows[1].reference_changes == ((20.0, -1e-3),)
 
 
+@pytest.mark.slow
 def test_a_calm_loop_does_not_show_its_gap_in_a_second_after_the_step():
     """Not in the window alone; what the encoder's offset does for it is in test_carried.py."""
     loop = calm(1.0, 0.0)
@@ -212,6 +215,7 @@ def test_an_outlier_is_not_what_is_expected_next():
     assert math.degrees(wear.expect("boot-1", 140.0, 142.0).previous) == pytest.approx(41.0)
 
 
+@pytest.mark.slow
 def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
     """Each step ends inside the dead zone, before the screw comes to the other side: the carried offset makes up for
     it."""
@@ -221,6 +225,7 @@ def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
     assert np.max(np.abs(errors_deg(loop))) < 0.05
 
 
+@pytest.mark.slow
 def test_sixteen_bits_for_the_angle_cost_hundredths_of_a_degree():
     """Decision 8: what the angle's rounding does, and that of the position does not."""
     fine, coarse = (loop_of("fig15", fine_angle=fine) for fine in (True, False))

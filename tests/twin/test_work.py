@@ -111,6 +111,7 @@ def test_equal_claims_give_equal_outcomes():
     assert work(fleet(), sent, 7.0) == work(fleet(), sent, 7.0)
 
 
+@pytest.mark.slow
 def test_and_in_another_process():
     """Where strings hash otherwise; the context may be another, as sources may be edited meanwhile."""
     script = (
@@ -168,6 +169,7 @@ SPOILT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_cannot_be_used_is_evidence_and_the_rest_goes_on(kind):
     spoilt, said = SPOILT[kind]
@@ -326,6 +328,7 @@ def test_the_tail_is_the_largest_error_in_the_last_tenth():
     assert DecodedWindow.of(alone).tail is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["certified", "calm"])
 def test_it_says_what_the_twin_of_the_simulation_says(name):
     """Every message of a scenario in the order and at the times in which it came."""

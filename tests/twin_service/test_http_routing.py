@@ -5,6 +5,7 @@ import contextlib
 from typing import Any
 
 import msgspec
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from service_system import OPERATOR, OTHER, TOKEN, served, twin_file, window
@@ -65,6 +66,7 @@ async def answered(app: Any, scope: dict[str, Any], parts: list[bytes]) -> tuple
     return sent[0]["status"], sorted(sent[0]["headers"]), b"".join(event.get("body", b"") for event in sent[1:])
 
 
+@pytest.mark.slow
 @given(st.lists(requests(), min_size=1, max_size=40))
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory, requested):

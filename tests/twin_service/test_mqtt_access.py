@@ -51,6 +51,7 @@ def test_the_files_that_the_guide_shows_are_read(tmp_path: Path) -> None:
     assert (result.mqtt.broker.password, result.mqtt.group, result.mqtt.local) == ("secret", "twins", False)
 
 
+@pytest.mark.slow
 def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path: Path, store: Store) -> None:
     rules = shown("pattern write")
     logins = Login("twins", "twin's password"), Login("axis-1", "edge's password")
@@ -64,6 +65,7 @@ def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path:
     assert (kept(store), kept(store, "axis-2")) == ([0], [])
 
 
+@pytest.mark.slow
 def test_a_user_and_a_password_where_the_broker_asks_for_them(tmp_path: Path, store: Store) -> None:
     logins = Login("edge", "edge's password"), Login("twin", "twin's password")
     with broker(tmp_path / "broker", logins) as server:
@@ -76,6 +78,7 @@ def test_a_user_and_a_password_where_the_broker_asks_for_them(tmp_path: Path, st
     assert "password" not in repr(edges)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_over_tls_the_brokers_certificate_is_checked(tmp_path: Path, store: Store) -> None:
     """The socket of a handshake that failed is left by paho to the garbage collector, which warns."""

@@ -66,6 +66,7 @@ def statuses(system, servo="ax-1"):
     return {link.window.sequence: [result.status[:8] for result in link.found] for link in links}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["die", "hang", "raise"])
 def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_processed_once(tmp_path, fault, caplog):
     async def body():
@@ -93,6 +94,7 @@ def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_process
     asyncio.run(body())
 
 
+@pytest.mark.slow
 def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path):
     async def body():
         async with working(twin_file(tmp_path)) as (system, client):
@@ -116,6 +118,7 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
     asyncio.run(body())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SYSTEMS)
 def test_windows_are_processed_and_the_edge_is_notified(tmp_path, kind):
     async def body(url):
@@ -138,6 +141,7 @@ def shown(url):
     return f"{head}://{who.split(':')[0]}{at}{where}"
 
 
+@pytest.mark.slow
 def test_processes_share_one_database_and_notify_each_other_s_edges(tmp_path):
     async def body(url):
         file = twin_file(tmp_path, f'store = "{shown(url)}"')

@@ -41,6 +41,7 @@ def raw(_context, value):
     return value.data if hasattr(value, "data") else value
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
 def test_requests_that_the_openapi_document_allows(described, data):
@@ -70,6 +71,7 @@ def bodies(draw):
     return {"whole": whole, "cut": whole[:at], "flipped": flipped, "more": whole + draw(st.binary(max_size=50))}[kind]
 
 
+@pytest.mark.slow
 @given(
     body=bodies(),
     sent=st.sampled_from(["", "deflate", "zstd"]),
@@ -106,6 +108,7 @@ def test_decompression_gives_no_more_than_is_allowed(data, encoding, whole):
         assert refusal is not None or result == data * 40
 
 
+@pytest.mark.slow
 @given(st.text(max_size=100), st.text(max_size=40))
 @settings(max_examples=25, deadline=None)
 def test_headers_and_queries(tmp_path_factory, header, query):

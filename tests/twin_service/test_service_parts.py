@@ -246,6 +246,7 @@ def test_a_message_posted_while_the_store_is_read_is_not_missed():
     asyncio.run(body())
 
 
+@pytest.mark.slow
 @given(
     servos=st.dictionaries(st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,20}\Z"), st.binary(min_size=32, max_size=32)),
     operators=st.dictionaries(st.sampled_from(["me", "you"]), st.binary(min_size=32, max_size=32)),

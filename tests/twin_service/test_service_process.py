@@ -91,6 +91,7 @@ def children(pid: int) -> list[int]:
     return [int(each) for each in result.split()]
 
 
+@pytest.mark.slow
 def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_order(tmp_path):
     with process(twin_file(tmp_path)) as (running, url):
         with httpx.Client(base_url=url, timeout=PATIENCE) as client:
@@ -131,6 +132,7 @@ def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_orde
         assert token not in log
 
 
+@pytest.mark.slow
 def test_a_poll_that_waits_does_not_hold_up_the_end(tmp_path):
     with process(twin_file(tmp_path)) as (running, url):
         answers = []
@@ -147,6 +149,7 @@ def test_a_poll_that_waits_does_not_hold_up_the_end(tmp_path):
         assert unpacked(answers[0].content) == []
 
 
+@pytest.mark.slow
 def test_killed_in_midstream_every_acknowledged_window_is_stored_once(tmp_path):
     path, sequence, acknowledged = twin_file(tmp_path, "rate_burst = 1e6"), 0, []
     for _ in range(3):
@@ -170,6 +173,7 @@ def test_killed_in_midstream_every_acknowledged_window_is_stored_once(tmp_path):
     assert set(acknowledged) <= set(kept) <= {*acknowledged, sequence}
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_service_that_is_killed_and_its_work_is_taken_up_again(tmp_path):
     path = twin_file(tmp_path)
     with process(path) as (running, url):
@@ -186,6 +190,7 @@ def test_workers_end_with_a_service_that_is_killed_and_its_work_is_taken_up_agai
     assert [len([f for f in link["found"] if f["kind"] == "estimate"]) for link in links] == [1] * 20
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(tmp_path):
     with process(twin_file(tmp_path)) as (running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
         for sequence in range(10):
@@ -199,6 +204,7 @@ def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(tmp_path):
         assert "servotwin_workers_lost_total" in client.get("/metrics").text
 
 
+@pytest.mark.slow
 def test_tls_with_a_self_made_certificate(tmp_path):
     certificate, _ = self_made(tmp_path)
     service = 'tls_certificate = "twin.crt"\ntls_key = "twin.key"'
@@ -213,10 +219,11 @@ def test_tls_with_a_self_made_certificate(tmp_path):
             client.get("/healthz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("service", "tokens", "expected"),
     [
-        ('bind = "0.0.0.0"', False, "only with tokens"),
+        ('bind = "0.0.0.0"', False, "this requires tokens"),
         ('bind = "0.0.0.0"', True, "behind_proxy"),
         ('bind = "elsewhere"', True, "IP address"),
         ('store = "postgresql://me:secret@host/twin"', True, "store_password_file"),
@@ -237,6 +244,7 @@ def test_a_file_that_is_not_allowed_is_one_sentence_and_2(tmp_path, service, tok
     assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
+@pytest.mark.slow
 def test_tokens_that_others_may_read_are_refused(tmp_path):
     path = twin_file(tmp_path)
     (tmp_path / "tokens.toml").chmod(0o644)
@@ -246,6 +254,7 @@ def test_tokens_that_others_may_read_are_refused(tmp_path):
     assert "chmod 600" in result.stderr
 
 
+@pytest.mark.slow
 def test_bytes_that_are_no_request_do_no_harm(tmp_path):
     with process(twin_file(tmp_path)) as (_running, url):
         address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
@@ -272,6 +281,7 @@ def test_bytes_that_are_no_request_do_no_harm(tmp_path):
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "begun",
     [
@@ -291,6 +301,7 @@ def test_one_endless_header_is_cut_before_it_fills_the_memory(tmp_path, begun):
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
 
 
+@pytest.mark.slow
 def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_path):
     path = twin_file(tmp_path)
     with process(path) as (running, url):

@@ -81,6 +81,7 @@ def test_an_edge_of_the_version_before_starts_on_its_parameters(folder: Path) ->
     assert band.settling == 4.0
 
 
+@pytest.mark.slow
 def test_unsent_messages_of_an_edge_of_the_version_before_reach_its_twin_which_continues(folder: Path) -> None:
     outbox = SqliteOutbox(folder / "edge" / "outbox.sqlite", "quick")
     parcels = [outbox.parcel(key) for key in outbox.pending()]

@@ -8,6 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 import msgspec
+import pytest
 from deployment import Process
 from machines import machine
 from services import service
@@ -70,6 +71,7 @@ keep_s = 100.0
 """
 
 
+@pytest.mark.slow
 def test_free_running_is_simulated(tmp_path: Path) -> None:
     """The same windows are accepted, and the gap lies within its interval as often as it should."""
     (tmp_path / "scenario.toml").write_text(SCENARIO)

@@ -110,6 +110,7 @@ def test_without_a_file_of_tokens_nobody_is_enrolled(tmp_path):
     assert "tokens" in result.stderr
 
 
+@pytest.mark.slow
 def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeypatch):
     twin, token = twin_file(tmp_path), tmp_path / "operator"
     assert run("enroll", "boss", "--operator", token, "--twin", twin).exit_code == 0

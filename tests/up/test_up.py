@@ -87,11 +87,12 @@ def stored(path: Path) -> dict[str, set[str]]:
         store.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
 def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path: Path) -> None:
     path = tmp_path / "up"
     with started(path, "--for", "5", "--speed", "10") as first:
-        lines = told(first, "all has ended")
+        lines = told(first, "all processes have ended")
         assert first.wait(PATIENCE_S) == 0
     assert "made: " in lines[0]
     [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
@@ -119,7 +120,7 @@ def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path
         with started(path, "--speed", "10") as third:
             told(third, RUNNING)
             third.send_signal(signal.SIGINT)
-            assert "all has ended" in told(third, "all has ended")[-1]
+            assert "all processes have ended" in told(third, "all processes have ended")[-1]
             assert third.wait(PATIENCE_S) == 0
     assert eventually(lambda: not left_behind(path))
     assert all(after > former + 5.0 for former, after in zip(before, times(path), strict=True))
@@ -149,6 +150,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.slow
 def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "up"
     with folder.opened(path) as made:
@@ -169,6 +171,7 @@ def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> 
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [("--speed", "0"), ("--speed", "101"), ("--for", "-1")])
 def test_an_invalid_speed_or_time_is_refused(tmp_path: Path, options: tuple[str, str]) -> None:
     command = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), *options]
