@@ -1,4 +1,4 @@
-"""What servotwin raises when the user's input is at fault."""
+"""Error of servotwin for input that the user has to mend."""
 
 
 class InvalidInput(ValueError):

@@ -137,7 +137,7 @@ class AgentSettings:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
 
     def _check_longest(self) -> None:
-        """What may be requested is at least what is configured, and fits together."""
+        """Check that the longest window and pre-trigger are at least the configured ones, and fit together."""
         for name in ("window_s", "pre_trigger_s"):
             longest, configured = getattr(self, f"longest_{name}"), getattr(self, name)
             if longest is None:

@@ -67,7 +67,7 @@ class TwinLink:
 
     @property
     def over_mqtt(self) -> bool:
-        """Whether the twin is reached over a broker."""
+        """True if the twin is reached over a broker."""
         return is_mqtt(self.url)
 
 
@@ -170,7 +170,7 @@ class EdgeConfig:
         return Table(self.source, self.drive, "drive")
 
     def path(self, name: str) -> Path:
-        """Where a file of the configuration is."""
+        """Path of a file that the configuration names."""
         return self.folder / name
 
     def settings(self, boot: str) -> AgentSettings:
