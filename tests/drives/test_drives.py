@@ -93,7 +93,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
     same.advance(moved)
     same.set_reference(shifted(as_pieces(scenario.reference, 10.0), PiecewiseCubic.constant(2e-4)))
     run, blocks = whole(same), before + between + after
-    assert changed == 2345 + wire.MOST
+    assert changed == 2345 + wire.MAX_SAMPLES
     assert [block.version for block in blocks] == [0, 0] + [7] * (len(blocks) - 2)
     assert [block.first for block in blocks[1:]] == [block.last for block in blocks[:-1]]
     for values, name in zip(joined(blocks), CHANNELS, strict=True):

@@ -171,7 +171,7 @@ def test_a_signal_from_a_time_on_is_the_same_later(begin: float, time: float) ->
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": "other"}', "\xff", '{"time_s": -1}'])
 def test_an_invalid_state_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "state.json").write_text(text, encoding="latin-1")
-    with pytest.raises(InvalidInput, match=r"state\.json: is no state of a machine"):
+    with pytest.raises(InvalidInput, match=r"state\.json: holds no machine state"):
         read_state(tmp_path / "state.json")
 
 
