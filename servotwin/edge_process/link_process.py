@@ -62,7 +62,7 @@ class FrameHandler:
 
     def __init__(self, config: EdgeConfig, outbox: SqliteOutbox) -> None:
         self._config, self._outbox = config, outbox
-        self._store = FileParameterStore(config.path(config.keeping.parameters))
+        self._store = FileParameterStore(config.path(config.files.parameters))
         self._unsaved: SaveFrame | None = None
         self._writer: WindowWriter | None = None
         self._boot = ""
@@ -149,8 +149,8 @@ class LinkProcess:
 
     def __init__(self, config: EdgeConfig, end: socket.socket) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
-        keeping = config.keeping
-        self.outbox = SqliteOutbox(config.path(keeping.outbox), config.agent.servo, keeping.windows, keeping.bytes)
+        files = config.files
+        self.outbox = SqliteOutbox(config.path(files.outbox), config.agent.servo, files.windows, files.bytes)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = _token(config), False
@@ -231,7 +231,7 @@ class LinkProcess:
         self._log_troubles()
         self._check_token()
         try:
-            write_status(self._config.path(self._config.keeping.status), self._status())
+            write_status(self._config.path(self._config.files.status), self._status())
         except OSError:
             self._faults["status not written"] += 1
 

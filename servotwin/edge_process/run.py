@@ -71,8 +71,8 @@ def run(path: str | os.PathLike[str]) -> None:
 def _run(config: EdgeConfig, path: Path) -> None:
     connect = table.control_drive if config.role == "control" else table.supervised_drive
     drive: Drive = connect(config.drive_table, config.folder)
-    first = permitted(stored_parameters(config.path(config.keeping.parameters)), config.agent)
-    boot = next_boot(config.path(config.keeping.boots), os.urandom(8))
+    first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent)
+    boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
     child = LinkChild(link_command(path), outlet)
     stop = StopSignal()

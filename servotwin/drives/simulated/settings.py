@@ -58,8 +58,8 @@ class MachineSettings:
         key(
             "slack_s",
             above=0.0,
-            help="Longest delay (by the clock) that is caught up. A longer one of the edge is a missed tick, a longer one "
-            "of the machine is lost machine time.",
+            help="Longest delay (by the clock) that is caught up. A longer one of the edge is a missed tick, one of "
+            "the machine is lost machine time.",
         ),
     ] = 0.25
     block: Annotated[

@@ -1,9 +1,9 @@
 """Protocol between a simulated machine and its client: messages of fixed sizes, little-endian.
 
 The client sends HELLO once, and the machine answers WELCOME once. In the role control the machine then sends a SAMPLE
-at each sample instant, and the client answers each with a VOLTAGE. In the role supervise the client sends one REQUEST at
-a time, and the machine answers each with a REPLY; `count` samples follow it (signal after signal, doubles) or, after a
-refusal, `count` bytes of text.
+at each sample instant, and the client answers each with a VOLTAGE. In the role supervise the client sends one REQUEST
+at a time, and the machine answers each with a REPLY; `count` samples follow it (signal after signal, doubles) or, after
+a refusal, `count` bytes of text.
 """
 
 import socket
