@@ -73,7 +73,7 @@ def transition(step: float) -> Array:
 
 
 def process_noise(step: float, settings: TrendSettings) -> Array:
-    """(3, 3) covariance that `step` seconds of the random walks add: exact, so that steps can be split at will."""
+    """(3, 3) covariance that `step` seconds of the random walks add: exact however the time is divided."""
     gap, rate = settings.gap_walk_rad_per_sqrt_s**2, settings.rate_walk_rad_per_s_per_sqrt_s**2
     noise = np.zeros((3, 3))
     noise[GAP, GAP] = gap * step + rate * step**3 / 3.0

@@ -291,7 +291,7 @@ def test_a_servo_without_a_model_fails_without_a_word_to_it():
     outcome = work(lost, claim(windows()[0], state=b"kept", serial=3), 0.0)
     assert (outcome.state, outcome.serial, outcome.done, outcome.wake) == (b"kept", 3, (1,), None)
     assert statuses(outcome) == [
-        "failed: servo 'axis' has no model: [servos] names it neither by itself nor by a pattern"
+        "failed: servo 'axis' has no model: [servos] has neither its name nor a pattern that fits"
     ]
 
 

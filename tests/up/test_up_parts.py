@@ -273,5 +273,5 @@ def test_a_truth_outside_of_the_interval_is_marked() -> None:
 
 
 def test_files_of_a_machine_belong_to_one_that_runs_on(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="run on"):
+    with pytest.raises(InvalidInput, match="allowed only with speed > 0"):
         replace(machine(tmp_path), speed=0.0)

@@ -87,7 +87,9 @@ class MachineSettings:
         check(self)
         rate, law = self.rate, self.scenario.law.sample_rate
         if law is None:
-            raise InvalidInput("scenario controller sample rate: must be a number in Hz; the controller is continuous")
+            raise InvalidInput(
+                "scenario controller sample rate: must be a number in Hz, but the controller is continuous"
+            )
         if self.role == "control" and law != rate:
             raise InvalidInput(f"scenario controller sample rate = {law!r} Hz: must be the recording's, {rate!r} Hz")
         if not 1 <= self.block_samples <= wire.MAX_SAMPLES:

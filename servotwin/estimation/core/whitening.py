@@ -127,7 +127,7 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
     predictors, power = np.zeros((most + 1, most + 1)), np.zeros(most + 1)
     predictors[0, 0] = 1.0
     power[0] = np.sum(series * series) / (count * size)
-    # A backward error stands where the series begins that it was predicted from: beside its forward error.
+    # A backward error is stored at the first sample of its series: beside the forward error of the same stage.
     forward, backward = series.copy(), series.copy()
     for order in range(1, most + 1):
         across = square = 0.0
