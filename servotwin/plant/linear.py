@@ -152,13 +152,19 @@ class LinearSystem:
 
 def zero_order_hold(A: Array, B: Array, step: float) -> tuple[Array, Array]:
     """(A_d, B_d) of x' = A x + B u over `step` seconds of constant u (zero-order hold), by a matrix exponential."""
+    advance, drive = zero_order_holds(A[None], B[None], step)
+    return advance[0], drive[0]
+
+
+def zero_order_holds(A: Array, B: Array, step: float) -> tuple[Array, Array]:
+    """`zero_order_hold` of (P, n, n) and (P, n) systems."""
     from scipy.linalg import expm
 
-    size = B.size
-    flow = np.zeros((size + 1, size + 1))
-    flow[:size, :size], flow[:size, size] = A, B
+    size = B.shape[1]
+    flow = np.zeros((len(A), size + 1, size + 1))
+    flow[:, :size, :size], flow[:, :size, size] = A, B
     advance = expm(flow * step)
-    return advance[:size, :size], advance[:size, size]
+    return advance[:, :size, :size], advance[:, :size, size]
 
 
 def gain(value: float) -> LinearSystem:

@@ -249,7 +249,7 @@ def summarise_members(
             group.rows,
             group.members,
             1.0 / sample_rate,
-            _samples(duration, sample_rate),
+            samples_of(duration, sample_rate),
             options,
             threads,
         )
@@ -258,7 +258,8 @@ def summarise_members(
     return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
 
 
-def _samples(duration: float, sample_rate: float) -> int:
+def samples_of(duration: float, sample_rate: float) -> int:
+    """Number of samples of a run, both ends included."""
     if not (0.0 < duration < np.inf and 0.0 < sample_rate < np.inf):
         raise InvalidInput(f"duration = {duration} s at sample_rate = {sample_rate} Hz: must be positive and finite")
     return round(duration * sample_rate) + 1
@@ -273,7 +274,7 @@ def _traces(
     dead_zone: bool | None = None,
 ) -> Array:
     """(K, O, N) outputs of all members."""
-    groups, samples = members.groups(outputs, dead_zone), _samples(duration, sample_rate)
+    groups, samples = members.groups(outputs, dead_zone), samples_of(duration, sample_rate)
     runs = [
         run_family(group.automata, group.rows, group.members, 1.0 / sample_rate, samples, threads)[0]
         for group in groups
@@ -298,7 +299,7 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     values = [np.asarray(value, dtype=float) for value in cases]
     shape = np.broadcast_shapes(plants.shape, laws.shape, *(value.shape for value in values))
     constants = {name: np.broadcast_to(value, shape).ravel() for name, value in zip(Cases._fields, values, strict=True)}
-    _check(constants)
+    check_constants(constants)
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
     every_law = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
@@ -309,7 +310,8 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     return EnsembleMembers(shape, every_servo, every_law, constants)
 
 
-def _check(constants: dict[str, Array]) -> None:
+def check_constants(constants: dict[str, Array]) -> None:
+    """Refuse constants that are not finite, or negative where they must not be."""
     for name, values in constants.items():
         allowed = "finite and 0 or more" if name in NOT_NEGATIVE else "finite"
         if not np.isfinite(values).all() or (name in NOT_NEGATIVE and values.min(initial=0.0) < 0.0):

@@ -40,7 +40,7 @@ _RECORDED = ("theta_m", "theta_d", "voltage")
 @dataclass
 class SampledEngine:
     """Engine of a `Simulation` whose controller has a sample rate; with `keep` it stores at least that many samples,
-    and no events."""
+    and no events. A voltage is applied `delay` ticks after its measurement; zero until then."""
 
     servo: Servo
     controller: Controller
@@ -50,6 +50,7 @@ class SampledEngine:
     noise: Noise | None
     rng: np.random.Generator
     keep: int | None = None
+    delay: int = 0
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
@@ -87,6 +88,7 @@ class SampledEngine:
             self.record_every,
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
+            np.zeros(self.delay),
         )
 
     @property

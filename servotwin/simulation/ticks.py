@@ -29,6 +29,7 @@ class Port(NamedTuple):
     record_every: int
     searches: int  # search steps per base step
     room: int  # events after which the record counts as full
+    delayed: Array  # (d,) voltages that are computed but not yet applied, tick i's at i % d; empty: no delay
 
 
 class TickInputs(NamedTuple):
@@ -55,7 +56,7 @@ class Output(NamedTuple):
 def take_tick(
     i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, tick_inputs: TickInputs, output: Output
 ) -> LawState:
-    """Measure, tick, hold the voltage."""
+    """Measure, tick, hold the voltage (that of `delayed.size` ticks ago)."""
     k = i - tick_inputs.first
     y = x[port.position] + tick_inputs.noise[k]
     if port.resolution > 0.0:
@@ -75,7 +76,12 @@ def take_tick(
         parameters.release_step,
     )
     state = tick(now, state, tick_inputs.reference[k], y)
-    x[port.voltage] = state.voltage
+    if port.delayed.size == 0:
+        x[port.voltage] = state.voltage
+    else:
+        place = i % port.delayed.size
+        x[port.voltage] = port.delayed[place]
+        port.delayed[place] = state.voltage
     output.measured[i - output.first_tick] = y
     output.active[i - output.first_tick] = 1 if state.active > 0.5 else 0
     return state

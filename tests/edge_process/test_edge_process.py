@@ -201,7 +201,9 @@ def test_without_a_twin_an_edge_controls_and_stores_windows(edge: RunningEdge, m
 
 @pytest.mark.slow
 def test_a_terminal_that_is_closed_leaves_the_safe_voltage(edge: RunningEdge, machine: StubMachine) -> None:
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup the edge would ignore it, as it should
     edge.start()
+    signal.signal(signal.SIGHUP, inherited)
     until(lambda: edge.status().get("samples", 0) > 0)
     assert edge.process is not None
     os.killpg(edge.process.pid, signal.SIGHUP)

@@ -1,11 +1,9 @@
 """The sampled loop: against an interpreted one on a plant of its own, the continuous loop, and its invariants."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
-from event_oracle import OracleGuard, OracleMode, follow
-from paper_loop import CURRENT, MOTOR, RESTING, SCREW, SPEED, Array, Case, Loop
+from held_plant import HeldPlant
+from paper_loop import MOTOR, SCREW, Array
 
 from servotwin.control import law
 from servotwin.control.controller import Controller
@@ -19,43 +17,6 @@ from servotwin.simulation.sampled import SampledEngine
 
 DEGREE = np.pi / 180.0
 PAPER = Servo.preset("paper")
-
-
-@dataclass
-class Plant:
-    """Motor, screw and chain with the voltage held and a gap that wears linearly, by scipy's expm and brentq."""
-
-    servo: Servo
-    gap: float
-    wear: float
-    interval: float
-
-    def __post_init__(self) -> None:
-        self.loop = Loop(Case(self.servo, 0.0, 1.0, np.zeros(4), 0.0))
-        n = self.loop.size
-        unit = np.eye(n + 3)
-        self.volts, gap, rate = n, unit[n + 1], unit[n + 2]
-        apart, self.modes = unit[MOTOR] - unit[SCREW], []
-        for side in (-1, 0, 1):
-            A, _, b = self.loop.flow(side, 0)
-            full = np.zeros((n + 3, n + 3))
-            full[:n, :n], full[:n, n + 2], full[n + 1, n + 2] = A, b, 1.0
-            full[CURRENT, self.volts] = 1.0 / self.servo.L
-            if side:
-                guards = [OracleGuard(-side * unit[SPEED] + 0.5 * rate, 1, "release", floor=RESTING)]
-            else:
-                guards = [OracleGuard(s * apart - 0.5 * gap, s + 1, "contact", floor=1e-14) for s in (1, -1)]
-            self.modes.append(OracleMode(full, guards))
-        self.state, self.mode, self.contacts = np.zeros(n + 3), 1, 0
-        self.state[n + 1 :] = self.gap, self.wear
-
-    def step(self, voltage: float) -> None:
-        """Hold a voltage over one interval."""
-        self.state[self.volts] = voltage
-        run = follow(self.modes, self.state, self.mode, self.interval, self.interval / 64.0)
-        time, self.mode, start = run.starts[-1]
-        self.state = self.modes[self.mode].after(start, self.interval - time)
-        self.contacts += sum(label == "contact" for _, label in run.events)
 
 
 LAWS = {
@@ -73,7 +34,7 @@ def test_against_an_interpreted_loop(name: str) -> None:
     gap, wear, tolerance = 2.0 * DEGREE, 1.0 * DEGREE, servo.tolerance_for(1.5 * DEGREE)
     noise = Noise(std=2e-6)
     drawn = noise.source(rate, np.random.default_rng(5)).block(count)
-    plant, parameters, state = Plant(servo, gap, wear, 1.0 / rate), controller.law(tolerance), law.start(0.0)
+    plant, parameters, state = HeldPlant(servo, gap, wear, 1.0 / rate), controller.law(tolerance), law.start(0.0)
     last, rows = plant.loop.last, []
     for k in range(count):
         measured = round((plant.state[last] + drawn[k]) / 1e-6) * 1e-6
