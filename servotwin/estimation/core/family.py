@@ -157,6 +157,7 @@ def _exponential(flow: Array, change: Array, step: Array) -> None:
         step[0] += term
         step[1] += slope
     for _ in range(halvings):
+        # The derivative of a square, before the square itself replaces its factor.
         step[1] = multiplied(step[0], step[1]) + multiplied(step[1], step[0])
         step[0] = multiplied(step[0], step[0])
 
