@@ -72,6 +72,7 @@ class LinearSystem:
             values = np.asarray(above / below, dtype=complex)
             sizes = [poly.polyval(np.abs(s), np.abs(p)) for p in (self.numerator, self.denominator)]
             error = np.finfo(float).eps * (sizes[0] / np.abs(above) + sizes[1] / np.abs(below))
+        # Not `error >= _ROUNDED`: the error of an overflow is NaN, which compares false.
         spoilt = ~(error < _ROUNDED) & ((s != 0.0) | (not self._has_polynomials))
         if spoilt.any():
             values = values.copy()
@@ -97,6 +98,7 @@ class LinearSystem:
         """Schur form of the balanced A, with B and C in its states."""
         from scipy.linalg import matrix_balance, schur, solve
 
+        # Balanced, because the entries of a stiff chain differ by many powers of ten.
         balanced, scaling = matrix_balance(self.A)
         triangular, unitary = schur(balanced, output="complex")
         return triangular, unitary.conj().T @ solve(scaling, self.B), (self.C @ scaling) @ unitary
