@@ -1,7 +1,7 @@
 """Simulation of settings on many machines within the model's uncertainty, and the measures of each.
 
-A controller with a sample rate is simulated as the sampled loop that runs: its own tick at its rate, delay, counts of the
-sensor, limits; exact between samples. A continuous one is simulated in continuous time.
+A controller with a sample rate is simulated as the sampled loop that runs: its own tick at its rate, delay, counts of
+the sensor, limits; exact between samples. A continuous one is simulated in continuous time.
 """
 
 from __future__ import annotations
@@ -143,8 +143,8 @@ def stillness(members: SimulatedMachines) -> Array:
 def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -> Array:
     """(P, C) m, error within which the loop has arrived, for steps (m).
 
-    It is 2 % of the step, plus the error that input bias and friction leave where nothing integrates, plus the dead zone
-    and two counts of the sensor.
+    It is 2 % of the step, plus the error that input bias and friction leave where nothing integrates, plus the dead
+    zone and two counts of the sensor.
     """
     model = members.plants[0]
     return left_over(setting, model, members.input_bias, members.friction, step)

@@ -23,7 +23,8 @@ class Beyond:
     """
 
     k_T: Annotated[
-        float, key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the motor's gain, relative to the model's.")
+        float,
+        key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the motor's gain, relative."),
     ] = 0.1
     delay: Annotated[
         int,
@@ -39,8 +40,8 @@ class Beyond:
         key(
             "friction_percent",
             minimum=0.0,
-            help="Largest Coulomb friction, relative to the torque with which the servo's own proportional gain answers "
-            "the smallest step; none with an elastic screw.",
+            help="Largest Coulomb friction, relative to the torque with which the servo's own Kp answers the smallest "
+            "step; none with an elastic screw.",
         ),
     ] = 0.2
     machines: int = 60
@@ -109,8 +110,8 @@ class Demands:
         key(
             "error_percent",
             above=0.0,
-            help="Largest error in the end, relative to the largest step; the dead zone and two counts of the sensor come "
-            "on top.",
+            help="Largest error in the end, relative to the largest step; the dead zone and two counts of the sensor "
+            "come on top.",
         ),
     ] = 0.1
     beyond: Annotated[Beyond, key(help="Ranges that nobody stated, in which a setting must settle too.")] = field(
@@ -118,14 +119,14 @@ class Demands:
     )
     tail: float = math.inf
     tolerance: float = math.inf
-    scales: tuple[float, ...] = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
-    shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.2, 1.4))
+    scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+    shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.05)
-    known: float = 0.075
+    known: float = 0.0726
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
     effort_weight: float = 14.0
     screened: int = 4
-    conditions: int = 4
+    conditions: int = 8
     machines: int = 300
     attempts: int = 4
     seed: int = 0
@@ -279,7 +280,7 @@ class Certificate:
     @property
     def tried(self) -> str:
         """Sentence on what was tried, with ranges."""
-        law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, 0 to {self.delay} samples late"
+        law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, up to {self.delay} samples late"
         low, high = (math.degrees(end) for end in self.gap)
         text = (
             f"verified on {self.members} simulated machines {law}: steps of {1e3 * self.step[0]:.3g} to "
@@ -293,9 +294,10 @@ class Certificate:
         if self.beyond is not None:
             extra = self.beyond
             text += (
-                f"; beyond that, {extra.machines} machines with the motor's gain {100.0 * extra.k_T:g} % off, friction of "
-                f"up to {extra.friction:.3g} N m" + (f" and up to {extra.delay} samples of delay" if self.rate else "")
+                f"; beyond that, {extra.machines} machines with the motor's gain up to {100.0 * extra.k_T:.3g} % off "
+                f"and friction of up to {extra.friction:.3g} N m"
             )
+            text += f", up to {extra.delay} samples late" if self.rate else ""
         return text
 
     @property

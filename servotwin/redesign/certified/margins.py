@@ -18,6 +18,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants
 
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
+_WORTH_TRYING = 0.25
 _ROUNDED = 1.0 + 1e-6
 
 
@@ -111,11 +112,11 @@ def laws_within(
         for scale in demands.scales
     ]
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
-    laws, closest = [], math.inf
+    laws: list[Controller] = []
+    closest = math.inf
     for law in dict.fromkeys(scaled):
         peaks = np.array([plants.peaks(law, delay) for delay in delays_of(law, uncertainty)])
         stable = all(plants.decays(law, delay).min() > 0.0 for delay in delays_of(law, uncertainty))
-        # The zeros of a design that shape and scale make may hide an unstable loop behind a small peak.
         closest = min(closest, float(peaks.max())) if stable else closest
         if stable and peaks[0, 0] <= demands.Ms * _ROUNDED and peaks.max() <= demands.Ms_worst * _ROUNDED:
             laws.append(law)
@@ -128,15 +129,15 @@ def laws_within(
             f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
             f"{min(demands.scales):g}"
         )
-    return tuple(laws)
+    # A loop with a fraction of the gain that another one may have is slower, and only that.
+    least = _WORTH_TRYING * max(abs(law.Kp) for law in laws)
+    return tuple(law for law in laws if abs(law.Kp) >= least)
 
 
 def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share: float) -> Controller:
     """The controller with Kp and Kd scaled, its derivative action moved by a shape, and a share of its Ki."""
     lead, slower = shape
-    return own.replace(
-        Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share
-    )
+    return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
 
 
 def unfed(law: Controller) -> Controller:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,8 +25,8 @@ _LENGTH = 250.0
 # Decay times of the slowest mode: what is left of it is e^-20.
 _DECAYS = 20.0
 _JUDGED = 1.0 / 6.0
-# Samples per radian of the fastest motion that the loop makes.
-_SAMPLING = 2.0
+# Samples a second, in units of the crossover and of the frequency of the sensitivity peak (both rad/s).
+_SAMPLING, _RESONANCE = 12.0, 2.0
 _MOST_SAMPLES = 20_000
 
 
@@ -76,8 +77,8 @@ def _trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Tria
     loop = nominal_margins(servo, unfed(_reference(servo.controller, laws)))
     crossover = loop.gain_crossovers[-1].omega if loop.gain_crossovers else slowest
     duration = max(_LENGTH / crossover, _DECAYS / slowest)
-    fastest = max(crossover, loop.Ms_omega if loop.Ms_omega < float("inf") else crossover)
-    rate = min(_SAMPLING * fastest, _MOST_SAMPLES / duration)
+    resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0
+    rate = min(max(_SAMPLING * crossover, _RESONANCE * resonance), _MOST_SAMPLES / duration)
     sampled = servo.controller.sample_rate
     if sampled is not None:
         rate = sampled / max(1, round(sampled / rate))

@@ -96,10 +96,6 @@ class Uncertainty:
     m: Annotated[
         float, key("m_percent", minimum=0.0, below=1.0, help="Half-width of the mass, relative to the model's.")
     ] = 0.1
-    k_T: Annotated[
-        float,
-        key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the torque gain, relative to the model's."),
-    ] = 0.0
     gap: Annotated[Range, key("gap_deg", minimum=0.0, help="Range of the total gap.")] = (0.0, math.radians(60.0))
     step: Annotated[
         Range,
@@ -116,6 +112,10 @@ class Uncertainty:
     friction: Annotated[
         Range, key("friction_n_m", minimum=0.0, help="Range of the Coulomb friction on the motor's shaft.")
     ] = (0.0, 0.0)
+    k_T: Annotated[
+        float,
+        key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the torque gain, relative to the model's."),
+    ] = 0.0
     delay: Annotated[
         int,
         key(
