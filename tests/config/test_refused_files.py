@@ -85,7 +85,7 @@ def text_store(folder: Path) -> str:
         ("prot = 1", "unknown key 'service.prot' (did you mean 'port'?)"),
         ("retention_days = -3", "service.retention_days = -3 is not allowed; give a positive number"),
         ('tokens = "none.toml"', "none.toml: there is no such file of tokens; `servotwin enroll` makes it"),
-        (world_readable, "has mode 0644, so that others may open it; make it 0600"),
+        (world_readable, "has mode 0644, so that others may open it; make it 0600: chmod 600 "),
         (nonsense, "are no certificate with its own key, in PEM and without a password"),
         (strangers, "KEY_VALUES_MISMATCH"),
         ('store = "sqlite:///no/such/folder/twin.db"', "cannot be made (No such file or directory)"),
