@@ -11,7 +11,8 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin import messages
@@ -182,7 +183,7 @@ def test_what_cannot_be_used_is_evidence_and_the_rest_goes_on(kind):
 
 
 @given(st.binary(max_size=300), st.sampled_from(["", DEFLATE, ZSTD, "gzip"]))
-@settings(max_examples=200)
+@examples(200)
 def test_no_bytes_make_it_fail(body, encoding):
     outcome = work(fleet(), claim((body, encoding)), 0.0)
     assert outcome.done == (1,)
