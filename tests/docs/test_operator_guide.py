@@ -175,7 +175,7 @@ def test_every_field_of_an_edge_s_status_is_explained() -> None:
 
 def test_every_kind_of_evidence_is_explained() -> None:
     kinds = calls("twin", "_made", "_sent")
-    assert set(NAME.findall("".join(cells[0] for cells in rows("What is found of a window")))) == kinds | {"failed"}
+    assert set(NAME.findall("".join(cells[0] for cells in rows("Evidence of a window")))) == kinds | {"failed"}
 
 
 def test_commands_are_printed_with_options_that_they_have() -> None:
