@@ -7,6 +7,7 @@ import sys
 import zlib
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -121,7 +122,7 @@ def test_and_in_another_process():
         "said = o.state, o.outgoing, [row._replace(context='') for row in o.evidence]\n"
         "print(hashlib.sha256(repr(said).encode()).hexdigest())"
     )
-    paths = os.pathsep.join((".", "tests", "tests/twin"))
+    paths = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
     seen = {
         subprocess.run(
             [sys.executable, "-c", script],
