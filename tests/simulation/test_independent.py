@@ -88,8 +88,8 @@ def test_most_random_runs_can_be_compared(cases: list[tuple[int, Case, float]]) 
 
 @pytest.mark.slow
 def test_against_solve_ivp(cases: list[tuple[int, Case, float]]) -> None:
-    """DOP853 at 1e-12, restarted at every event, on the first eight."""
-    for seed, case, sensitive in cases[:8]:
+    """DOP853 at 1e-12, restarted at every event, on the first four: masses 2, 3 and 5; the rest below."""
+    for seed, case, sensitive in cases[:4]:
         if sensitive > SENSITIVE:
             continue
         (expected, count), run = by_solve_ivp(case, TIMES), ours(case)
