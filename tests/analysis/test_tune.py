@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from exploration import examples
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -88,7 +89,7 @@ def test_a_proportional_controller_takes_the_margin_it_gets():
     st.floats(20.0, 80.0),
     st.sampled_from(["PI", "PIDF", "PDF"]),
 )
-@settings(max_examples=25)
+@examples(25)
 def test_the_returned_controller_is_stable_and_meets_its_specification(crossover, margin_deg, kind):
     try:
         found = tune(PAPER.plant(), Specification(crossover, math.radians(margin_deg), kind))
@@ -102,7 +103,7 @@ def test_the_returned_controller_is_stable_and_meets_its_specification(crossover
 
 
 @given(st.floats(1.0, 15.0), st.floats(0.1, 1.5), st.floats(0.0, 1.0), st.floats(0.1, 1.4))
-@settings(max_examples=60)
+@examples(60)
 def test_nyquist_agrees_with_the_poles(wc, phz, share, al):
     factors = Factors(1.0 / abs(PAPER.plant().response(wc)), wc, phz, share * phz, al, True)
     poles = PAPER.closed_loop(factors.controller()).poles()

@@ -5,7 +5,8 @@ from math import inf
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.link.client import Receiver, Sender
@@ -170,7 +171,7 @@ def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_withou
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@examples(40, deadline=None)
 @given(FAULTS)
 def test_every_window_is_delivered_once_or_counted(
     tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None]

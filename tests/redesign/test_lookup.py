@@ -1,4 +1,4 @@
-"""Settings verified beforehand: a certificate that is looked up holds for the requested region; foreign tables are refused."""
+"""Settings verified beforehand: a certificate holds for every region inside its cell; foreign tables are refused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.control.gains import gains_of
@@ -103,7 +104,7 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=25)
+@examples(25, deadline=None)
 @given(
     st.floats(0.0, 30.0),
     st.floats(0.0, 30.0),

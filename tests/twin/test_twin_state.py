@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from twin_messages import known_gap, make, window_message
 
@@ -189,7 +190,7 @@ def test_a_trend_keeps_every_bit(trend):
         max_size=15,
     )
 )
-@settings(max_examples=60)
+@examples(60)
 def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
     """Boots that come back, old windows, receipts for nothing, a clock that jumps."""
     lives, dies = make()[0], make()[0]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import correlate
 
 from servotwin.estimation.paper.observer import LagFilter, Observer
 from servotwin.hybrid.compiled import compiled
@@ -38,6 +37,9 @@ def standard_deviation(sensitivity: Array, nuisance: Array, residual: Array) -> 
     information = float(left @ left)
     if math.sqrt(information) <= _SINGULAR * math.sqrt(float(sensitivity @ sensitivity)):
         return math.inf
+    # Here, because scipy.signal takes most of a second to import and many commands never fit.
+    from scipy.signal import correlate
+
     shifted = correlate(residual, left, method="fft")
     return math.sqrt(float(shifted @ shifted) / residual.size) / information
 
