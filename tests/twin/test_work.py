@@ -174,10 +174,10 @@ SPOILT = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_cannot_be_used_is_evidence_and_the_rest_goes_on(kind):
-    spoilt, said = SPOILT[kind]
+    spoilt, error_name = SPOILT[kind]
     outcome = work(fleet(), claim(windows()[0], spoilt, windows()[1]), 0.0)
     assert outcome.done == (1, 2, 3)
-    assert statuses(outcome)[1].startswith(f"failed: {said}: ")
+    assert statuses(outcome)[1].startswith(f"failed: {error_name}: ")
     assert kinds(outcome, 2) == ["estimate"]
     without = work(fleet(), claim(windows()[0], windows()[1]), 0.0)
     assert (outcome.outgoing, statuses(outcome)[::2]) == (without.outgoing, statuses(without))

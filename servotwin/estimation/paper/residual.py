@@ -105,6 +105,7 @@ class PlayResidual:
         if gap >= 0.0:
             self.screw.subtract_play(self.theta_m, 0.5 * gap, start, residual)
             return residual
+        # The play of a negative gap: the mirror of the screw's motion at the motor's, computed with the positive one.
         mirrored = 2.0 * float(self.theta_m[0]) - start
         self.screw.subtract_play(self.theta_m, -0.5 * gap, mirrored, residual)
         return 2.0 * self._no_gap - residual
