@@ -3,7 +3,7 @@ outputs and reduce these to figures."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,7 @@ def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
 @bare
 def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Array) -> None:
     """Every output of the run just recorded."""
-    zero = np.int64(0)  # as below
+    zero: Any = np.int64(0)  # as in run_members
     for o in range(len(traces)):
         sample_segments(
             zero,
@@ -164,7 +164,8 @@ def run_members(
     """Run members at places first .. last - 1 of the order; return the status and the place it concerns. `tail` is the
     number of samples at the end that have figures of their own."""
     t = memory.tables
-    begin = np.int64(0)  # a literal 0 is a type of its own to numba: all that it is given to would compile once more
+    # A literal 0 is a type of its own to numba: all that it is given to would be compiled once more.
+    begin: Any = np.int64(0)
     for place in range(first, last):
         k = starts.order[place]
         a = starts.automaton[k]
