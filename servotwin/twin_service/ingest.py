@@ -153,6 +153,7 @@ class Ingest:
         return put
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
+        # Before the body is decompressed and decoded, which costs far more.
         if not self._knows(servo):
             raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo!r}")
         try:

@@ -335,7 +335,7 @@ def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (second.returncode, second.stderr.count("\n")) == (2, 1)
     assert "another edge runs on its files" in second.stderr
-    other = replace(edge.config, keeping=replace(edge.config.keeping, parameters="other.json"))
+    other = replace(edge.config, files=replace(edge.config.files, parameters="other.json"))
     (edge.folder / "other.toml").write_text(edge_toml(other))
     third = subprocess.run([*command[:-1], str(edge.folder / "other.toml")], timeout=60, check=False)
     assert third.returncode == 2

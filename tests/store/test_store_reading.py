@@ -117,7 +117,7 @@ def test_the_evidence_chain(store: Store) -> None:
     assert [link.window.sequence for link in links] == [4, 3, 2, 1]
     assert [len(link.steps) for link in links] == [0, 0, 1, 0]
     acted = links[2]
-    assert [one.kind for one in acted.found] == ["glance", "estimate"]
+    assert [one.kind for one in acted.evidence] == ["glance", "estimate"]
     (step,) = acted.steps
     assert (step.update.kind, step.update.version, step.update.body) == ("update", 1, b"u")
     assert [(one.kind, one.status) for one in step.answers] == [("receipt", "applied")]
@@ -132,7 +132,7 @@ def test_the_evidence_chain(store: Store) -> None:
 def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> None:
     store.put([window(), window("b")])
     (link,) = store.audit("a")
-    assert (link.window.sequence, link.window.done, link.found, link.steps) == (1, None, (), ())
+    assert (link.window.sequence, link.window.done, link.evidence, link.steps) == (1, None, (), ())
 
 
 def test_an_update_after_a_verification_belongs_to_its_window(store: Store) -> None:

@@ -8,7 +8,7 @@ from servotwin.messages import decode
 from servotwin.store.records import EvidenceRecord, Lease, WorkResult
 from servotwin.twin_service import worker
 
-GIVEN_UP = 3
+ABANDON_AFTER = 3
 
 
 def work(claim: Lease, now: float) -> WorkResult:
@@ -17,7 +17,7 @@ def work(claim: Lease, now: float) -> WorkResult:
     evidence = []
     for message in messages:
         wanted = decode(message.body).reason
-        if claim.attempts >= GIVEN_UP:
+        if claim.attempts >= ABANDON_AFTER:
             evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status="failed: given up"))
             continue
         if wanted == "die":

@@ -236,7 +236,7 @@ def test_a_later_schema_and_another_servos_state_are_refused():
     with pytest.raises(InvalidInput, match="not understood"):
         twin.restore(later)
     other = Twin("other", twin.model)
-    with pytest.raises(InvalidInput, match=r"the state of servo 'other' is that of 'axis'"):
+    with pytest.raises(InvalidInput, match=r"the state of servo 'other' belongs to 'axis'"):
         other.restore(twin.state())
 
 

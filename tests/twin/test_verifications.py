@@ -225,7 +225,7 @@ def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, asked = begun(fleet)
     model = replace(fleet.models[0], settings=SETTINGS)
     queue.fleet = replace(fleet, models=(model,))
-    assert "no table is used any more" in queue.give(asked).evidence[0].status
+    assert "the twin uses no table any more" in queue.give(asked).evidence[0].status
 
 
 def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:

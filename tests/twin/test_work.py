@@ -27,7 +27,7 @@ from servotwin.twin.estimating import DecodedWindow, TrendState
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work
+from servotwin.twin.work import ABANDON_AFTER, ONE_BY_ONE, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=65.0, name="axis")
 START = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
@@ -206,7 +206,7 @@ def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkey
     assert (outcome.state, outcome.outgoing) == (right.state, right.outgoing)
 
 
-def test_an_overdue_update_is_sent_again_then_given_up():
+def test_an_overdue_update_is_sent_again_then_abandoned():
     first = work(fleet(), claim(windows()[1]), 100.0)
     state, sent = first.state, first.outgoing
     for now, expected, wake in ((104.9, (), 105.0), (105.0, sent, 110.0), (110.0, sent, 115.0), (115.0, (), None)):
@@ -291,7 +291,7 @@ def test_a_servo_without_a_model_fails_without_a_word_to_it():
     outcome = work(lost, claim(windows()[0], state=b"kept", serial=3), 0.0)
     assert (outcome.state, outcome.serial, outcome.done, outcome.wake) == (b"kept", 3, (1,), None)
     assert statuses(outcome) == [
-        "failed: servo 'axis' has no model: [servos] names it neither by itself nor by a pattern"
+        "failed: servo 'axis' has no model: [servos] has neither its name nor a pattern that fits"
     ]
 
 
@@ -301,17 +301,20 @@ def test_a_twin_that_is_switched_off_leaves_windows_as_they_are():
     assert outcome.done == tuple(range(1, len(windows()) + 1))
 
 
-def test_what_kills_its_workers_is_found_and_given_up():
+def test_what_kills_its_workers_is_found_and_abandoned():
     sent = windows()[:2]
     assert work(fleet(), claim(*sent, attempts=ONE_BY_ONE - 1), 0.0).done == (1, 2)
     alone = work(fleet(), claim(*sent, attempts=ONE_BY_ONE), 0.0)
     assert (alone.done, statuses(alone)) == ((1,), ["ok"])
-    given_up = work(fleet(), claim(*sent, attempts=GIVEN_UP), 0.0)
-    assert (given_up.done, statuses(given_up)) == ((1,), [f"failed: given up, as {GIVEN_UP - 1} workers died of it"])
+    abandoned = work(fleet(), claim(*sent, attempts=ABANDON_AFTER), 0.0)
+    assert (abandoned.done, statuses(abandoned)) == (
+        (1,),
+        [f"failed: abandoned, because {ABANDON_AFTER - 1} workers died while they processed it"],
+    )
     pending = work(fleet(), claim(windows()[1]), 0.0)
-    kept = work(fleet(), claim(windows()[2], state=pending.state, attempts=GIVEN_UP), 1.0)
+    kept = work(fleet(), claim(windows()[2], state=pending.state, attempts=ABANDON_AFTER), 1.0)
     assert (kept.state, kept.wake) == (pending.state, 5.0)
-    quiet = work(fleet(), claim(state=pending.state, attempts=GIVEN_UP), 100.0)
+    quiet = work(fleet(), claim(state=pending.state, attempts=ABANDON_AFTER), 100.0)
     assert (quiet.state, quiet.wake, quiet.outgoing) == (pending.state, None, ())
 
 
