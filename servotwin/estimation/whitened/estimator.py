@@ -113,6 +113,8 @@ class WindowFit:
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings)
         status, reasons = judge(evidence, self.settings)
+        if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
+            status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
         if status is GapStatus.OK:
             contacts = contacts_seen(self.aligned, self.servo)
             if not contacts.two:

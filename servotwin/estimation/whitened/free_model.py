@@ -27,6 +27,7 @@ from servotwin.plant.signals import Array
 
 FACTORS = ("k/m", "c/m", "pitch")
 FREEDOM = (0.1, 0.5, 0.05)  # relative standard deviations of the factors where nothing else is known of them
+LARGEST = 4.0  # standard deviations by which a factor may move
 _STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
 _SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
@@ -58,6 +59,11 @@ class FactorPrior:
     def root(self) -> Array:
         """(3, 3) whitening matrix: root (factors - mean) has unit covariance."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)))
+
+    def limits(self) -> tuple[Array, Array]:
+        """(3,) least and largest factors that are searched."""
+        reach = LARGEST * np.sqrt(np.diag(self.covariance))
+        return self.mean - reach, self.mean + reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +121,7 @@ class FreeProblem:
     compliance: float = 0.0
 
     def rows(self, q: Array) -> tuple[Array, Array]:
-        """Residual (M,) and derivatives of the motion (5, M) at a point (5,), nuisances projected out, prior appended."""
+        """Residual (M,) and derivatives of the motion (5, M) at a point (5,), nuisances out, prior appended."""
         point, factors = Point(q[0], q[1]), q[2:]
         rate = 1.0 / self.reduction.response.interval
         reduction = replace(self.reduction, response=_response(self.servo, tuple(factors), rate))
@@ -148,9 +154,8 @@ class FreeProblem:
         It ends early once the cost is below the first number of `within`, or once even the linearised problem cannot
         bring it below the second: its value is then not that of the minimum, but on the same side of both.
         """
-        spread = np.sqrt(np.diag(self.prior.covariance))
-        low = np.concatenate([[0.0, -1.0], self.prior.mean - 4.0 * spread])
-        high = np.concatenate([[self.largest, 1.0], self.prior.mean + 4.0 * spread])
+        least, most = self.prior.limits()
+        low, high = np.concatenate([[0.0, -1.0], least]), np.concatenate([[self.largest, 1.0], most])
         movable, (enough, hopeless) = np.array([*free, True, True, True]), within
         q, damping = np.clip(start, low, high), _FIRST_DAMPING
         residual, rows = self.rows(q)
@@ -276,7 +281,7 @@ def _step(residual: Array, rows: Array, movable: Array, q: Array, low: Array, hi
     downhill = rows @ residual
     blocked = ((q <= low) & (downhill < 0.0)) | ((q >= high) & (downhill > 0.0))
     size = np.linalg.norm(rows, axis=1)
-    use = np.flatnonzero(movable & ~blocked & (size > 0.0))
+    use = np.flatnonzero(np.logical_and.reduce([movable, ~blocked, size > 0.0]))
     step = np.zeros(q.size)
     if use.size:
         scaled = rows[use] / size[use, None]

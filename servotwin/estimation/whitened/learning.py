@@ -1,8 +1,8 @@
-"""Fit of a window to a machine whose stiffness, damping and pitch are known only roughly, or learnt from earlier windows.
+"""Fit of a window to a machine whose stiffness, damping and pitch are known roughly, or from earlier windows.
 
-The fit of gap and place in the window's own noise (`fit`) and that of the model's factors (`free_model`) take turns: the
-noise is estimated from the residual of the adapted model, and the factors in this noise. Where the factors are known
-well, one turn is enough.
+The fit of gap and place in the window's own noise (`fit`) and that of the model's factors (`free_model`) take turns:
+the noise is estimated from the residual of the adapted model, and the factors in this noise. Where the factors are
+known well, one turn is enough.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
-from servotwin.estimation.whitened.free_model import FactorPrior, FreeFit, FreeProblem, adapted
+from servotwin.estimation.whitened.free_model import FACTORS, LARGEST, FactorPrior, FreeFit, FreeProblem, adapted
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -23,6 +23,7 @@ from servotwin.plant.signals import Array
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
 _WIDE = (0.01, 0.05, 0.005)  # relative spreads of the factors: wider ones are searched before the noise is known
+_AT_END = 1e-3  # of the range of a factor
 _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all to the window, nothing to the prior
 
 
@@ -38,11 +39,24 @@ class LearntFit:
         With this servo's response.
     free : FreeFit
         In the same noise, with the factors' prior.
+    prior : FactorPrior
     """
 
     servo: Servo
     aligned: AlignedFit
     free: FreeFit
+    prior: FactorPrior
+
+    @property
+    def beyond(self) -> str:
+        """Sentence on a factor that lies at the end of what is allowed; empty where none does."""
+        low, high = self.prior.limits()
+        ends = _AT_END * (high - low)
+        for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
+            if not least < factor < most:
+                off = 100.0 * math.expm1(factor)
+                return f"{name} would have to be {off:+.3g} % off the model, {LARGEST:g} times its usual error"
+        return ""
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
@@ -88,4 +102,4 @@ def learn_and_fit(
         if np.all(still):
             break
         factors, points = free.factors, [free.point]
-    return LearntFit(here, aligned, free)
+    return LearntFit(here, aligned, free, machine)
