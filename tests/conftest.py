@@ -34,11 +34,7 @@ FIRST = (
     "analysis/test_cycle.py",  # compiles the kernel: in a fresh clone half a minute
     *("config/", "link/", "messages/", "runtime/", "store/"),  # compile nothing: for the other process, meanwhile
     *("analysis/", "control/", "cosim/", "estimation/", "hybrid/", "simulation/"),  # compile the rest
-    *(
-        "up/",
-        "edge_process/",
-        "docs/test_operator_guide.py",
-    ),  # processes that wait and find all compiled: not at the end
+    *("up/", "edge_process/", "docs/test_operator_guide.py"),  # wait, and find all compiled: not at the end
 )
 """Folders and files in the order of their tests; all others follow. Two processes hardly ever compile the same."""
 
