@@ -56,7 +56,7 @@ def enroll(
     ] = "supervise",
     sample_rate_hz: Annotated[float, typer.Option(help="Sample rate of the edge, Hz.")] = 5000.0,
     drive: Annotated[
-        Path | None, typer.Option(help="TOML with the table [drive]; a simulated drive by default.")
+        Path | None, typer.Option(help="TOML file with the table drive; a simulated drive by default.")
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="Address at which the edge reaches the twin; the twin's own by default.")

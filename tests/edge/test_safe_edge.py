@@ -23,7 +23,7 @@ from servotwin.simulation import Simulation
 from servotwin.twin.settings import TwinSettings
 
 QUICK = TwinSettings(demands=Demands(machines=64, screened=4, scales=(0.5, 0.7), settled=0.95))
-"""Settings proved on fewer machines than usual."""
+"""Settings verified on fewer machines than usual."""
 
 
 def drawn(own: Controller, draw: random.Random) -> Controller:

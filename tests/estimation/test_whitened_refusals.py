@@ -152,10 +152,12 @@ def test_one_contact_needs_a_known_offset():
     blind = estimate_gap(window, SERVO)
     assert not blind.ok
     assert "needed both ways" in " ".join(blind.reasons)
-    told = estimate_gap(window, SERVO, settings=WhitenedSettings(offset=(0.0, 1e-5), largest_std=math.radians(0.2)))
-    assert told.ok, told.reasons
-    assert abs(told.gap - math.radians(6.0)) < 3.0 * told.std
-    assert told.std < math.radians(0.2)
+    with_offset = estimate_gap(
+        window, SERVO, settings=WhitenedSettings(offset=(0.0, 1e-5), largest_std=math.radians(0.2))
+    )
+    assert with_offset.ok, with_offset.reasons
+    assert abs(with_offset.gap - math.radians(6.0)) < 3.0 * with_offset.std
+    assert with_offset.std < math.radians(0.2)
 
 
 def at_rest(span: float = 1.0) -> tuple[WindowCase, ...]:

@@ -13,7 +13,8 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
@@ -101,7 +102,7 @@ def test_an_accepted_update_ends_the_unconditional_windows_and_keeps_the_news_ou
     assert novelty.state.update_gap == math.radians(12.0)
 
 
-def test_an_update_that_stands_on_a_window_not_judged_moves_the_baseline() -> None:
+def test_an_update_from_a_window_without_a_score_moves_the_baseline() -> None:
     novelty = NoveltyDetector(SETTINGS)
     reasons(novelty, [updated(cut(k), 1, 10.0, 1) for k in range(5)])
     assert reasons(novelty, [updated(cut(k, 12.0), 2, 12.0, 99) for k in range(5, 9)]) == [""] * 4
@@ -168,7 +169,7 @@ _NUMBERS = st.floats(width=64) | st.sampled_from([0.0, 1e308, -1e308, 1e-320, ma
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@examples(60, deadline=None)
 @given(st.lists(st.tuples(_NUMBERS, _NUMBERS), min_size=1, max_size=40), st.integers(1, 300), st.integers(0, 3))
 def test_nothing_that_a_sensor_gives_stops_the_judge(steps: list[tuple[float, float]], hold: int, warm: int) -> None:
     theta_m, position = (np.repeat(np.array(values), hold) for values in zip(*steps, strict=True))

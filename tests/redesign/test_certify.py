@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
@@ -117,7 +118,7 @@ def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
 # --- measures
 
 
-@settings(max_examples=6)
+@examples(6)
 @given(seed=st.integers(0, 1000), share=st.sampled_from([0.0, 0.01, 0.05]))
 def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
     """The oracle: one `simulate` per member, and the measures by numpy."""
@@ -274,7 +275,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
 
 
 def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
-    """The fallback set is proved for an unknown bias, where no overshoot is asked."""
+    """The fallback set is verified for an unknown bias, without a bound on the overshoot."""
     strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))
     made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
     assert "none of" in made.reason
@@ -314,6 +315,7 @@ def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -
     assert first.certificate.friction == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
     wide = rule.redesign(Evidence(estimated(10.0)))

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -68,7 +69,7 @@ def test_the_linear_loop_agrees_with_expm() -> None:
     assert np.abs(run.voltage - voltage).max() < 1e-10 * np.abs(voltage).max()
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     bias=st.floats(-0.2, 0.2),
     degrees=st.floats(0.0, 15.0),
@@ -105,7 +106,7 @@ def test_the_limit_holds_inside_the_dead_zone_too(rate: float | None) -> None:
     assert speed == pytest.approx(0.3 / PAPER.k_B, rel=1e-9)
 
 
-def test_what_is_not_asked_for_costs_nothing() -> None:
+def test_an_absent_disturbance_costs_nothing() -> None:
     plain = continuous_loop(PAPER, PAPER.controller, Shape())
     assert not {"input bias", "friction", "feedforward", "offset"} & set(plain.automaton.names)
     assert len(plain.automaton.modes) == 9

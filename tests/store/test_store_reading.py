@@ -27,9 +27,9 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
 
 
 def test_an_edge_that_received_more_than_a_restored_store_posted_gets_the_next_message(store: Store) -> None:
-    for sequence, heard in ((1, 0), (2, 900), (3, 2**60)):
+    for sequence, last_serial in ((1, 0), (2, 900), (3, 2**60)):
         store.put([window(sequence=sequence), window("b", sequence)])
-        assert store.outgoing("a", heard) == []
+        assert store.outgoing("a", last_serial) == []
         store.commit([outcome(one, outgoing=(b"x%d" % sequence,)) for one in claim(store)], 201.0)
     assert store.outgoing("a", 900) == [OutgoingMessage(901, b"x2"), OutgoingMessage(902, b"x3")]
     assert [post.serial for post in store.outgoing("b", 0)] == [1, 2, 3]

@@ -7,11 +7,13 @@ import sys
 import zlib
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin import messages
@@ -120,7 +122,7 @@ def test_and_in_another_process():
         "said = o.state, o.outgoing, [row._replace(context='') for row in o.evidence]\n"
         "print(hashlib.sha256(repr(said).encode()).hexdigest())"
     )
-    paths = os.pathsep.join((".", "tests", "tests/twin"))
+    paths = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
     seen = {
         subprocess.run(
             [sys.executable, "-c", script],
@@ -172,17 +174,17 @@ SPOILT = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_cannot_be_used_is_evidence_and_the_rest_goes_on(kind):
-    spoilt, said = SPOILT[kind]
+    spoilt, error_name = SPOILT[kind]
     outcome = work(fleet(), claim(windows()[0], spoilt, windows()[1]), 0.0)
     assert outcome.done == (1, 2, 3)
-    assert statuses(outcome)[1].startswith(f"failed: {said}: ")
+    assert statuses(outcome)[1].startswith(f"failed: {error_name}: ")
     assert kinds(outcome, 2) == ["estimate"]
     without = work(fleet(), claim(windows()[0], windows()[1]), 0.0)
     assert (outcome.outgoing, statuses(outcome)[::2]) == (without.outgoing, statuses(without))
 
 
 @given(st.binary(max_size=300), st.sampled_from(["", DEFLATE, ZSTD, "gzip"]))
-@settings(max_examples=200)
+@examples(200)
 def test_no_bytes_make_it_fail(body, encoding):
     outcome = work(fleet(), claim((body, encoding)), 0.0)
     assert outcome.done == (1,)
@@ -215,7 +217,7 @@ def test_an_overdue_update_is_sent_again_then_abandoned():
         state = outcome.state
 
 
-def test_an_answer_in_the_same_claim_is_heard_before_anything_is_sent_again():
+def test_an_answer_in_the_same_lease_is_processed_before_anything_is_sent_again():
     first = work(fleet(), claim(windows()[1]), 100.0)
     update = decode(first.outgoing[0])
     outcome = work(fleet(), claim(receipt(update), state=first.state), 200.0)
@@ -275,7 +277,7 @@ def test_a_hello_says_what_a_restarted_edge_runs():
     assert (decode(then.outgoing[0]).version, decode(then.outgoing[0]).base_version) == (8, 7)
 
 
-def test_a_state_that_is_not_understood_is_kept_and_the_twin_begins_anew():
+def test_a_state_that_cannot_be_read_is_stored_and_the_twin_begins_anew():
     version = msgspec.structs.replace(windows()[1], parameter_version=40)
     outcome = work(fleet(), claim(version, state=b"\x81\xa4typeonce"), 0.0)
     (first, *rest) = outcome.evidence

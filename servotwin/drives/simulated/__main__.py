@@ -15,7 +15,7 @@ from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
 from servotwin.drives.simulated.server import (
     OnSample,
     Server,
-    StopSignal,
+    StopRequest,
     address_in_use,
     ignore_sample,
     listening,
@@ -28,7 +28,7 @@ from servotwin.drives.simulated.supervise import SuperviseServer
 from servotwin.errors import InvalidInput
 
 
-def main(path: str, stop: StopSignal) -> None:
+def main(path: str, stop: StopRequest) -> None:
     """Simulate the machine of a TOML file until its run is over, or `stop` is called.
 
     Raises
@@ -58,7 +58,7 @@ def _server(plant: ControlledPlant | SupervisedPlant, pace: Pace | None, slack: 
 
 
 if __name__ == "__main__":
-    stop = StopSignal()
+    stop = StopRequest()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
     try:

@@ -29,7 +29,7 @@ def ignore_sample(_sample: int, _now: float) -> None:
     """Do nothing between samples."""
 
 
-class StopSignal:
+class StopRequest:
     """Request that a machine stop between two samples.
 
     As the handler of a signal it only sets a flag and ends the wait: an exception raised in a handler may surface in
@@ -90,7 +90,7 @@ class Server(Protocol):
 
 
 def run(
-    server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, stop: StopSignal | None = None
+    server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, stop: StopRequest | None = None
 ) -> None:
     """Serve one client after the other until a client has received the end of the run.
 
@@ -103,11 +103,11 @@ def run(
     stop : StopSignal, optional
         Stops it earlier.
     """
-    with nullcontext(stop) if stop is not None else closing(StopSignal()) as signal:
+    with nullcontext(stop) if stop is not None else closing(StopRequest()) as signal:
         _serve(server, listener, settings, name, signal)
 
 
-def _serve(server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, stop: StopSignal) -> None:
+def _serve(server: Server, listener: socket.socket, settings: MachineSettings, name: bytes, stop: StopRequest) -> None:
     while not stop.requested:
         with _client(server, listener, stop) as connection:
             if connection is None:
@@ -163,7 +163,7 @@ def start_pace(settings: MachineSettings) -> Pace | None:
 
 
 @contextmanager
-def _client(server: Server, listener: socket.socket, stop: StopSignal) -> Iterator[socket.socket | None]:
+def _client(server: Server, listener: socket.socket, stop: StopRequest) -> Iterator[socket.socket | None]:
     """Yield the next client, with the plant running on until it comes; None: the machine must stop."""
     ready: list[socket.socket] = []
     while not ready:

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from servotwin.hybrid.compiled import bare, compiled, inlined, summed
 from servotwin.plant.signals import Array
@@ -60,6 +59,9 @@ class Autoregression:
         The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
         """
         poles = self.predictors[-1]
+        # Here, because scipy.signal takes long to import and many commands never estimate.
+        from scipy.signal import lfilter
+
         return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])
 
 
