@@ -135,13 +135,14 @@ def updated(
     reading = estimate.machine
     if reading is None:
         return before
-    if estimate.ok:
-        if not counts:
-            return before
+    if estimate.ok and not counts:
+        return before
+    # A window may show the machine's numbers, and the gap not well enough.
+    if estimate.ok or estimate.status is GapStatus.UNIDENTIFIABLE:
         windows = 1 if before is None else before.windows + 1
         alarm = "" if before is None else _drift(before.prior(given, now), reading)
         return Machine(reading.factors, reading.covariance, now, windows, alarm)
-    if before is None or estimate.status is not GapStatus.MODEL_MISMATCH:
+    if before is None:
         return before
     rival = Machine(reading.factors, reading.covariance, now)
     if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
