@@ -58,5 +58,5 @@ def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_publish
 def test_the_report_shows_what_was_sent_and_on_how_many_machines_it_was_tried(shown):
     text = shown[0].read_text()
     assert "What the certified twin sent" in text
-    assert "256 machines" in text
+    assert "300 machines" in text
     assert "-50.0" in text.replace("\u2212", "-")
