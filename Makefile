@@ -5,6 +5,9 @@ STAMP := .venv/.installed-from-lock
 
 PACKAGES ?= yes
 
+# A file's tests run in one process, in the order of tests/conftest.py: what they share is computed once.
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+
 .PHONY: help demo reproduce reference check test fuzz bench lint format lock clean packages
 
 help:
@@ -26,13 +29,13 @@ reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
 check: lint
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test: lint packages
-	$(BIN)/python -m pytest -q -n 2
+	$(PYTEST)
 
 fuzz: $(STAMP)
-	$(BIN)/python -m pytest -q -n 2 -m hypothesis --hypothesis-profile=fuzz
+	$(PYTEST) -m hypothesis --hypothesis-profile=fuzz
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks

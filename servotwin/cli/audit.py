@@ -25,12 +25,12 @@ from servotwin.twin_service.twin_file import service_of
 
 _TIMEOUT_S = 30.0
 _BEFORE_S = 60.0
-"""Events that belong to no window are shown from so many s before the first window on."""
+"""Events without a window are shown from this time before the first window on, s."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Source of the evidence: a service where there is a URL, otherwise the store that a twin's file names.
+    """Source of the evidence: a service where a URL is set, otherwise the store that a twin's file names.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Source:
     url : str or None
         https://twin:8765
     token, ca : Path or None
-        A file with an operator's token; certificates that the service's is checked against.
+        File with an operator's token; certificates against which the service's is checked.
     """
 
     config: Path
@@ -49,7 +49,7 @@ class Source:
 
 
 class _ServoEvidence(NamedTuple):
-    """A servo, its windows and the events of no window, as the API returns them."""
+    """A servo, its windows, and the events without a window, in the form of the API."""
 
     servo: JsonObject
     traces: list[JsonObject]
@@ -57,16 +57,16 @@ class _ServoEvidence(NamedTuple):
 
 
 def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> None:
-    """Print a servo's newest windows and what followed from them.
+    """Print a servo's newest windows with the estimates, updates and receipts that followed.
 
     Parameters
     ----------
     servo : str
     source : Source
     limit : int
-        Windows at most.
+        Largest number of windows.
     changes : bool
-        Leave out windows that led to nothing but an estimate.
+        Leave out windows that led to an estimate only.
     json : bool
         Print the evidence chains as JSON, in the form of the API.
 
@@ -80,7 +80,7 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     else:
         evidence = _read_service(servo, source, limit)
     if not evidence.traces:
-        raise InvalidInput(f"servo {servo!r}: no window of it was ever stored")
+        raise InvalidInput(f"servo {servo!r}: the store has no window of it")
     if json:
         print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
         return
@@ -114,10 +114,10 @@ def servos(source: Source, json: bool) -> None:
 
 
 def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
-    """All servos, page by page; `page` returns those after a name."""
+    """Read all servos page by page; `page` returns those after a name."""
     rows: list[JsonObject] = []
-    while more := page(rows[-1]["servo"] if rows else ""):
-        rows += more
+    while batch := page(rows[-1]["servo"] if rows else ""):
+        rows += batch
     return rows
 
 
@@ -152,7 +152,7 @@ def _since(oldest: float) -> float:
 
 
 def _json_client(source: Source) -> Callable[[str], Any]:
-    """Function that requests JSON from the service; raises InvalidInput."""
+    """Return a function that requests JSON from the service; raises InvalidInput."""
     url, headers = str(source.url).rstrip("/"), {}
     if not _is_address(url):
         raise InvalidInput(f"url {url!r}: give the URL of a twin, such as https://twin:8765")
@@ -160,7 +160,7 @@ def _json_client(source: Source) -> Callable[[str], Any]:
         raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
         headers["Authorization"] = f"Bearer {read_secret(source.token)}"
-    # A request in clear goes to this machine itself and must not pass a proxy, which could read the token.
+    # A request in clear goes to this computer only, and must not pass a proxy, which could read the token.
     handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
     opener = build_opener(_NoRedirect, handler)
 
@@ -185,7 +185,7 @@ def _is_address(url: str) -> bool:
 
 
 class _NoRedirect(HTTPRedirectHandler):
-    """Follows no redirect: the token is for this service alone."""
+    """Follows no redirect, which could send the token to another service."""
 
     def redirect_request(self, *_args: Any) -> None:
         """Refuse every redirect."""

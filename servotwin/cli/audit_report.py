@@ -1,4 +1,4 @@
-"""Evidence chain as text: a line per window in order of time, with what followed from it beside it."""
+"""Evidence chain as text: one line per window in order of time, with its consequences."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Entry = tuple[float, str, str]
 def lines_of(
     servo: JsonObject, traces: Sequence[JsonObject], events: Iterable[JsonObject], changes: bool = False
 ) -> Iterator[str]:
-    """All lines, oldest first.
+    """Make all lines, oldest first.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def _disturbance(body: JsonObject) -> str:
 
 
 def _matters(trace: JsonObject) -> bool:
-    """True where more followed from the window than an estimate."""
+    """True where more than an estimate followed from the window."""
     quiet = all(one["kind"] in _REMARKS for one in trace["found"])
     return bool(trace["steps"]) or not quiet or any(_failed(one) for one in trace["found"])
 
@@ -118,7 +118,7 @@ def _window(trace: JsonObject) -> Iterator[Entry]:
 
 
 def _estimate(trace: JsonObject) -> JsonObject | None:
-    """The estimate of a window; the glance where there is none."""
+    """Estimate of a window, or the glance where there is no estimate."""
     estimates = [one for one in trace["found"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
     return estimates[-1] if estimates else None
 
@@ -204,7 +204,7 @@ def _receipt(receipt: JsonObject) -> str:
 
 
 def _effect(effect: JsonObject) -> str:
-    """The largest error at the window's end, before and under the version."""
+    """Remark with the largest error at the end of a window, before and under the version."""
     window, before, after = effect["window"], effect["before"], effect["after"]
     return f"version {after['version']} in window {window['sequence']}: error {_error(before)} -> {_error(after)} um"
 

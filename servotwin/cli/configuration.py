@@ -99,16 +99,18 @@ FILES = {
                 "recording": TableSpec((Recording,), "Windows that the edge records and sends."),
                 "edge": TableSpec(
                     (Supervision,),
-                    "Supervision: with this table updates may set gains too, and the edge looks after itself.",
+                    "Supervision by the edge; with this table updates may also set gains.",
                     {
                         "fallback": _FALLBACK,
                         "probe": TableSpec((ProbeLimits,), "Probing moves of the reference that the twin may request."),
                     },
                 ),
-                "novelty": TableSpec((NoveltyRules,), "Rules by which the edge sends a window; all where absent."),
+                "novelty": TableSpec(
+                    (NoveltyRules,), "Rules that select the windows to send; where absent the edge sends all."
+                ),
                 "link": TableSpec(
                     (LinkSettings,),
-                    "The link, both ways.",
+                    "Both directions of the link.",
                     {
                         "up": TableSpec((LinkSettings,), "Changes for edge to twin.", partial=True),
                         "down": TableSpec((LinkSettings,), "Changes for twin to edge.", partial=True),
@@ -128,7 +130,9 @@ FILES = {
                 "own": _OWN,
                 "start": _START,
                 "supervision": TableSpec((Supervision,), "Supervision of the loop.", {"fallback": _FALLBACK}),
-                "novelty": TableSpec((NoveltySettings,), "Filter of the windows that are sent; all where absent."),
+                "novelty": TableSpec(
+                    (NoveltySettings,), "Filter that selects the windows to send; where absent the edge sends all."
+                ),
             },
         ),
     ),

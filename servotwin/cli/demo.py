@@ -30,7 +30,7 @@ BIAS = 0.05  # V on the motor's input, such as an amplifier's offset
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The servo alone, with its twin as published, and with the certified one."""
+    """Results without a twin, with the published twin, and with the certified one."""
 
     servo: st.Servo
     alone: TwinRun
@@ -40,7 +40,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class DemoStep:
-    """One step alone, with the published twin and with the certified one; what the twins made of its window."""
+    """Results of one step: without a twin, with the published twin and with the certified one, with their estimates."""
 
     number: int
     alone: MeasuredStep
@@ -57,9 +57,9 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
     Parameters
     ----------
     out : Path
-        Directory for report.html, demo.svg and demo.png; made if missing.
+        Directory for report.html, demo.svg and demo.png; created if missing.
     preset : str
-        Which of the paper's servos.
+        Name of one of the paper's servos.
     console : Console, optional
         Where progress and verdicts are shown.
 
@@ -94,7 +94,7 @@ def scenarios(preset: str) -> tuple[st.Scenario, st.Scenario]:
 
 
 def compare(published: st.Scenario, certified: st.Scenario, console: Console) -> Comparison:
-    """All three at once, under progress bars."""
+    """Run all three in parallel, under progress bars."""
     percent, note = TextColumn("{task.percentage:3.0f} %"), TextColumn("[dim]{task.fields[note]}")
     off = published.replace(twin=published.twin.replace(enabled=False))
     jobs = {"without a twin": off, "twin as published": published, "certified twin": certified}
@@ -152,14 +152,14 @@ _SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled"
 
 
 def cells(row: DemoStep) -> tuple[str, ...]:
-    """A verdict as texts, in the order of `HEADS`."""
+    """Make the texts of a verdict, in the order of `HEADS`."""
     swings = (f"{verdict(step)} {step.amplitude * MM:.3f}" for step in (row.alone, row.published, row.twinned))
     truth = f"{math.degrees(row.estimate.truth):.2f}"
     return str(row.number), truth, _estimate(row.estimate), *swings, f"{row.left * UM:.1f}"
 
 
 def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
-    """An update as texts, in the order of `SENT`; gains in the servo's own."""
+    """Make the texts of an update, in the order of `SENT`; gains relative to the servo's own."""
     new, verification, own = update.setting.gains, update.verification, servo.controller
     if new is None or verification is None:
         return (f"{update.data_time:.0f}", *("-" for _ in _SENT[1:]))

@@ -9,14 +9,14 @@ import typer
 
 
 def edge(file: Annotated[Path, typer.Argument(help="The servo's edge.toml.")]) -> None:
-    """Run one servo's edge until a signal ends it. On a gateway: python -m servotwin.edge_process."""
+    """Run one servo's edge until a signal ends it. On the edge's computer: python -m servotwin.edge_process."""
     from servotwin.edge_process.run import run
 
     run(file)
 
 
 def up(
-    folder: Annotated[Path, typer.Option(help="Folder of everything that is stored; made at the first start.")] = Path(
+    folder: Annotated[Path, typer.Option(help="Folder for all stored data; created at the first start.")] = Path(
         "servotwin-up"
     ),
     speed: Annotated[
@@ -56,7 +56,7 @@ def enroll(
     ] = "supervise",
     sample_rate_hz: Annotated[float, typer.Option(help="Sample rate of the edge, Hz.")] = 5000.0,
     drive: Annotated[
-        Path | None, typer.Option(help="TOML with the table [drive]; a simulated drive by default.")
+        Path | None, typer.Option(help="TOML file with the table drive; a simulated drive by default.")
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="Address at which the edge reaches the twin; the twin's own by default.")
@@ -72,7 +72,7 @@ def enroll(
     from servotwin.up import enrolment
 
     if operator is not None:
-        made = enrolment.enroll_operator(twin, name, operator, again)
+        written = enrolment.enroll_operator(twin, name, operator, replace_token=again)
     else:
         request = enrolment.Enrolment(
             servo=name,
@@ -81,12 +81,12 @@ def enroll(
             sample_rate=sample_rate_hz,
             drive=enrolment.drive_of(drive),
             url=url,
-            again=again,
+            replace_token=again,
             noise=noise_um * 1e-6,
             ca=ca,
         )
-        made = enrolment.enroll(twin, request)
-    for path in made:
+        written = enrolment.enroll(twin, request)
+    for path in written:
         print(f"written: {path}")
 
 

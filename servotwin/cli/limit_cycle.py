@@ -72,21 +72,21 @@ def print_limit_cycle(
     tolerance = None if tolerance_mm is None else tolerance_mm / _MM
     if not (math.isfinite(gap_deg) and gap_deg >= 0.0):
         raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be finite and 0 or more")
-    found = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
+    computed = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
     if as_json:
-        print(json.dumps(as_dict(found), indent=2))
+        print(json.dumps(as_dict(computed), indent=2))
         return
     console = Console()
     console.print(f"{name}: gap {gap_deg:g} deg in all, {_dead_zone(tolerance_mm)}, after a step of {step_mm:g} mm")
-    _print(console, found)
+    _print(console, computed)
 
 
-def as_dict(found: Findings) -> dict[str, Any]:
+def as_dict(computed: Findings) -> dict[str, Any]:
     """Make the JSON object: plain numbers, with units in the keys."""
     return {
-        "status": found.result.status.value,
-        "reason": found.result.reason,
-        "orbit": _orbit(found.result.orbit),
+        "status": computed.result.status.value,
+        "reason": computed.result.reason,
+        "orbit": _orbit(computed.result.orbit),
         "describing_function": [
             {
                 "frequency_hz": one.frequency,
@@ -96,9 +96,9 @@ def as_dict(found: Findings) -> dict[str, Any]:
                 "orbit": _orbit(near.orbit),
                 "reason": near.reason,
             }
-            for one, near in found.predictions
+            for one, near in computed.predictions
         ],
-        "no_prediction": found.no_prediction,
+        "no_prediction": computed.no_prediction,
     }
 
 
@@ -125,13 +125,14 @@ def _dead_zone(tolerance_mm: float | None) -> str:
     return f"dead zone ±{tolerance_mm:g} mm" if tolerance_mm else "no dead zone"
 
 
-def _print(console: Console, found: Findings) -> None:
-    orbit = found.result.orbit
-    console.print(f"[bold]{found.result.status.value}[/]{': ' if found.result.reason else ''}{found.result.reason}")
+def _print(console: Console, computed: Findings) -> None:
+    result = computed.result
+    orbit = result.orbit
+    console.print(f"[bold]{result.status.value}[/]{': ' if result.reason else ''}{result.reason}")
     table = Table("", "frequency\nHz", "position\n± mm", "motor\n± deg", "", box=None, pad_edge=False)
     if orbit is not None:
         table.add_row("exact, after the step", *_cells(orbit))
-    for one, near in found.predictions:
+    for one, near in computed.predictions:
         table.add_row(
             "describing function",
             f"{one.frequency:.4f}",
@@ -145,8 +146,8 @@ def _print(console: Console, found: Findings) -> None:
         console.print(table, highlight=False)
     if orbit is not None:
         _print_orbit(console, orbit)
-    if found.no_prediction:
-        console.print(f"no describing function: {found.no_prediction}", style="dim", highlight=False)
+    if computed.no_prediction:
+        console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
 
 
 def _cells(orbit: Orbit) -> tuple[str, ...]:

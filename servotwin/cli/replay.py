@@ -92,7 +92,7 @@ def _replay_windows(
     """Replay the windows of a servo, newest first."""
     before = None
     while traces := store.audit(servo, limit=_PAGE, window=only, before=before):
-        contexts = store.contexts({record.context for trace in traces for record in trace.found if record.context})
+        contexts = store.contexts({record.context for trace in traces for record in trace.evidence if record.context})
         for trace in traces:
             yield _replay_window(store, trace, contexts, model)
         before = traces[-1].window.id
@@ -111,7 +111,7 @@ def _replay_window(
 ) -> _ReplayedWindow:
     window = trace.window
     name = f"{window.boot}/{window.sequence}"
-    estimate = next((one for one in reversed(trace.found) if one.kind == "estimate"), None)
+    estimate = next((one for one in reversed(trace.evidence) if one.kind == "estimate"), None)
     if estimate is None:
         return _ReplayedWindow(name, WAITING if window.done is None else _GLANCED)
     if estimate.status.startswith("failed"):

@@ -1,1 +1,1 @@
-"""Settings that an edge starts with, made of a servo's model and a policy."""
+"""Settings that an edge starts with, derived from a servo's model and a policy."""

@@ -1,4 +1,4 @@
-"""Settings that an edge starts with, made of a servo's model and a policy.
+"""Settings that an edge starts with, derived from a servo's model and a policy.
 
 A fallback set is verified for every gap, step and input bias of the stated range, so that it needs no estimate:
 the loop begins on it, and comes back to it. The limits admit what the policy may send and little else.
@@ -33,7 +33,7 @@ from servotwin.runtime.retry import Retry
 from servotwin.twin.settings import TwinSettings
 
 PATIENCE = 1.0
-"""s that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
+"""Longest time that a change of the dead zone waits for an instant at which it neither opens nor closes the loop, s."""
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
 _MOST_SAMPLES = 1e8  # some 10 GB of signals
@@ -58,7 +58,7 @@ class Recording:
     sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
     window: Annotated[
         float | None,
-        key("window_s", above=0.0, help="Length of a window; by the controller where absent."),
+        key("window_s", above=0.0, help="Length of a window; where absent it follows from the controller."),
     ] = None
     pre_trigger: Annotated[
         float | None,
@@ -68,7 +68,7 @@ class Recording:
             help="Part of a window before the change of the reference; where absent it follows from the controller.",
         ),
     ] = None
-    retry: Annotated[Retry, key(prefix="retry_", help="When an unacknowledged window is sent again.")] = field(
+    retry: Annotated[Retry, key(prefix="retry_", help="Repetition of unacknowledged windows.")] = field(
         default_factory=Retry
     )
     limits: Annotated[Limits, key(help="Limits that an update must respect.")] = field(default_factory=Limits)
@@ -88,7 +88,7 @@ class Recording:
         key(
             "longest_pre_trigger_s",
             minimum=0.0,
-            help="Longest pre-trigger that it may request; pre_trigger_s where absent.",
+            help="Longest pre-trigger that the twin may request; pre_trigger_s where absent.",
         ),
     ] = None
     probe: ProbeLimits | None = None
@@ -104,14 +104,14 @@ class Guarding(NamedTuple):
 
 
 def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
-    """Supervision and limits for a policy that sends gains; None for one that sets the tolerance only.
+    """Derive supervision and limits for a policy that sends gains; None for one that sets the tolerance only.
 
-    A twin may be silent for as long as its settings are verified for.
+    The edge tolerates silence of the twin for the time for which its settings are verified.
 
     Parameters
     ----------
     servo : Servo
-        With the controller that runs.
+        Servo with the controller that runs.
     settings : TwinSettings
     noise : float
         m rms on the measured position.
@@ -134,7 +134,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
 
 
 def start_of(fallback: FallbackSet) -> Parameters:
-    """The fallback set from the first sample on; an update may replace it at once."""
+    """Parameters with the fallback set from the first sample on; an update may replace it at once."""
     return Parameters(setting=fallback.setting, fallback=True)
 
 
@@ -173,7 +173,7 @@ class Commissioning:
     twin : TwinSettings
     recording : Recording
     supervision : Supervision, optional
-        None: made for the policy.
+        None: derived from the policy.
     noise : float
         m rms on the measured position.
     """
@@ -187,7 +187,7 @@ class Commissioning:
 
     @cached_property
     def guarding(self) -> Guarding | None:
-        """Supervision and limits by the policy; None: the supervision was given, or the policy needs none.
+        """Supervision and limits from the policy; None: `supervision` is set, or the policy needs none.
 
         Raises
         ------
@@ -215,23 +215,23 @@ class Commissioning:
     @property
     def window(self) -> float:
         """Length of a window, s."""
-        given = self.recording.window
-        return given if given is not None else (CALM_WINDOW if self.calm else WINDOW)
+        window = self.recording.window
+        return window if window is not None else (CALM_WINDOW if self.calm else WINDOW)
 
     @property
     def pre_trigger(self) -> float:
         """Part of a window before the change of the reference, s."""
-        given = self.recording.pre_trigger
+        pre_trigger = self.recording.pre_trigger
         fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
-        return given if given is not None else (CALM_PRE_TRIGGER if fits else 0.0)
+        return pre_trigger if pre_trigger is not None else (CALM_PRE_TRIGGER if fits else 0.0)
 
     def check_window(self) -> None:
-        """Refuse a window that does not fit into memory, or that is too short for the estimator.
+        """Refuse a window that does not fit into memory or is too short for the estimator.
 
         Raises
         ------
         InvalidInput
-            With the length that is allowed.
+            Names the allowed length.
         """
         rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
         check_samples("window", self.recording.longest_window or self.window, rate)
@@ -240,7 +240,7 @@ class Commissioning:
             raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")
 
     def agent_settings(self, servo: str, boot: str) -> AgentSettings:
-        """Settings of the agent of a servo (by name) for one boot.
+        """Make the settings of the agent of a servo (by name) for one boot.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class Commissioning:
         return agent
 
     def recorder_settings(self, servo: str, boot: str) -> AgentSettings:
-        """The part of the agent's settings that is about windows."""
+        """Settings of the agent that concern windows."""
         r = self.recording
         return AgentSettings(
             servo=servo,

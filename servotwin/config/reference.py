@@ -1,4 +1,4 @@
-"""Reference of a file's keys as Markdown and JSON _Schema, generated from the declarations of `config.keys`."""
+"""Reference of a file's keys as Markdown and JSON Schema, generated from the declarations of `config.keys`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def markdown(title: str, spec: TableSpec) -> str:
 
 
 def schema(title: str, spec: TableSpec) -> _Schema:
-    """The JSON _Schema of one kind of file."""
+    """The JSON Schema of one kind of file."""
     return {"$schema": "http://json-schema.org/draft-07/schema#", "title": title, **_object(spec)}
 
 

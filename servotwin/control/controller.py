@@ -48,9 +48,7 @@ class Controller:
         float,
         key("filter_time_s", above=0.0, help="Time constant of the derivative's filter, which makes the law proper."),
     ]
-    enter: Annotated[
-        float, key("enter_tolerances", minimum=0.0, help="The loop opens when the error is at most that large.")
-    ] = 1.0
+    enter: Annotated[float, key("enter_tolerances", minimum=0.0, help="Error at or below which the loop opens.")] = 1.0
     leave: Annotated[
         float,
         key(

@@ -1,9 +1,9 @@
 """Co-simulation: plant and law, edge agent, link and twin under one virtual clock.
 
-Time is event time in seconds; the machine moves in whole samples. Something that happens between two samples, or
-exactly at one, takes effect at the later one, before that sample is taken. The plant runs ahead only as far as nothing
-can happen to it: to the next event, to what the agent waits for, at most to where a change not seen yet could complete
-a window; during a probing move, to where the wanted position changes.
+Time is event time in seconds; the machine advances by whole samples. An event between two samples, or exactly at one,
+takes effect at the later one, before that sample is taken. The plant advances only as far as nothing can happen to it:
+to the next event, to the agent's deadline, and at most to the sample at which a change of the reference that has not
+been recorded yet could complete a window; during a probing move, to the next change of the reference.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 
 Progress = Callable[[float], object]
-"""Called with the share done, 0 .. 1."""
+"""Callback with the completed share, 0 .. 1."""
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
-_ROUNDING = 1e-6  # of a sample: times that are sums of delays are known to rounding only
+_ROUNDING = 1e-6  # of a sample: a sum of delays may exceed the sample's time by rounding
 
 
 def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: Estimator | None = None) -> Loop:
@@ -50,9 +50,9 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
     ----------
     scenario : Scenario
     progress : callable, optional
-        Called with the share done, 0 .. 1, at least once per window length.
+        Called with the completed share, 0 .. 1, at least once per window length.
     estimator : callable, optional
-        Replaces the twin's own: (identify.Window, twin.wear.Expectation) -> GapEstimate.
+        Replaces the twin's own: (estimation.Window, Expectation) -> GapEstimate.
 
     Returns
     -------
@@ -74,22 +74,22 @@ class Machine(Protocol):
 
     @property
     def index(self) -> int:
-        """The present sample."""
+        """Number of the present sample."""
 
     def advance(self, index: int) -> None:
-        """Go on to a sample."""
+        """Advance to a sample."""
 
     def measured(self, name: str, first: int, last: int) -> Floats:
-        """A channel at samples first .. last - 1, all before the present one."""
+        """Return a channel at samples first .. last - 1, all before the present one."""
 
     def set_tolerance(self, tolerance: float) -> None:
-        """A new dead zone (m) from the present sample on."""
+        """Set the dead zone (m) from the present sample on."""
 
     def set_reference(self, reference: PiecewiseCubic) -> None:
-        """Another reference (m) from the present sample on."""
+        """Set the reference (m) from the present sample on."""
 
     def set_controller(self, controller: Controller, tolerance: float) -> None:
-        """Another controller and dead zone (m) from the present sample on, the voltage unchanged by it."""
+        """Set controller and dead zone (m) from the present sample on; the voltage does not jump."""
 
 
 class Remote(Protocol):
@@ -99,7 +99,7 @@ class Remote(Protocol):
         """Return the answers to a message that arrived at `now` (s)."""
 
     def next_wake(self) -> float | None:
-        """Return the time at which `wake` is due, s; None: nothing is waited for."""
+        """Return the time at which `wake` is due, s; None: no answer is pending."""
 
     def wake(self, now: float) -> list[Message]:
         """Return the messages that are due at `now` (s)."""
@@ -144,22 +144,22 @@ class Cosimulation:
         self.fallbacks: list[Fallback] = []
         self.answers: list[Answer] = []
         self._in_force = self.agent.parameters
-        self._wanted = as_pieces(scenario.reference, scenario.duration)
+        self._reference = as_pieces(scenario.reference, scenario.duration)
         self._probe: ProbingMove | None = None
         self._wake: Event | None = None
 
     @property
     def done(self) -> bool:
-        """The last sample is reached."""
+        """True at the last sample."""
         return self.machine.index == self.machine.samples - 1
 
     @property
     def share(self) -> float:
-        """Share of the samples that is done, 0 .. 1."""
+        """Completed share of the samples, 0 .. 1."""
         return self.machine.index / (self.machine.samples - 1)
 
     def advance(self) -> None:
-        """To the next sample at which something may happen, and through what does."""
+        """Advance to the next sample at which an event is possible, and process its events."""
         first, stop = self.machine.index, self._next_stop()
         self.machine.advance(stop)
         blocks = (self.machine.measured(name, first, stop) for name in CHANNELS)
@@ -172,7 +172,7 @@ class Cosimulation:
             self.clock.step()
 
     def loop(self, run: Run) -> Loop:
-        """Everything so far, with the machine's run."""
+        """Return the result so far, with the machine's run."""
         return Loop(
             scenario=self.scenario,
             run=run,
@@ -192,7 +192,7 @@ class Cosimulation:
         )
 
     def _next_stop(self) -> int:
-        """The next event, what the agent waits for, or where a change not seen yet could complete a window."""
+        """Sample up to which nothing can happen to the machine (see the module)."""
         index = self.machine.index
         stops = [index + self.agent.shortest_wait, self.machine.samples - 1]
         if self.clock.next_time is not None:
@@ -202,14 +202,14 @@ class Cosimulation:
         return max(min(stops) if self._probe is None else self._before_moving(min(stops)), index + 1)
 
     def _before_moving(self, stop: int) -> int:
-        """With the first sample at which the wanted position is another than at the last one; at most `stop`."""
+        """Sample at which the reference first changes, at most `stop`."""
         first = self.machine.index - 1
-        wanted = self._wanted.on(np.arange(first, stop) / self.scenario.recording.sample_rate)
-        moved = np.flatnonzero(wanted != wanted[0])
+        references = self._reference.on(np.arange(first, stop) / self.scenario.recording.sample_rate)
+        moved = np.flatnonzero(references != references[0])
         return first + int(moved[0]) + 1 if moved.size else stop
 
     def _sample_at(self, time: float) -> int:
-        """The first sample at or after a time."""
+        """First sample at or after a time."""
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
     def _send_up(self, outgoing: ScheduledMessage) -> None:
@@ -222,38 +222,38 @@ class Cosimulation:
         self.link.up.send(encode(outgoing.message))
 
     def _at_edge(self, data: bytes) -> None:
-        """Bytes arrive at the machine."""
+        """Receive bytes at the edge."""
         sent = self.agent.receive(decode(data))
         self._follow()
         for outgoing in sent:
             self._send_up(outgoing)
 
     def _follow(self) -> None:
-        """Let the machine run as the agent wants it to."""
+        """Apply the agent's parameters and probing move to the machine."""
         self._retune()
         if self.agent.probe is not self._probe:
             self._probe = self.agent.probe
-            self.machine.set_reference(self._wanted if self._probe is None else self._moved(self._probe))
+            self.machine.set_reference(self._reference if self._probe is None else self._moved(self._probe))
 
     def _moved(self, move: ProbingMove) -> PiecewiseCubic:
-        """The wanted position with a probing move on top."""
+        """Reference with a probing move added."""
         changes = [(0, 0.0), *move.changes(), (move.last, 0.0)]
         times = [sample / self.scenario.recording.sample_rate for sample, _ in changes]
-        return shifted(self._wanted, PiecewiseCubic.held(times, [offset for _, offset in changes]))
+        return shifted(self._reference, PiecewiseCubic.held(times, [offset for _, offset in changes]))
 
     def _retune(self) -> None:
-        """Let the machine run on what the agent has put in force."""
-        wanted, controller = self.agent.parameters, self.agent.controller
-        if wanted is self._in_force:
+        """Apply the parameters in force to the machine where they have changed."""
+        parameters, controller = self.agent.parameters, self.agent.controller
+        if parameters is self._in_force:
             return
-        self._in_force = wanted
+        self._in_force = parameters
         if controller is None:
-            self.machine.set_tolerance(wanted.setting.tolerance)
+            self.machine.set_tolerance(parameters.setting.tolerance)
         else:
-            self.machine.set_controller(controller, wanted.setting.tolerance)
+            self.machine.set_controller(controller, parameters.setting.tolerance)
 
     def _at_twin(self, data: bytes) -> None:
-        """Bytes arrive at the twin; one that is switched off lets them lie."""
+        """Receive bytes at the twin; a twin that is switched off ignores them."""
         if self.scenario.twin.enabled:
             self._answer(self.twin.receive(decode(data), self.clock.now))
 
@@ -262,7 +262,7 @@ class Cosimulation:
         self._answer(self.twin.wake(self.clock.now))
 
     def _answer(self, messages: Iterable[Message]) -> None:
-        """Send what the twin says, what it worked out after its processing time, and note when it wants to be woken."""
+        """Send the twin's messages, updates after its processing time, and schedule its next wake."""
         for message in messages:
             delay = self.scenario.twin.processing if isinstance(message, Update | Request) else 0.0
             self.clock.schedule(self.clock.now + delay, partial(self.link.down.send, encode(message)))

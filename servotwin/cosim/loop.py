@@ -1,4 +1,4 @@
-"""Result of a co-simulation: the trajectory, and everything that crossed the link."""
+"""Result of a co-simulation: the trajectory, and every message on the link."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Transmission:
         The message's number in its direction; 1 for a duplicate.
     data : bytes
     sent, arrival : float
-        s; a lost one's arrival is when it would have come.
+        s; a lost copy has the arrival that it would have had.
     fate : Fate
     """
 
@@ -69,31 +69,32 @@ class Loop:
     run : Run
         The trajectory.
     windows : tuple of messages.WindowMessage
-        As decoded by the twin, each once, in the order of arrival.
+        As decoded by the twin, without repetitions, in the order of arrival.
     estimates : tuple of GapEstimate
         One for each window.
     disturbances : tuple of Disturbance
         Input bias and noise, one for each window.
     trends : tuple of Trend or None
-        Gap and rate of wear as the twin knew them after each window; None before the first accepted estimate.
+        The twin's gap and rate of wear after each window; None before the first accepted estimate.
     redesigns : tuple of Redesign
-        What was made of each window, or why nothing was.
+        Redesign after each window, or the reason why there is none.
     updates : tuple of messages.Update
-        Every version that the twin gave out.
+        Every version that the twin sent.
     receipts : tuple of messages.Receipt
-        Every decision of the edge, in its order (repeated answers included).
+        Every decision of the edge, in order, repeated answers included.
     fallbacks : tuple of messages.Fallback
-        When and why the edge left the twin's parameters.
+        Every return of the edge to the fallback set, with time and reason.
     excitations : tuple of redesign.excitation.Decision
-        What the twin asked for after a window, or why nothing; one for each window that was looked at.
+        Decision for or against a request after each window that the twin considered, with the reason.
     requests : tuple of messages.Request
-        Every request of the twin for windows that tell more.
+        Every request of the twin for more informative windows.
     answers : tuple of messages.Answer
-        Every answer of the edge to one, repeated answers included.
+        Every answer of the edge to a request, repeated answers included.
     messages : tuple of Transmission
         Every copy of every message, in the order of sending.
     accounts : Counter
-        Windows cut by the edge: "delivered", "in flight" (kept at the edge, not at the twin), or why they were dropped.
+        Windows cut by the edge, by fate: "delivered", "in flight" (in the outbox, not at the twin), or the reason for
+        which they were dropped.
     """
 
     scenario: Scenario
@@ -148,16 +149,16 @@ class Loop:
 
     @property
     def columns(self) -> dict[str, list[Any]]:
-        """One row per window: what was estimated from it. Signals are in ``loop.run.columns``."""
-        found = self.estimates
+        """Estimates as columns, one row per window. Signals are in ``loop.run.columns``."""
+        estimates = self.estimates
         return {
             "sequence": [window.sequence for window in self.windows],
             "start_s": [window.start for window in self.windows],
-            "time_s": [estimate.time for estimate in found],
-            "status": [estimate.status.value for estimate in found],
-            "gap_rad": [estimate.gap for estimate in found],
-            "gap_low_rad": [estimate.interval[0] for estimate in found],
-            "gap_high_rad": [estimate.interval[1] for estimate in found],
+            "time_s": [estimate.time for estimate in estimates],
+            "status": [estimate.status.value for estimate in estimates],
+            "gap_rad": [estimate.gap for estimate in estimates],
+            "gap_low_rad": [estimate.interval[0] for estimate in estimates],
+            "gap_high_rad": [estimate.interval[1] for estimate in estimates],
             "trend_gap_rad": [math.nan if trend is None else trend.gap for trend in self.trends],
             "trend_rate_rad_per_s": [math.nan if trend is None else trend.rate for trend in self.trends],
         }

@@ -1,4 +1,4 @@
-"""The machine of a scenario: its plant and its controller, to be simulated."""
+"""Simulated machine of a scenario: its plant with its controller."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from servotwin.simulation.endless import FOREVER, UnboundedSimulation, first_str
 
 
 def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
-    """The plant and its controller at the start of a scenario; `plant` where the machine is another than twin and edge
-    take it for."""
+    """Make the simulation of a scenario's plant and controller.
+
+    `plant` replaces the scenario's servo where the machine differs from the model of twin and edge.
+    """
     return _simulation(scenario, scenario.servo if plant is None else plant)
 
 
 def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
-    """The same, running on after the scenario's end and remembering `keep` samples.
+    """Make a simulation that runs on after the scenario's end and remembers `keep` samples.
 
     Raises
     ------
@@ -25,12 +27,12 @@ def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
         The controller is continuous.
     """
     if scenario.law.sample_rate is None:
-        raise InvalidInput("controller sample_rate = None: a machine that runs on needs a rate in Hz")
+        raise InvalidInput("controller sample_rate = None: must be a number in Hz for a machine that runs on")
     return UnboundedSimulation(_simulation(scenario, scenario.servo, keep), scenario.reference)
 
 
 def compile_ahead(scenario: Scenario) -> None:
-    """Have everything compiled that a machine of this kind runs: no sample waits for it then."""
+    """Compile everything that a machine of this kind runs, so that no sample waits for a compilation."""
     rate = scenario.law.sample_rate or scenario.recording.sample_rate
     gap = PiecewiseCubic.held([0.0, 1.5 / rate], [0.01, 0.02])
     simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)

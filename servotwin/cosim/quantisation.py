@@ -20,9 +20,9 @@ class Quantisation:
     start : float
         s, of the window.
     position_step, theta_m_step : float
-        m and rad: one count of the channel's code, the most that neighbouring codes can tell apart.
+        m and rad: one count of the channel's code, its resolution.
     gap_change : float
-        rad: gap from the decoded window less gap from what the sensors gave; NaN where one of them gives none.
+        rad: gap from the decoded window minus gap from the raw samples; NaN where one of them is unknown.
     """
 
     start: float
@@ -39,18 +39,18 @@ def quantisation(loop: Loop) -> tuple[Quantisation, ...]:
     """
     settings = loop.scenario.twin
     estimate = estimator_of(loop.scenario.servo, settings)
-    previous, found = settings.initial_gap, []
+    previous, effects = settings.initial_gap, []
     for window in loop.windows:
         pair = decode_window(window), _raw(loop.run, window)
         decoded, raw = (estimate(w, Expectation(previous)) for w in pair)
         steps = {channel.name: channel.scale for channel in window.channels}
-        found.append(Quantisation(window.start, steps["position"], steps["theta_m"], decoded.gap - raw.gap))
+        effects.append(Quantisation(window.start, steps["position"], steps["theta_m"], decoded.gap - raw.gap))
         previous = decoded.gap if decoded.ok else previous
-    return tuple(found)
+    return tuple(effects)
 
 
 def _raw(run: Run, window: WindowMessage) -> Window:
-    """The same samples as the sensors gave them."""
+    """Window with the raw samples of the sensors."""
     first = round(window.start * window.rate)
     part = slice(first, first + window.samples)
     return Window(

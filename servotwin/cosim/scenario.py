@@ -1,4 +1,4 @@
-"""A scenario: everything that a co-simulation needs, in one frozen value that a TOML file can hold."""
+"""Scenario: everything that a co-simulation needs, as one frozen value that a TOML file can describe."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ class Scenario:
     controller : Controller, optional
         The servo's own by default.
     recording : Recording
-        Left open, a window holds 1 s from the change of the reference on. A loop with little or no integral action, as
-        the certified policy makes it, is calm: the screw turns back so late that a second often shows one side of the
-        gap only. Its windows begin 0.3 s before the change, or with the first sample, and hold 2 s. What `recording`
-        says goes first; limits that it leaves open are made for the policy where `supervision` is.
+        By default a window is 1 s long and begins with the change of the reference. A loop with little or no integral
+        action, which the certified policy designs, is calm: the screw turns back so late that one second often shows
+        one side of the gap only. Its windows are 2 s long and begin 0.3 s before the change, or with the first sample.
+        Values of `recording` take precedence; limits that it leaves open are derived from the policy.
     uplink, downlink : LinkSettings
         Edge to twin, and back.
     twin : TwinSettings
-        Its `initial_gap` and `k_dz` also set the dead zone before the first update, twin or no twin; 0: none.
-        Under the policy "certified" the loop begins, twin or no twin, on the fallback set, which is verified for every
+        Its `initial_gap` and `k_dz` also set the dead zone before the first update, also without a twin; 0: none.
+        Under the policy "certified" the loop begins with the fallback set, also
+        without a twin, which is verified for every
         gap of the stated range, unless `controller` has other gains than the servo's own, or `supervision` is given.
     supervision : Supervision, optional
-        How the edge looks after itself; then updates may set gains too, in a box around the servo's own, and every
-        change leaves the voltage where it is. None: made for the policies that send gains, "certified" and
-        "hysteresis", from what is verified; under the others updates set the tolerance, at once, and the edge trusts
-        them.
+        Supervision by the edge; with it updates may also set gains, in a box around the servo's own, and no change
+        makes the voltage jump. None: derived from the verified settings for the policies that send gains ("certified"
+        and "hysteresis"); under the others updates set the tolerance at once, and the edge does not supervise them.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Scenario:
         float,
         key(
             "theta_d0_deg",
-            help="Angle of the screw at the start; the motor's is 0 there, so that 0 is the middle of the backlash.",
+            help="Angle of the screw at the start; the motor starts at 0, so 0 is the middle of the backlash.",
         ),
     ] = 0.0
     controller: Controller | None = None
@@ -128,7 +128,7 @@ class Scenario:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Scenario:
-        """A scenario from a TOML file; a servo's path in it is relative to the file.
+        """Load a scenario from a TOML file; a servo's path in the file is relative to its folder.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Scenario:
 
     @classmethod
     def preset(cls, name: str) -> Scenario:
-        """One of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm", "certified"."""
+        """Load one of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm", "certified"."""
         if name not in PRESETS:
             hint = did_you_mean(name, PRESETS)
             raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
@@ -149,7 +149,7 @@ class Scenario:
 
     @classmethod
     def from_table(cls, table: Table, folder: Path) -> Scenario:
-        """A scenario from a table that was read already; a servo's path in it is relative to `folder`."""
+        """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
             scenario: Scenario = read(table, cls, folder, **read_parts(table, folder))
             table.done()
@@ -158,11 +158,11 @@ class Scenario:
             return scenario
 
     def replace(self, **changes: Any) -> Scenario:
-        """A copy with some values changed, validated again."""
+        """Copy with some values changed, validated again."""
         return dataclasses.replace(self, **changes)
 
     def with_servo(self, servo: Servo) -> Scenario:
-        """The same with another servo and its own controller, changed where this scenario changes its servo's."""
+        """Copy with another servo and its controller, changed as this scenario changes its servo's controller."""
         if self.controller is None:
             return self.replace(servo=servo)
         own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.controller)
@@ -176,12 +176,12 @@ class Scenario:
 
     @property
     def model(self) -> Servo:
-        """The servo with the controller that runs: what the twin designs for."""
+        """The servo with the controller that runs; the twin designs for it."""
         return self.servo.replace(controller=self.law)
 
     @cached_property
     def commissioning(self) -> Commissioning:
-        """All that the settings of its edge follow from."""
+        """Servo, law and twin from which the settings of its edge follow."""
         noise = 0.0 if self.noise is None else self.noise.std
         return Commissioning(self.servo, self.law, self.twin, self.recording, self.supervision, noise)
 
@@ -202,7 +202,7 @@ class Scenario:
 
     @property
     def samples(self) -> int:
-        """Samples recorded, both ends included."""
+        """Number of recorded samples, both ends included."""
         return round(self.duration * self.recording.sample_rate) + 1
 
     def agent_settings(self) -> AgentSettings:

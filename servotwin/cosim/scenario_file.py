@@ -1,4 +1,4 @@
-"""A scenario's TOML: kinds of reference and gap, and the tables that depend on its servo."""
+"""Scenario file: kinds of reference and gap, and the tables that depend on the servo."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def samples(
     times: Annotated[tuple[float, ...], key("times_s", help="Times.")],
     values: Annotated[tuple[float, ...], key("values_mm", help="Values, as many.")],
 ) -> SignalLike:
-    """Values at given times, the last one held."""
+    """Values at given times; the last one holds."""
     return Samples(times, list(values))
 
 
@@ -72,7 +72,7 @@ REFERENCES: Mapping[str, Maker] = {
 def constant_gap(
     total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
 ) -> SignalLike:
-    """Gap that stays as it is."""
+    """Constant gap."""
     return total
 
 
@@ -90,7 +90,7 @@ GAPS: Mapping[str, Maker] = {"constant": constant_gap, "growing": growing_gap}
 
 
 def gap_maker(table: Table) -> Maker:
-    """Kind of gap that a table describes."""
+    """Choose the kind of gap that a table describes."""
     return constant_gap if "total_deg" in table.values or not table.values else growing_gap
 
 
@@ -127,7 +127,7 @@ def read_parts(table: Table, folder: Path) -> dict[str, Any]:
 
 
 def resolve_servo(table: Table, folder: Path) -> Servo:
-    """The servo that a file names: a preset, or a TOML file relative to `folder`."""
+    """Load the servo that a file names: a preset, or a TOML file relative to `folder`."""
     name = table.text("servo")
     if name not in PRESETS and not (folder / name).is_file():
         raise table.invalid(
@@ -137,13 +137,13 @@ def resolve_servo(table: Table, folder: Path) -> Servo:
 
 
 def _changed(table: Table, controller: Controller) -> Controller | None:
-    """The servo's controller with what the scenario changes, keys as in a servo's file; None: it changes nothing."""
+    """Read the changes of the servo's controller, keys as in a servo's file; None: there are none."""
     changed = changes(table, Controller)
     return controller.replace(**changed) if changed else None
 
 
 def _supervision(edge: Table, controller: Controller) -> Supervision | None:
-    """[edge]: updates may set gains, and the edge looks after itself; without it, they set the tolerance only.
+    """Read [edge]: with it updates may set gains and the edge supervises the loop; without it they set the tolerance.
 
     Its table `probe` changes nothing of this.
     """

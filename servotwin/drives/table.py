@@ -65,7 +65,7 @@ def _replay(
     log: Annotated[Path, key(help="CSV as `servotwin simulate` writes it.")],
     speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
     loop: Annotated[bool, key(help="Begin again at the end.")] = False,
-    block_s: Annotated[float, key(above=0.0, help="Time in one block.")] = 0.05,
+    block_s: Annotated[float, key(above=0.0, help="Length of a block.")] = 0.05,
 ) -> SupervisedDrive:
     """Recorded log in place of a machine."""
     from servotwin.drives.replay import Replay
@@ -89,9 +89,7 @@ def _opcua(
     server_certificate: Annotated[Path | None, key(help="Certificate of the server.")] = None,
     poll_s: Annotated[
         float,
-        key(
-            above=0.0, help="Time from one look at the samples to the next; the rings must hold several times as much."
-        ),
+        key(above=0.0, help="Interval between two readings of the samples; the rings must hold several times as much."),
     ] = 0.05,
     silence_s: Annotated[float, key(above=0.0, help=_SILENCE)] = 5.0,
 ) -> SupervisedDrive:

@@ -186,12 +186,14 @@ class Agent:
     def hello(self) -> Hello:
         """Make the message that introduces the edge: send it after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller
+        # The gains in force, which an earlier boot may have stored, and not the configured ones.
         setting = Setting(p.setting.tolerance, None if law is None else gains_of(law))
         return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""
         stop = int(min(len(reference), done + self._deadline - self.samples))
+        # Changes within an open window are listed when it is cut, so the block goes on; a probing move ends at one.
         if self._open_window is not None and self.probe is None:
             return stop
         last = self._expected
@@ -272,6 +274,7 @@ class Agent:
     @property
     def _timed(self) -> float:
         """Value of `samples` at which a window is cut although the reference rests."""
+        # At least a window after the last one, so that two windows share no sample.
         return self._cut_at + max(self.settings.look_samples, self._requests.window)
 
     def _before(self, first: int) -> float:
@@ -287,4 +290,5 @@ class Agent:
         due = self.outlet.next_time
         if due is None:
             return deadline
+        # At least one sample ahead: what is due now has just been returned.
         return min(deadline, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))

@@ -149,6 +149,7 @@ def _in_step(name: str, old: float, new: float, smallest: float, factor: float) 
 def _power(base: float, exponent: float) -> float:
     try:
         return base**exponent
+    # So long after the last update that any step is allowed.
     except OverflowError:
         return inf
 
@@ -196,6 +197,8 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
     samples = here.sample - current.sample
     since = samples / here.rate
     old, new = current.setting.tolerance, update.setting.tolerance
+    # The first failed check is the reason: servo, boot and versions before limits, which only a current update must
+    # meet.
     checks = (
         (update.servo == here.servo, Reason.WRONG_SERVO),
         (update.window[0] == here.boot, Reason.OTHER_BOOT),
@@ -206,6 +209,7 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
         (here.time < update.not_after and here.time - update.data_time <= limits.lifetime_s, Reason.EXPIRED),
         (limits.allows_tolerance(new), Reason.OUT_OF_BOUNDS),
         (limits.allows_tolerance_step(old, new, since), Reason.STEP_TOO_LARGE),
+        # Without a window the parameters are those of the start or a fallback, from which no interval counts.
         (current.window is None or samples >= limits.interval_s * here.rate, Reason.TOO_SOON),
         (here.sample >= current.not_before, Reason.AFTER_FALLBACK),
     )

@@ -116,6 +116,7 @@ class Recorder:
         place = (end - len(block)) % self.capacity
         room = self.capacity - place
         ring[place : place + len(block)] = block[:room]
+        # The part beyond the end of the ring continues at its begin.
         ring[: max(0, len(block) - room)] = block[room:]
 
     def _read(self, ring: "array[float]", first: int, last: int) -> "array[float]":
@@ -132,6 +133,7 @@ def as_floats(block: Floats) -> "array[float]":
         view = memoryview(block)  # type: ignore[arg-type]
     except TypeError:
         return array("d", block)
+    # Element by element: the bytes of another layout are no doubles.
     if view.format != "d" or not view.contiguous:
         return array("d", block)
     floats = array("d")

@@ -94,8 +94,10 @@ def offer(state: Switch, update: Update, rules: Rules, here: Instant, error: flo
         Last tracking error, m; None: there was no sample yet.
     """
     current, pending = state.current, state.pending
+    # Its receipt was lost: the twin gets the same answer again.
     if is_repeat(update, current, here):
         return Transition(state, (receipt(update, Reason.APPLIED, current.sample, current, here),))
+    # Repeated while it waits: the receipt follows the decision.
     if pending is not None and update == pending.update:
         return Transition(state)
     reason = _judge_with_pending(update, state, rules, here)
@@ -126,6 +128,7 @@ def apply_pending(state: Switch, rules: Rules, here: Instant, error: float | Non
 def fall_back(state: Switch, fallback: FallbackSet, violation: Violation, here: Instant) -> Transition:
     """Put the fallback set in force at the next sample, whatever the error is; refuse the pending update."""
     setting = msgspec.structs.replace(fallback.setting, gains=fallback.setting.gains or state.current.setting.gains)
+    # Data time now: updates from data recorded before the fallback are refused.
     new = Parameters(0, setting, here.time, fallback=True)
     return _replace(state, new, fallback.setting.gains, violation, fallback.refuse_s, here)
 
@@ -141,6 +144,7 @@ def _replace(
 ) -> Transition:
     """Put other parameters in force at the next sample, under a new version, and refuse updates for a while."""
     old, pending = state.current, state.pending
+    # Above the pending version too, which the twin has already used.
     version = 1 + max(old.version, 0 if pending is None else pending.update.version)
     not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, _MOST_DOUBLINGS) * here.rate)
     new = replace(new, version=version, sample=here.sample, not_before=not_before)
@@ -246,6 +250,7 @@ class Supervisor:
 
     def twin_answered(self, now: float, more: bool) -> None:
         """Note an answer of the twin's; `more` windows may still wait for theirs."""
+        # While other windows wait, the silence counts from this answer.
         self._unanswered_since = now if more else None
 
     def check(self) -> Messages:

@@ -124,6 +124,7 @@ class Watch:
         for start in range(0, len(errors), self.slot):
             part = slice(start, start + self.slot)
             violation = self._update_slot(first + start, reference[part], errors[part], voltage[part])
+            # All slots are taken even after a violation: the result must not depend on the length of the blocks.
             first_violation = first_violation or violation
         return first_violation or self._check_energies()
 
@@ -137,6 +138,7 @@ class Watch:
     ) -> Violation | None:
         """Take one more slot, the first sample of which has number `sample`."""
         mean = sum(errors) / len(errors)
+        # Samples that are not finite say nothing about the loop.
         if not isfinite(mean):
             return None
         self._note_moves(sample, reference, abs(errors[0]))

@@ -1,4 +1,4 @@
-"""Configuration of one servo's edge as a process, as `edge.toml` holds it."""
+"""Configuration of one servo's edge as a process, from `edge.toml`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from servotwin.link.url import in_clear
 
 ROLES = ("control", "supervise")
 UNBOOTED = "unbooted"
-"""The boot's name in a configuration: each start takes its own."""
+"""Placeholder for the boot's name in a configuration: each start has its own."""
 MB = 1_000_000
 
 
@@ -41,10 +41,12 @@ class TwinLink:
     token_env: Annotated[str | None, key(help="Environment variable with the servo's token.")] = None
     ca_file: Annotated[
         str | None,
-        key(help="Certificates that the twin's, or the broker's, is checked against; the system's where absent."),
+        key(help="Certificates against which the twin's or the broker's is checked; the system's where absent."),
     ] = None
     timeout_s: Annotated[float, key(above=0.0, help="Longest wait for an answer.")] = 10.0
-    wait_s: Annotated[float, key(minimum=0.0, maximum=30.0, help="Longest wait of one poll for something new.")] = 25.0
+    wait_s: Annotated[float, key(minimum=0.0, maximum=30.0, help="Longest time that one poll waits for a message.")] = (
+        25.0
+    )
     user: Annotated[str | None, key(help="Name of the edge at the broker.")] = None
     password_file: Annotated[
         str | None, key(help="File of mode 0600 with the user's password; either this or password_env.")
@@ -73,14 +75,14 @@ class TwinLink:
 
 @settings("keep")
 @dataclass(frozen=True, slots=True)
-class Keeping:
-    """Files that the edge keeps; paths are relative to the configuration's folder."""
+class StoredFiles:
+    """Files that the edge writes; paths are relative to the configuration's folder."""
 
-    outbox: Annotated[str, key(help="Windows and letters that the twin has not acknowledged.")] = "outbox.sqlite"
-    parameters: Annotated[str, key(help="Parameters that stood the test last.")] = "parameters.json"
+    outbox: Annotated[str, key(help="Outbox: messages that the twin has not acknowledged.")] = "outbox.sqlite"
+    parameters: Annotated[str, key(help="Last parameters under which the loop kept its band.")] = "parameters.json"
     status: Annotated[str, key(help="Status that `servotwin edge` shows.")] = "status.json"
     boots: Annotated[str, key(help="Number of starts of this edge.")] = "boots"
-    windows: Annotated[int, key(minimum=1, help="Most windows in the outbox.")] = 5000
+    windows: Annotated[int, key(minimum=1, help="Largest number of windows in the outbox.")] = 5000
     bytes: Annotated[int, key("megabytes", minimum=MB, help="Largest size of the outbox.")] = 256 * MB
 
     def __post_init__(self) -> None:
@@ -110,9 +112,10 @@ class EdgeConfig:
     Parameters
     ----------
     agent : AgentSettings
-        Of a boot without name; its `controller` is set where updates may set gains.
+        Settings for a boot without name; its `controller` is set where updates may set gains.
     controller : Controller, optional
-        As configured; needed to control, and where updates may set gains. Its rate is the samples'.
+        Configured controller; required in the role control, and where updates may set gains. Its rate is that of the
+        samples.
     drive : mapping of str to TOML value
         Keys for the drive of the kind that the key `kind` names.
     folder : path
@@ -129,9 +132,9 @@ class EdgeConfig:
     controller: Controller | None
     drive: Mapping[str, object]
     twin: Annotated[
-        TwinLink | None, key(help="Where the twin is; where absent the edge runs without one and keeps its windows.")
+        TwinLink | None, key(help="Address of the twin; where absent the edge runs without one and stores its windows.")
     ] = None
-    keeping: Annotated[Keeping, key("keep", help="Files that the edge keeps.")] = field(default_factory=Keeping)
+    files: Annotated[StoredFiles, key("keep", help="Files that the edge writes.")] = field(default_factory=StoredFiles)
     sensor: Annotated[SensorGuard, key(help="Voltage while samples are not finite.")] = field(
         default_factory=SensorGuard
     )
@@ -141,7 +144,7 @@ class EdgeConfig:
             "realtime_priority",
             minimum=0,
             maximum=99,
-            help="Priority of the control process among real-time ones (SCHED_FIFO); 0: it is none.",
+            help="Real-time priority of the control process (SCHED_FIFO); 0: normal scheduling.",
         ),
     ] = 0
     folder: Path = field(default=Path(), compare=False)
@@ -150,9 +153,9 @@ class EdgeConfig:
     def __post_init__(self) -> None:
         check(self)
         if self.controller is None and (self.role == "control" or self.agent.controller is not None):
-            raise InvalidInput("table [controller] is missing: it is needed to control, and where updates set gains")
+            raise InvalidInput("table [controller] is missing: role = 'control' and update_gains = true need it")
         if self.agent.controller is not None and self.agent.controller != self.controller:
-            raise InvalidInput("the agent's controller is not the one that runs")
+            raise InvalidInput("the controller of agent must be the one that runs")
         if self.role == "control" and self.law_rate != self.agent.sample_rate:
             allowed = f"must be that of the samples, {self.agent.sample_rate!r} Hz"
             raise InvalidInput(f"controller sample_rate_hz = {self.law_rate!r} Hz: {allowed}")
@@ -161,12 +164,12 @@ class EdgeConfig:
 
     @property
     def law_rate(self) -> float | None:
-        """Of the controller, Hz."""
+        """Sample rate of the controller, Hz."""
         return None if self.controller is None else self.controller.sample_rate
 
     @property
     def drive_table(self) -> Table:
-        """For the drive's own reader."""
+        """Table [drive], which the drive's own reader parses."""
         return Table(self.source, self.drive, "drive")
 
     def path(self, name: str) -> Path:
@@ -174,29 +177,29 @@ class EdgeConfig:
         return self.folder / name
 
     def settings(self, boot: str) -> AgentSettings:
-        """The agent's, for one boot."""
+        """Settings of the agent for one boot."""
         return replace(self.agent, boot=boot)
 
     def law(self, controller: Controller | None, tolerance: float) -> LawParameters:
-        """The law for a controller (None: as configured) and a tolerance (m)."""
+        """Discretise a controller (None: the configured one) with a tolerance (m)."""
         chosen = controller or self.controller
-        assert chosen is not None, "the role is to control"
+        assert chosen is not None, "the role control needs a controller"
         return chosen.law(tolerance)
 
 
 def token_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str:
-    """The servo's token.
+    """Read the servo's token.
 
     Raises
     ------
     InvalidInput
-        There is none, or others may read its file; the token itself is never shown.
+        It is missing, or others may read its file; the message never shows the token.
     """
     return _secret("token", twin.token_file, twin.token_env, folder, environment)
 
 
 def password_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str | None:
-    """The password of the edge's user at the broker, None where there is no user; raises InvalidInput as `token_of`."""
+    """Read the password of the edge's user at the broker; None without a user. Raises InvalidInput as `token_of`."""
     if twin.user is None:
         return None
     return _secret("password", twin.password_file, twin.password_env, folder, environment)
@@ -212,7 +215,7 @@ def _is_http(url: str) -> bool:
 
 
 def _secret(what: str, file: str | None, variable: str | None, folder: Path, environment: Mapping[str, str]) -> str:
-    """From a private file or the environment."""
+    """Read a secret from a private file or the environment."""
     if variable is not None:
         return _checked(what, environment.get(variable, "").strip(), f"environment variable {variable}")
     assert file is not None

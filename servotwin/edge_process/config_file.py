@@ -1,4 +1,4 @@
-"""`edge.toml`: reads an `EdgeConfig`, and writes one so that what is read from it is equal, bit for bit."""
+"""`edge.toml`: reader and writer of an `EdgeConfig`; a written one reads back equal, bit for bit."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def read_config(table: Table) -> EdgeConfig:
 def update_gains_table(
     update_gains: Annotated[bool, key(help="Updates may set gains too, not only the dead zone.")] = False,
 ) -> bool:
-    """Whether updates may set gains."""
+    """Return True where updates may set gains."""
     return update_gains
 
 
 def _controller(table: Table) -> Controller:
-    """The controller of the law, sampled as the samples are."""
+    """Read the controller; its sample rate is the recording's by default."""
     rate = changes(table, AgentSettings, only=("sample_rate",)).get("sample_rate")
     controller: Controller = part(table, "controller", Controller)
     return controller if controller.sample_rate is not None else controller.replace(sample_rate=rate)
@@ -68,8 +68,7 @@ def _agent(table: Table, controller: Controller | None) -> AgentSettings:
         return None if stay or settable is None else read_gains(inner, settable)
 
     def start_gains(inner: Table) -> Gains | None:
-        given = gains_given(inner)
-        return read_gains(inner, settable) if given and settable is not None else None
+        return read_gains(inner, settable) if gains_given(inner) and settable is not None else None
 
     start, supervision = table.table("start"), table.table("supervision")
     agent: AgentSettings = read(
@@ -88,18 +87,18 @@ def _agent(table: Table, controller: Controller | None) -> AgentSettings:
 
 
 def _own(table: Table, gains: Callable[[Table], Gains | None]) -> Gains | None:
-    found = gains(table)
+    own = gains(table)
     table.done()
-    return found
+    return own
 
 
 def edge_toml(config: EdgeConfig) -> str:
-    """The text of `edge.toml`.
+    """Write the text of `edge.toml`.
 
     Parameters
     ----------
     config : EdgeConfig
-        Its folder is not written: paths stay as they are.
+        Its folder is not written; paths stay relative to it.
     """
     agent = config.agent
     values: Values = {

@@ -77,6 +77,7 @@ class ControlRole:
     def step(self) -> bool:
         """Control one sample; False: the run is over. Raises `DriveLost`."""
         sample = self._drive.read()
+        # After `read`, which waits for the sample instant: the tick's time is that of the computation.
         began = self._edge.clock()
         if sample is None:
             return False
@@ -104,9 +105,11 @@ class ControlRole:
         if isfinite(sample.reference):
             self._reference = sample.reference  # the last one holds where this one is bad
         reference = self._reference + agent.offset
+        # The transfer between two laws needs the measurement of this tick, so it waits for a good sample.
         if agent.parameters is not self._applied and isfinite(sample.position):
             self._apply(agent.parameters, reference, sample.position)
         voltage = self.law.tick(reference, sample.position)
+        # Before anything is recorded or sent: the voltage must not wait for that.
         self._drive.write(voltage)
         if not isfinite(sample.reference + sample.theta_m + sample.position):
             edge.counts["bad samples"] += 1

@@ -101,12 +101,14 @@ class EdgeRuntime:
             self._new_boot("samples missing" if missing > 0 else "machine counts anew")
             return
         self.counts["samples missed"] += missing
+        # Not a number, so that a window with them is dropped: a guess would be estimated as if it were measured.
         unknown = array("d", [nan]) * missing
         references, voltages = array("d", [reference]) * missing, array("d", [voltage]) * missing
         self.send(self.agent.absorb_block(references, unknown, unknown, voltages))
 
     def _new_boot(self, why: str) -> None:
         """Begin a new boot, on the parameters in force."""
+        # Samples count from 0 again, so the boot needs another name: the twin must not confuse their windows.
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
         self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters())
@@ -158,6 +160,7 @@ class EdgeRuntime:
         end, status_sent, left = self.clock() + seconds, False, self._outlet.untaken
         while self.clock() < end and not (status_sent and self._outlet.idle):
             if self._outlet.untaken < left:
+                # Each window that is taken gives more time: a slow disk is not a dead link process.
                 end, left = self.clock() + seconds, self._outlet.untaken
             if self._outlet.idle:
                 self._outlet.send_status(self._status())

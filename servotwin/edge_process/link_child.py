@@ -59,6 +59,7 @@ class LinkChild:
         if code is None and self._outlet.connected:
             return
         if code is None:
+            # It runs without a connection and is of no use any more: the next check starts another.
             self._process.kill()
             return
         log("link process gone", code=code)
@@ -81,6 +82,7 @@ class LinkChild:
             self._ended(now)
             return
         finally:
+            # The child has its own copy: with this one open, its end would not close the connection.
             theirs.close()
         self.starts += 1
         self._started = now

@@ -62,7 +62,7 @@ class FrameHandler:
 
     def __init__(self, config: EdgeConfig, outbox: SqliteOutbox) -> None:
         self._config, self._outbox = config, outbox
-        self._store = FileParameterStore(config.path(config.keeping.parameters))
+        self._store = FileParameterStore(config.path(config.files.parameters))
         self._unsaved: SaveFrame | None = None
         self._writer: WindowWriter | None = None
         self._boot = ""
@@ -82,6 +82,7 @@ class FrameHandler:
             self._unconfirmed[frame.serial] = _Unconfirmed(None, len(frame.body))
             return self._confirmed()
         if isinstance(frame, SaveFrame):
+            # Newer parameters replace unwritten ones, whose frame is confirmed because nobody needs it any more.
             before, self._unsaved = self._unsaved, frame
             return ([] if before is None else [before.serial]) + self._save()
         if isinstance(frame, ProcessedFrame):
@@ -113,6 +114,7 @@ class FrameHandler:
         boot, sequence = ("", -1) if last is None else msgspec.msgpack.decode(last, type=tuple[str, int])
         if boot == frame.boot and frame.sequence <= sequence:
             return
+        # In the transaction of the window itself: after a crash both are on the disk, or neither.
         self._outbox.set_value(_LAST_CUT, msgspec.msgpack.encode((frame.boot, frame.sequence)))
         if self._writer is None or frame.boot != self._boot:
             self._boot = frame.boot
@@ -149,8 +151,8 @@ class LinkProcess:
 
     def __init__(self, config: EdgeConfig, end: socket.socket) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
-        keeping = config.keeping
-        self.outbox = SqliteOutbox(config.path(keeping.outbox), config.agent.servo, keeping.windows, keeping.bytes)
+        files = config.files
+        self.outbox = SqliteOutbox(config.path(files.outbox), config.agent.servo, files.windows, files.bytes)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = _token(config), False
@@ -231,7 +233,7 @@ class LinkProcess:
         self._log_troubles()
         self._check_token()
         try:
-            write_status(self._config.path(self._config.keeping.status), self._status())
+            write_status(self._config.path(self._config.files.status), self._status())
         except OSError:
             self._faults["status not written"] += 1
 
@@ -268,6 +270,7 @@ class LinkProcess:
     def _send(self) -> None:
         assert self._sender is not None
         while not self._stopping.is_set():
+            # Before the step: a message that comes meanwhile ends the wait after it.
             self._outbox_changed.clear()
             sent = self._sender.step(time.monotonic())
             if sent.window is not None:
@@ -276,6 +279,7 @@ class LinkProcess:
             if sent.reconnected:
                 self._emit(frames.encode(frames.ReconnectedFrame()))
             if sent.wait_s > 0.0:
+                # An event cannot be waited for infinitely long in seconds.
                 self._outbox_changed.wait(min(sent.wait_s, 3600.0))
 
     def _receive(self) -> None:
@@ -297,6 +301,7 @@ class LinkProcess:
         self._stopping.set()
         self._outbox_changed.set()
         if self._transport is not None:
+            # First the blocking calls, so that the threads end; then the file, which they use.
             self._transport.close()
         for thread in threads:
             thread.join()

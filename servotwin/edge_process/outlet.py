@@ -102,6 +102,8 @@ class PipeOutlet:
         """Connect to a new link process, and send it everything that the last one has not acknowledged."""
         self.disconnect()
         self._pipe = pipe
+        # In their order, from the first unacknowledged one on: the last link process may have died before it stored
+        # any.
         for frame in self._unacknowledged.values():
             pipe.post(frame)
 
@@ -136,6 +138,7 @@ class PipeOutlet:
 
     def send_status(self, frame: frames.StatusFrame) -> None:
         """Send a status, which may be lost; nothing is sent while the link process is behind."""
+        # Never behind other frames: a status is worth nothing once it is late.
         if self._pipe is not None and self._pipe.backlog == 0:
             self._pipe.post(frames.encode(frame))
 
@@ -173,6 +176,7 @@ class PipeOutlet:
         """Take a message of the twin's once, even where it is repeated."""
         if frame.serial == 0 or frame.serial > self._processed:
             received.messages.append(decode(frame.body))
+        # Reported even where it is a repetition: the link process may have died before it stored the first report.
         if frame.serial > 0:
             self._processed = max(self._processed, frame.serial)
             if self._pipe is not None:

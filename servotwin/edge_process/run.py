@@ -71,8 +71,9 @@ def run(path: str | os.PathLike[str]) -> None:
 def _run(config: EdgeConfig, path: Path) -> None:
     connect = table.control_drive if config.role == "control" else table.supervised_drive
     drive: Drive = connect(config.drive_table, config.folder)
-    first = permitted(stored_parameters(config.path(config.keeping.parameters)), config.agent)
-    boot = next_boot(config.path(config.keeping.boots), os.urandom(8))
+    first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent)
+    # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
+    boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
     child = LinkChild(link_command(path), outlet)
     stop = StopSignal()
@@ -143,6 +144,7 @@ def set_realtime_priority(priority: int) -> bool:
     if priority == 0:
         return False
     try:
+        # RESET_ON_FORK: a link process at real-time priority could delay the tick that it must not delay.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         log("no real-time priority", error=str(error))
@@ -171,6 +173,7 @@ def _connect(config: EdgeConfig, drive: Drive, known: bool) -> None:
     except InvalidInput as error:
         if not known:
             raise
+        # A machine that is restarting may answer with default values for a while.
         raise DriveLost(str(error)) from None
 
 

@@ -28,7 +28,7 @@ def check(config: EdgeConfig) -> None:
         The token, the broker's password, the certificates, a library of the link or a folder is missing.
     """
     for key in ("outbox", "parameters", "status", "boots"):
-        name = getattr(config.keeping, key)
+        name = getattr(config.files, key)
         folder = config.path(name).parent
         if not folder.is_dir():
             raise InvalidInput(f"{config.source}: [keep]: {key} = {name!r}: there is no folder {folder}")
@@ -58,7 +58,7 @@ def exclusive(config: EdgeConfig) -> Iterator[None]:
         Another process holds a lock.
     """
     with ExitStack() as locks:
-        for name in dict.fromkeys((config.keeping.parameters, config.keeping.outbox)):
+        for name in dict.fromkeys((config.files.parameters, config.files.outbox)):
             try:
                 locks.enter_context(locked(config.path(f"{name}-lock")))
             except BlockingIOError:

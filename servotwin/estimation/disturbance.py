@@ -16,7 +16,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
@@ -196,7 +196,7 @@ def _spread(drive: Array) -> float:
 @lru_cache(maxsize=16)
 def _few(freedom: int) -> float:
     """Return the factor from normal to Student's 95 % interval, for a spread estimated from few values."""
-    return float(student.ppf(0.975, freedom)) / NORMAL_95
+    return float(stdtrit(freedom, 0.975)) / NORMAL_95
 
 
 def _noise(position: Array, size: int) -> float:

@@ -99,6 +99,7 @@ def read_offset(
     gain = response(servo, window.sample_rate).static_gain
     solved = least_squares(np.delete(columns, _GAP, axis=0), residual)
     covariance = _scaled(least_squares(columns, residual).root, estimate.std_total)
+    # `_columns` counts both channels from their first samples; here the origins come back.
     offset = float(solved.coefficients[0]) + float(window.position[0]) / gain - float(window.theta_m[0])
     return OffsetReading(offset, math.sqrt(covariance[1, 1]), float(covariance[0, 1]))
 

@@ -65,6 +65,7 @@ def _scale(mean: Array, covariance: Array, gap: float) -> float:
     """Time scale of the passage: distance over rate, spreads included; 1 s when nothing moves."""
     distance = abs(gap - float(mean[0])) + math.sqrt(covariance[0, 0])
     rate = abs(float(mean[1])) + math.sqrt(covariance[1, 1])
+    # The limits keep the powers of the time in `_passed` finite.
     return min(max(distance / rate, 1e-60), 1e60) if rate > 0.0 and distance > 0.0 else 1.0
 
 
@@ -90,6 +91,7 @@ def _passed(
     second = _score(gap - float(mean[0]) - time * float(mean[1]), then)
     product = np.sqrt(now * np.maximum(then, 0.0))
     correlation = np.divide(shared, product, out=np.zeros_like(time), where=product > 0.0)
+    # Rounding may put a correlation a little beyond 1.
     return 1.0 - both_below(first, second, np.clip(correlation, -1.0, 1.0))
 
 

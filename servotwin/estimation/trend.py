@@ -73,7 +73,7 @@ def transition(step: float) -> Array:
 
 
 def process_noise(step: float, settings: TrendSettings) -> Array:
-    """(3, 3) covariance that `step` seconds of the random walks add: exact, so that steps can be split at will."""
+    """(3, 3) covariance that `step` seconds of the random walks add: exact however the time is divided."""
     gap, rate = settings.gap_walk_rad_per_sqrt_s**2, settings.rate_walk_rad_per_s_per_sqrt_s**2
     noise = np.zeros((3, 3))
     noise[GAP, GAP] = gap * step + rate * step**3 / 3.0
@@ -218,9 +218,11 @@ class Trend:
 
     def _corrected(self, measurement: TrendMeasurement) -> Trend:
         """Correct the state by a measurement, unless its gap is an outlier; an outlying offset is read anew."""
+        # The gap alone first: with the offset included, a slipped encoder would look like a jump of the gap.
         distance = self._distance(measurement.of_gap)
         if distance > self.settings.outlier_std:
             return self._refused(distance, measurement)
+        # The gap fits, so it is the offset that does not.
         if self._distance(measurement) > self.settings.outlier_std:
             return replace(self.without_offset()._joseph(measurement), reasons=(_MOVED,))
         return self._joseph(measurement)
@@ -237,6 +239,7 @@ class Trend:
         spread = select @ self.covariance @ select.T + noise
         gain = np.linalg.solve(spread, select @ self.covariance).T
         left = np.eye(3) - gain @ select
+        # (I - K H) P alone would lose symmetry and definiteness to rounding after many windows.
         covariance = left @ self.covariance @ left.T + gain @ noise @ gain.T
         mean = self.mean + gain @ (measurement.values - select @ self.mean)
         counted = self.updates + 1
@@ -260,6 +263,7 @@ class Trend:
         if self.rival is not None and self.rival._distance(measurement.of_gap) <= self.settings.agreement_std:
             return self.rival._corrected(measurement)
         fresh = Trend.start(self.time, self.settings).covariance
+        # The gap has jumped; the wear rate that was learnt stays.
         fresh[RATE, RATE] = self.covariance[RATE, RATE]
         mean = np.array([0.0, self.mean[RATE], 0.0])
         return Trend(self.time, mean, fresh, self.settings)._joseph(measurement)

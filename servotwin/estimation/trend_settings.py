@@ -1,4 +1,4 @@
-"""Settings of the filter across windows: what it assumes of wear."""
+"""Settings of the filter across windows: its assumptions on wear."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from servotwin.errors import InvalidInput
 @settings("trend")
 @dataclass(frozen=True)
 class TrendSettings:
-    """What is assumed of wear before anything was measured. `for_wear` derives all of it from two plain numbers.
+    """Assumptions on wear before the first measurement. `for_wear` derives them from two plain numbers.
 
     Raises
     ------
@@ -36,7 +36,7 @@ class TrendSettings:
     ] = 0.0
     rate_walk_rad_per_s_per_sqrt_s: Annotated[
         float,
-        value(minimum=0.0, unit="rad/s/sqrt(s)", help="Random walk of the rate: how fast wear may change its pace."),
+        value(minimum=0.0, unit="rad/s/sqrt(s)", help="Random walk of the rate: changes of the pace of wear."),
     ] = math.radians(0.015)
     offset_walk_rad_per_sqrt_s: Annotated[
         float, value(minimum=0.0, unit="rad/sqrt(s)", help="Random walk of the encoder's offset.")
@@ -45,27 +45,27 @@ class TrendSettings:
         float,
         value(
             minimum=0.0,
-            help="Error that all windows have in common (the model's), which no number of windows averages away; it "
-            "widens the stated gap, not its rate.",
+            help="Error that all windows share (the model's), which does not average out; it widens the stated gap, "
+            "not its rate.",
         ),
     ] = math.radians(0.02)
     outlier_std: Annotated[
         float,
-        value(minimum=0.0, help="An estimate more standard deviations off the prediction is refused."),
+        value(minimum=0.0, help="An estimate that is farther from the prediction is refused, in standard deviations."),
     ] = 6.0
     restart_after: Annotated[
         int,
         value(
             minimum=1,
-            help="So many outliers in a row that agree mean that the machine has changed (a crash, a new or "
-            "re-adjusted screw): the gap then starts afresh from them.",
+            help="Number of consecutive outliers in agreement from which on the machine counts as changed (a crash, a "
+            "new or re-adjusted screw): the gap then starts anew from them.",
         ),
     ] = 2
     agreement_std: Annotated[
         float,
         value(
             minimum=0.0,
-            help="Outliers agree when each is within so many standard deviations of what the ones before it predict.",
+            help="Outliers agree if each is within this many standard deviations of the earlier ones' prediction.",
         ),
     ] = 3.0
 
@@ -74,9 +74,9 @@ class TrendSettings:
 
     @classmethod
     def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
-        """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a pace that may change meanwhile.
+        """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a rate that may change.
 
-        The rate begins with a spread of gap / over and wanders by as much within `over`.
+        The standard deviation of the rate is gap / over at the start; its random walk reaches as much within `over`.
         """
         if not (0.0 < gap < math.inf and 0.0 < over < math.inf):
             raise InvalidInput(f"wear of {gap!r} rad over {over!r} s: both must be finite and greater than 0")
@@ -86,13 +86,13 @@ class TrendSettings:
 
 
 def wear(
-    gap: Annotated[float, key("wear_deg", above=0.0, help="Growth of the gap that is expected within over_s.")],
+    gap: Annotated[float, key("wear_deg", above=0.0, help="Expected growth of the gap within over_s.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time in which the gap grows by wear_deg.")],
 ) -> TrendSettings:
-    """Trend settings from a table."""
+    """Make trend settings from the keys of a table."""
     return TrendSettings.for_wear(gap, over)
 
 
 def trend_maker(table: Table) -> Any:
-    """What makes trend settings of a table: the defaults of an empty one, otherwise `wear`."""
+    """Choose the maker of trend settings: the defaults for an empty table, otherwise `wear`."""
     return wear if table.values else TrendSettings

@@ -52,7 +52,7 @@ def verbatim(function: _Function) -> _Function:
 
 def _compile(function: _Function, **options: Any) -> _Function:
     try:
-        # Nothing calls these through a C function pointer: without that wrapper they compile 8 % faster.
+        # The C wrapper would only be compiled and cached: nothing calls these functions through a C function pointer.
         given: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True, **options}
         dispatcher: Any = njit(cache=True, nogil=True, **given)(function)
     except RuntimeError:  # only the cache can fail here: compilation comes with the first call

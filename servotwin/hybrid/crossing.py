@@ -60,6 +60,7 @@ def _search_unit(t: Tables, scratch: Scratch) -> float:
     error = CUBIC_ERROR * fourth_derivative_bound(c, 1.0) / PIECES**4
     for piece in range(PIECES):
         at = 3 * piece
+        # No Bernstein coefficient above zero: the cubic stays below zero, and the guard too, by the bound of the error.
         if max(b[at], b[at + 1], b[at + 2], b[at + 3]) + error > 0.0:
             root = first_positive(c, piece / PIECES, (piece + 1) / PIECES, scratch.starts, scratch.ends)
             if root < np.inf:
@@ -77,6 +78,7 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         return np.inf
     c = scratch.series
     first = series(t, mode, guard, x, c)
+    # The guard is zero on the whole step but for rounding: a mode may last on its own boundary.
     if first == TERMS:
         return np.inf
     if c[first] > 0.0:

@@ -189,6 +189,7 @@ def _run(
     workers = max(1, min(threads or os.cpu_count() or 1, count))
     # Members cost unequally: many small parts keep every worker busy to the end.
     size = max(1, count // (_PARTS_PER_WORKER * workers))
+    # An iterator shared by the threads: the interpreter lock makes taking the next part safe.
     parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
     tail = 1 if options is None else options.last
 
@@ -268,4 +269,5 @@ def _checked_starts(
     if which.shape != modes.shape or not np.isin(which, np.arange(automata)).all():
         raise InvalidInput(f"every member needs an automaton of 0 to {automata - 1}")
     limits = np.zeros((len(modes), results.traces.shape[1])) if options is None else options.limits
+    # Sorted by automaton, so that its tables are filled once for all of its members.
     return MemberStarts(np.argsort(which, kind="stable"), which, modes, states, limits)

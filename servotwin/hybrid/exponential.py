@@ -48,6 +48,7 @@ def new_powers(states: int) -> Powers:
 @verbatim
 def _sum(a: float, b: float) -> tuple[float, float]:
     """Sum and what rounding left of it."""
+    # Knuth's sum without error. Reordered, as fast-math would do it, the remainder is zero; hence `verbatim`.
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
@@ -57,6 +58,7 @@ def _sum(a: float, b: float) -> tuple[float, float]:
 def _product(a: float, b: float) -> tuple[float, float]:
     """Product and what rounding left of it."""
     result = a * b
+    # Dekker's product without error, from exact products of halves.
     big = _SPLIT * a
     a_high = big - (big - a)
     big = _SPLIT * b
@@ -137,8 +139,10 @@ def expm1(flow: Array, time: float) -> Array:
     """``exp(flow * time) - I`` of an ``(n, n)`` matrix, by scaling, Taylor series and squaring of the deviation from
     one."""
     n, powers = len(flow), new_powers(len(flow))
+    # Balanced for its size only: the units of the states must not decide the number of halvings.
     balanced = matrix_balance(flow, permute=False)[0]
     size = float(np.abs(balanced).sum(axis=1).max()) * abs(time)
+    # To a norm of at most 1/4, for which the series ends within `_MOST_TERMS`.
     halvings = max(0, int(np.ceil(np.log2(max(size, 1e-300)))) + 2)
     _expm1(np.array(flow, dtype=float).ravel(), n, float(time), halvings, powers)
     return powers.power.reshape(n, n)

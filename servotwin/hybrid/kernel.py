@@ -124,6 +124,7 @@ def cross(
     of events."""
     place, before = start, record.size[1]
     while record.size[1] - before < EVENTS_PER_STEP:
+        # Every guard, because several may be crossed within the step: the earliest crossing is the event.
         first, which = np.inf, -1
         for g in range(t.guard_count[mode]):
             time = next_crossing(t, mode, g, x, end - place, scratch)
@@ -133,6 +134,7 @@ def cross(
             advance_fraction(t, mode, x, end - place, scratch)
             return mode, record.size[1] - before
         advance_fraction(t, mode, x, first, scratch)
+        # Rounding of the sum must not put the event behind the end of this part of the step.
         place = min(place + first, end)
         mode = fire(t, mode, which, x, step, place, False, record, scratch)
         mode = follow_guards(t, mode, x, step, place, False, record, scratch)
@@ -178,6 +180,7 @@ def flow_until(
     Returns status, place reached (of the failure when Zeno) and mode.
     """
     calm = 0  # search steps since the last event
+    # Compiled code cannot enlarge the record: it returns FULL while one more step with all its events still fits.
     room = len(record.step) - EVENTS_PER_STEP - 4
     room_events = len(record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE - 4
     if record.size[0] > room or record.size[1] > room_events:
@@ -195,6 +198,7 @@ def flow_until(
                 note_segment(record, step, 0.0, mode, x)
             if clean == wanted:
                 continue
+        # The tables hold whole search steps, so they serve only a state on the grid of search steps.
         if fraction == 0.0 and step < end_step:
             wanted = min(NODES_FINE, end_step - step)
             clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, wanted, mode, x, scratch)
@@ -233,6 +237,7 @@ def follow_schedule(
     `record` has grown.
     """
     while True:
+        # A start or a jump may have made guards positive: they are followed before anything flows.
         if at[3] == 1:
             mode = follow_guards(t, at[1], x, at[0], place[0], True, record, scratch)
             if mode < 0:

@@ -166,6 +166,7 @@ def run_members(
     for place in range(first, last):
         k = starts.order[place]
         a = starts.automaton[k]
+        # Members come sorted by automaton: most find its tables filled.
         if memory.loaded[0] != a:
             load(family, a, memory)
         for i in range(t.states):

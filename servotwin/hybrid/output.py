@@ -81,6 +81,7 @@ def _fill_rows(t: Tables, flow: int, row: Array, w: OutputWorkspace) -> None:
 def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
     """Rows as sampling needs them: whole ones, or for every step the columns that are not zero."""
     base = m * _BLOCK * n
+    # A few samples: one row each. Every sample: column by column, so that one product gives many samples.
     if stride > 1:
         for i in range(_BLOCK * n):
             outputs.table[base + i] = w.rows[i]

@@ -7,6 +7,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined
 
+# Halvings of an interval: roots closer together than 2**-40 of it count as one.
 DEPTH = 40
 _NEWTON_STEPS = 100
 _CONVERGED = 1e-9
@@ -37,6 +38,7 @@ def bracketed_root(c: Array, low: float, high: float, at_low: float, at_high: fl
             high = t
         else:
             low = t
+        # Beyond the bracket on purpose where Newton has no slope to follow: a bisection comes next.
         new = t - value / slope if slope > 0.0 else high + 1.0
         if not low <= new <= high:
             new = 0.5 * (low + high)
@@ -87,6 +89,7 @@ def first_positive(c: Array, low: float, high: float, starts: Array, ends: Array
                 return bracketed_root(c, a, b, at_a, at_b)
             continue
         middle = 0.5 * (a + b)
+        # The right half first: the left one, on top of the stack, is searched before it.
         starts[top], ends[top] = middle, b
         starts[top + 1], ends[top + 1] = a, middle
         top += 2

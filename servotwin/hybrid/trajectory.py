@@ -133,6 +133,7 @@ class Trajectory:
     def _follow(self, steps: NDArray[np.int64], fractions: Array, values: Array, modes: NDArray[np.int64]) -> None:
         if self._failure:
             raise ZenoError(self._failure)
+        # The schedule is a new one with each call; all else resumes.
         self._at[2] = 0
         while True:
             status = follow_schedule(

@@ -142,6 +142,7 @@ class Receiver:
         if sealed.serial <= self.after:
             self.counts["repeated"] += 1
             return None
+        # Before the body is decoded: a message that this edge does not understand must not be polled again for ever.
         self.after = sealed.serial
         return self._decoded(sealed)
 

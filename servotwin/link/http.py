@@ -97,6 +97,7 @@ class _PersistentConnection:
         """Allow no more requests; the one under way fails at once."""
         self._closed = True
         connection = self._connection
+        # A request under way has the lock until its time limit: its socket is shut down instead, which wakes it.
         if self._busy.acquire(blocking=False):
             self.drop()
             self._busy.release()
@@ -133,6 +134,8 @@ class _PersistentConnection:
             size += len(piece)
             if size > limit:
                 raise HTTPException(f"a response of more than {limit} bytes")
+            # The socket's time limit begins anew with every byte, so that a slow sender would occupy the thread for
+            # ever.
             if self._clock() > deadline:
                 raise TimeoutError("the response takes too long")
             pieces.append(piece)

@@ -138,8 +138,10 @@ class MqttTransport:
 
     def _message(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         """Handle a response, or the news that a twin is gone; ignore anything else."""
+        # The broker need not repeat it: a response that gets lost here is requested again.
         acknowledge()
         if topic == TWIN_GONE:
+            # It may have been the one with the request: the session repeats it now instead of after its time limit.
             self._fail_all("a twin is gone")
             return
         try:

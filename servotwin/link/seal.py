@@ -45,6 +45,7 @@ _decoder = msgspec.msgpack.Decoder(Sealed)
 
 def verifier_of(token: str) -> bytes:
     """Compute the verifier of a token; the twin stores it to check and to seal, and cannot recover the token."""
+    # The prefix separates this digest from any other use of the token.
     return sha256(b"servotwin token\0" + token.encode()).digest()
 
 
@@ -80,5 +81,7 @@ def opened(key: bytes, direction: str, servo: str, data: bytes, limit: int) -> S
 
 
 def _mac(key: bytes, direction: str, servo: str, serial: int, body: bytes) -> bytes:
+    # The direction keeps a message from being returned to its sender as one of the other side. Names have no zero byte,
+    # so that no two heads are equal.
     head = f"{direction}\0{servo}\0".encode() + pack("<Q", serial)
     return hmac.digest(key, head + body, "sha256")

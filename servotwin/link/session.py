@@ -118,4 +118,5 @@ class Session:
 
     def _due_time(self, item: Item) -> float:
         attempt = self._attempts.get(item)
+        # A message that was never tried is due at once, whatever time it is.
         return -inf if attempt is None else attempt.due

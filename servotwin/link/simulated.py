@@ -116,6 +116,7 @@ class LinkDirection:
     def send(self, data: bytes) -> None:
         """Send a message at the clock's time."""
         serial, self.offered = self.offered, self.offered + 1
+        # The delay of the duplicate is drawn even where none is sent, as in `_delay`.
         first, second, lost, twice = self._delay(), self._delay(), self._chance("loss"), self._chance("duplicate")
         self._launch(SentCopy(serial, 0, data, self._clock.now, self._clock.now + first), lost)
         if twice and not lost:
@@ -180,5 +181,6 @@ class SimulatedLink:
 
 def derive_seed(root: int, *names: str) -> int:
     """Derive the 64-bit seed of a named random source, the same on every machine and in every run."""
+    # Not `hash`, which differs from process to process.
     text = "\0".join((str(root), *names))
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")

@@ -6,6 +6,8 @@ import sqlite3
 from pathlib import Path
 from typing import Any, NamedTuple
 
+# FULL: a commit is on the disk before its frame is confirmed, so that a power failure loses nothing confirmed.
+# AUTOINCREMENT: places rise for ever, also after deletions, so they give the order of age.
 _SCHEMA = """
 PRAGMA journal_mode = WAL;
 PRAGMA synchronous = FULL;
@@ -54,6 +56,7 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     sqlite3.Error
         The file cannot be opened, or is corrupt (`is_broken`).
     """
+    # The outbox begins its transactions itself, and its lock guards the connection for all threads.
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
     try:
         connection.executescript(_SCHEMA)
@@ -74,6 +77,7 @@ def put_aside(path: Path) -> Path:
     while (aside := path.with_name(f"{path.name}.broken-{number}")).exists():
         number += 1
     path.rename(aside)
+    # With its write-ahead log: SQLite would apply that to the new file of the same name.
     for end in _BESIDE:
         beside = path.with_name(path.name + end)
         if beside.exists():

@@ -249,6 +249,7 @@ class SqliteOutbox:
             self.close()  # before connecting again: connections of one process to one file share its state
             self._connection = connect(self._path, check=False)
         if self._unwritten:
+            # IMMEDIATE takes the write lock now: a file that is locked fails here, before the first statement.
             self._connection.execute("BEGIN IMMEDIATE")
             for statement in self._unwritten.values():
                 self._connection.execute(statement.text, statement.values)
@@ -262,6 +263,7 @@ class SqliteOutbox:
         stored = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
+        # Windows of the file first: they are older, and the index is in the order of age.
         self._index = {
             **{key: entry for key, entry in stored.items() if ("window", key) not in self._unwritten},
             **self._index,

@@ -35,9 +35,9 @@ class NoveltyModel:
     direct, static_gain : float
         m/rad: position over angle at once, and at rest.
     unseen : float
-        s: what the screw does so late in a window has not reached the last mass.
+        s: motion of the screw so late in a window has not reached the last mass.
     factor : int
-        Samples per sample that is judged.
+        Decimation factor of the score.
     """
 
     rate: float
@@ -73,11 +73,11 @@ def model_table(
     static_gain: Annotated[float, key("static_gain_m_per_rad", help="Position over angle at rest.")],
     unseen: Annotated[
         float,
-        key("unseen_s", minimum=0.0, help="What the screw does so late in a window has not reached the last mass."),
+        key("unseen_s", minimum=0.0, help="Motion of the screw this late in a window has not reached the last mass."),
     ],
-    factor: Annotated[int, key("decimation", minimum=1, help="Samples per sample that is judged.")],
+    factor: Annotated[int, key("decimation", minimum=1, help="Decimation factor of the score.")],
 ) -> NoveltyModel:
-    """Response of the structure, as a program writes it."""
+    """Response of the structure; a program writes it."""
     if not len(decay_real) == len(decay_imag) == len(gain_real) == len(gain_imag):
         raise InvalidInput("decay_real, decay_imag, gain_real and gain_imag must have as many numbers as one another")
     decay, gain = map(complex, decay_real, decay_imag), map(complex, gain_real, gain_imag)
@@ -99,7 +99,7 @@ def _model_values(model: NoveltyModel) -> Values:
 @settings("novelty")
 @dataclass(frozen=True, slots=True)
 class NoveltyRules:
-    """Rules by which a window counts as news."""
+    """Rules by which a window counts as novel."""
 
     resolution: Annotated[
         float,
@@ -107,7 +107,7 @@ class NoveltyRules:
             "resolution_deg",
             "resolution_rad",
             above=0.0,
-            help="No window is taken to be surer of the gap than that, so that far smaller changes are no news.",
+            help="Smallest standard deviation that a window's gap is assumed to have.",
         ),
     ] = radians(0.005)
     worth: Annotated[
@@ -116,7 +116,7 @@ class NoveltyRules:
             "worth_deg",
             "worth_rad",
             minimum=0.0,
-            help="A smaller change since the last window that was sent is not sent, however sure it is.",
+            help="Smallest change since the last sent window for which a window is sent.",
         ),
     ] = 0.0
     score_limit: Annotated[
@@ -124,14 +124,15 @@ class NoveltyRules:
         key(
             above=0.0,
             infinite=True,
-            help="Standard deviations from the baseline that make one window news.",
+            help="Change from the baseline, in standard deviations, from which on one window is novel.",
         ),
     ] = 4.5
     allowance: Annotated[
-        float, key(minimum=0.0, help="Standard deviations that the cumulative sum lets pass in each window.")
+        float, key(minimum=0.0, help="Allowance of the cumulative sum per window, in standard deviations.")
     ] = 0.5
     cusum_limit: Annotated[
-        float, key(above=0.0, infinite=True, help="Standard deviations from which on the cumulative sum is news.")
+        float,
+        key(above=0.0, infinite=True, help="Cumulative sum, in standard deviations, from which on a window is novel."),
     ] = 8.0
     margin: Annotated[
         float,
@@ -140,7 +141,7 @@ class NoveltyRules:
             "margin_rad",
             above=0.0,
             infinite=True,
-            help="Excess of the lost motion at rest over the gap that the twin knows of; worth_deg if that is more.",
+            help="Excess of the lost motion at rest over the twin's gap that makes a window novel; at least worth_deg.",
         ),
     ] = radians(0.25)
     travel: Annotated[
@@ -149,7 +150,7 @@ class NoveltyRules:
             "travel_deg",
             "travel_rad",
             above=0.0,
-            help="Least travel of the pushed screw, both ways, for a window to say something.",
+            help="Smallest travel of the pushed screw, both ways, in an informative window.",
         ),
     ] = radians(0.5)
     settle: Annotated[
@@ -158,15 +159,13 @@ class NoveltyRules:
             "settle_deg",
             "settle_rad",
             above=0.0,
-            help="Largest move of the baseline with an update that stands on a window which was not judged.",
+            help="Largest move of the baseline by an update whose window was not scored.",
         ),
     ] = radians(0.2)
     relearn: Annotated[
-        int, key(minimum=0, help="Windows that the baseline counts as at most after an accepted update.")
+        int, key(minimum=0, help="Largest weight of the baseline after an accepted update, in windows.")
     ] = 5
-    learn: Annotated[
-        int, key(minimum=0, help="Windows that say something and are sent after each start, whatever they say.")
-    ] = 2
+    learn: Annotated[int, key(minimum=0, help="Number of informative windows sent after each start, novel or not.")] = 2
     outlier: Annotated[
         float,
         key(
@@ -174,25 +173,27 @@ class NoveltyRules:
             "outlier_rad",
             above=0.0,
             infinite=True,
-            help="A larger change may be an outlier to the twin, which wants another window that agrees.",
+            help="A larger change may be an outlier for the twin, which needs more windows to confirm it.",
         ),
     ] = radians(1.0)
-    confirm: Annotated[int, key(minimum=0, help="Windows sent after such a change, whatever they say.")] = 1
+    confirm: Annotated[int, key(minimum=0, help="Number of windows sent after such a change, novel or not.")] = 1
     patience: Annotated[
         int,
         key(
             minimum=0,
-            help="Windows in a row that say nothing and are sent nevertheless, while some are still to be sent: the "
-            "twin may ask for ones that tell more.",
+            help="Number of consecutive uninformative windows that are sent while unconditional ones remain: the twin "
+            "may then request more informative ones.",
         ),
     ] = 4
-    period_s: Annotated[float, key(above=0.0, infinite=True, help="At least one window is sent in so long.")] = 600.0
+    period_s: Annotated[float, key(above=0.0, infinite=True, help="Longest time from one sent window to the next.")] = (
+        600.0
+    )
     look_s: Annotated[
         float,
         key(
             above=0.0,
             infinite=True,
-            help="Where the reference does not change for so long, a window is cut and judged; inf: never.",
+            help="Time without a change of the reference after which a window is cut and scored; inf: never.",
         ),
     ] = 60.0
 
@@ -207,9 +208,9 @@ class NoveltySettings:
 
     model: Annotated[
         NoveltyModel,
-        key(makers={"": model_table}, dump=_model_values, help="Response of the structure, as a program writes it."),
+        key(makers={"": model_table}, dump=_model_values, help="Response of the structure; a program writes it."),
     ]
-    rules: Annotated[NoveltyRules, key(prefix="", help="Rules by which a window counts as news.")] = NoveltyRules()
+    rules: Annotated[NoveltyRules, key(prefix="", help="Rules by which a window counts as novel.")] = NoveltyRules()
     gap: Annotated[float, key("gap_deg", "gap_rad", minimum=0.0, help="Total gap to begin at.")] = 0.0
 
     def __post_init__(self) -> None:

@@ -33,6 +33,7 @@ def play_samples(theta_m: Array, half_gap: Array, theta_d0: float) -> Array:
     """Play without checks: (n,) motor angles and half gaps, (n,) or (1,)."""
     theta_d = np.empty_like(theta_m)
     now = theta_d0
+    # A constant gap is one number: no array of equal ones has to be made.
     stride = 0 if half_gap.size == 1 else 1
     for i in range(theta_m.size):
         now = play_step(now, theta_m[i], half_gap[i * stride])
@@ -139,6 +140,7 @@ def contact_guards(
     release = -side * screw_rate(basis, contact) - stopping
     if servo.rigid:
         return [GuardRow(release, "open", reset, "release", side)]
+    # The motor stands on the flank and moves with it, at the rate of the half gap.
     reset[basis["speed"]] = 0.5 * side * basis.row("gap'")
     return [GuardRow(release, f"held {flank}", reset, "hold", side)]
 

@@ -72,6 +72,7 @@ class LinearSystem:
             values = np.asarray(above / below, dtype=complex)
             sizes = [poly.polyval(np.abs(s), np.abs(p)) for p in (self.numerator, self.denominator)]
             error = np.finfo(float).eps * (sizes[0] / np.abs(above) + sizes[1] / np.abs(below))
+        # Not `error >= _ROUNDED`: the error of an overflow is NaN, which compares false.
         spoilt = ~(error < _ROUNDED) & ((s != 0.0) | (not self._has_polynomials))
         if spoilt.any():
             values = values.copy()
@@ -97,6 +98,7 @@ class LinearSystem:
         """Schur form of the balanced A, with B and C in its states."""
         from scipy.linalg import matrix_balance, schur, solve
 
+        # Balanced, because the entries of a stiff chain differ by many powers of ten.
         balanced, scaling = matrix_balance(self.A)
         triangular, unitary = schur(balanced, output="complex")
         return triangular, unitary.conj().T @ solve(scaling, self.B), (self.C @ scaling) @ unitary
@@ -152,13 +154,19 @@ class LinearSystem:
 
 def zero_order_hold(A: Array, B: Array, step: float) -> tuple[Array, Array]:
     """(A_d, B_d) of x' = A x + B u over `step` seconds of constant u (zero-order hold), by a matrix exponential."""
+    advance, drive = zero_order_holds(A[None], B[None], step)
+    return advance[0], drive[0]
+
+
+def zero_order_holds(A: Array, B: Array, step: float) -> tuple[Array, Array]:
+    """`zero_order_hold` of (P, n, n) and (P, n) systems."""
     from scipy.linalg import expm
 
-    size = B.size
-    flow = np.zeros((size + 1, size + 1))
-    flow[:size, :size], flow[:size, size] = A, B
+    size = B.shape[1]
+    flow = np.zeros((len(A), size + 1, size + 1))
+    flow[:, :size, :size], flow[:, :size, size] = A, B
     advance = expm(flow * step)
-    return advance[:size, :size], advance[:size, size]
+    return advance[:, :size, :size], advance[:, :size, size]
 
 
 def gain(value: float) -> LinearSystem:

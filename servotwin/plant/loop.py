@@ -7,6 +7,7 @@ edge's own tick as the law.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from servotwin.plant.linear import (
     zero_order_hold,
 )
 from servotwin.plant.motor import ANGLE, SPEED, Motor
+from servotwin.plant.signals import Array
 from servotwin.plant.structure import Structure, chain, transfer
 
 
@@ -106,23 +108,60 @@ def closed_loop(plant: LinearSystem, controller: Controller) -> LinearSystem:
     return feedback(series(pidf(controller), plant), loop_filter(controller))
 
 
-def sampled_poles(plant: LinearSystem, controller: Controller) -> Complex:
-    """Poles z of the sampled loop: eigenvalues of plant and law over one tick; stable when all abs(z) < 1.
+class StateMatrices(NamedTuple):
+    """x' = A x + B y, minus the voltage = C x + D y; of a sampled law x' is the next x."""
 
-    The law's matrix comes from applying the tick to unit states, with limits and dead zone off, where it is linear.
+    A: Array
+    B: Array
+    C: Array
+    D: float
+
+
+def continuous_law(controller: Controller) -> StateMatrices:
+    """Loop filter and PIDF, from the measurement to minus the voltage."""
+    law = series(loop_filter(controller), pidf(controller))
+    return StateMatrices(law.A, law.B, law.C, law.D)
+
+
+def sampled_law(controller: Controller) -> StateMatrices:
+    """One tick of the law, from the measurement to minus the voltage; with limits and dead zone off it is linear.
+
+    The matrices come from applying the edge's own tick to unit states and to a unit measurement.
+
+    Raises
+    ------
+    InvalidInput
+        The controller is continuous.
     """
     if controller.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
     law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)
-    advance, drive = zero_order_hold(plant.A, plant.B, 1.0 / controller.sample_rate)
-    size = plant.B.size
     names = ["derivative"] + ["integral"] * (controller.Ki != 0.0) + ["filtered"] * (law.loop_step < 1.0)
-    matrix = np.zeros((size + len(names), size + len(names)))
-    for column, unit in enumerate(np.eye(len(matrix))):
-        before = LawState(0.0, 0.0, 0.0, 0.0, 1.0)._replace(**dict(zip(names, map(float, unit[size:]), strict=True)))
-        after = tick(law, before, 0.0, float(plant.C @ unit[:size]))
-        matrix[:size, column] = advance @ unit[:size] + drive * after.voltage
-        matrix[size:, column] = [getattr(after, name) for name in names]
+    rest = LawState(0.0, 0.0, 0.0, 0.0, 1.0)
+    starts = [rest._replace(**{name: 1.0}) for name in names]
+    ticks = [tick(law, start, 0.0, 0.0) for start in starts] + [tick(law, rest, 0.0, 1.0)]
+    moved = np.array([[getattr(after, name) for after in ticks] for name in names])
+    voltage = np.array([after.voltage for after in ticks])
+    return StateMatrices(moved[:, :-1], moved[:, -1], -voltage[:-1], -float(voltage[-1]))
+
+
+def sampled_poles(plant: LinearSystem, controller: Controller, delay: int = 0) -> Complex:
+    """Poles z of the sampled loop: eigenvalues of plant, law and `delay` samples over one tick; stable when all
+    abs(z) < 1."""
+    law = sampled_law(controller)
+    assert controller.sample_rate is not None
+    advance, drive = zero_order_hold(plant.A, plant.B, 1.0 / controller.sample_rate)
+    size, states = plant.B.size, len(law.A)
+    matrix = np.zeros((size + states + delay, size + states + delay))
+    matrix[:size, :size], matrix[size : size + states, size : size + states] = advance, law.A
+    matrix[size : size + states, :size] = np.outer(law.B, plant.C)
+    voltage = np.concatenate([-law.D * plant.C, -law.C, np.zeros(delay)])
+    if delay == 0:
+        matrix[:size] += np.outer(drive, voltage)
+    else:
+        matrix[:size, -1] = drive
+        matrix[size + states] = voltage
+        matrix[size + states + 1 :, size + states : -1] = np.eye(delay - 1)
     return np.asarray(np.linalg.eigvals(matrix), dtype=complex)
 
 

@@ -280,12 +280,12 @@ def as_pieces(signal: SignalLike, duration: float) -> PiecewiseCubic:
         if isinstance(error, InvalidInput):
             raise
         raise InvalidInput(
-            f"{signal!r} is no signal; give a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic"
+            f"{signal!r} is not a signal; give a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic"
         ) from None
 
 
 def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit: str = "rad") -> PiecewiseCubic:
-    """As `as_pieces`, refusing a signal that goes below zero anywhere on [0, duration].
+    """Convert as `as_pieces`, and refuse a signal that is negative anywhere on [0, duration].
 
     Raises
     ------
@@ -302,7 +302,7 @@ def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit:
 
 
 def as_gap(signal: SignalLike, duration: float) -> PiecewiseCubic:
-    """As `as_nonnegative`, refusing a total gap (rad) above one turn.
+    """Convert as `as_nonnegative`, and refuse a total gap (rad) above one turn.
 
     Raises
     ------

@@ -120,6 +120,7 @@ def transfer(m: Array, k: Array, c: Array, k_d: float = math.inf) -> tuple[Array
     inner = _determinant(m[1:], k[1:], c[1:])
     if math.isinf(k_d):
         return couplings, inner, inner
+    # The spring k_d of the screw hangs mass 1 on one more support.
     extra = k.copy()
     extra[0] += k_d
     return k_d * couplings, _determinant(m, extra, c), inner

@@ -1,1 +1,1 @@
-"""From an estimate to the controller's next setting."""
+"""Redesign: the controller's next setting from an estimate."""

@@ -1,8 +1,8 @@
-"""Excitation: requests for longer windows where windows tell too little of the gap, and only then for a probing move.
+"""Excitation: requests for longer windows where windows are uninformative, and only then for a probing move.
 
-The calmer a loop, the less its windows tell (dual control). A longer window costs only bytes; a move of the reference
-disturbs the machine, so the policy requests it only where the configuration allows it, no larger than needed, and
-rarely. The policy is a pure function of its state and one window; every decision carries its reason.
+The calmer a loop, the less informative its windows (dual control). A longer window costs only bytes; a move of the
+reference disturbs the machine, so the policy requests it only where the configuration allows it, no larger than needed,
+and rarely. The policy is a pure function of its state and one window; every decision carries its reason.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 @settings("excitation")
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """Requests that the twin may make of the edge when windows tell too little of the gap, and when.
+    """Settings of the requests that the twin may send to the edge when windows are uninformative.
 
     Raises
     ------
@@ -34,12 +34,12 @@ class ExcitationSettings:
 
     after: Annotated[
         int,
-        key(minimum=1, help="Windows in a row that tell too little for an estimate, until the twin makes a request."),
+        key(minimum=1, help="Number of consecutive uninformative windows after which the twin sends a request."),
     ] = 2
     window: Annotated[float, key("window_s", above=0.0, help="Length of the requested windows.")] = 2.0
     pre_trigger: Annotated[
         float,
-        key("pre_trigger_s", minimum=0.0, help="Part of them before the reference changes, below window_s."),
+        key("pre_trigger_s", minimum=0.0, help="Part of them before the change of the reference, below window_s."),
     ] = 0.3
     probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is requested.")] = 0.0
     interval: Annotated[float, key("interval_s", above=0.0, help="Time from one probing move to the next.")] = 60.0
@@ -48,10 +48,10 @@ class ExcitationSettings:
         key(
             "hold_s",
             above=0.0,
-            help="Time that a probing move stays away, and that the window goes on after its return.",
+            help="Duration of a probing move, and of the window after its return.",
         ),
     ] = 0.85
-    strokes: Annotated[int, key(minimum=1, help="Number of times that it goes there and back.")] = 1
+    strokes: Annotated[int, key(minimum=1, help="Number of moves there and back.")] = 1
     margin: Annotated[
         float,
         key(
@@ -81,12 +81,12 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class WindowSummary:
-    """Information in one window, and the bounds known with it.
+    """Information in one window, and the bounds after it.
 
     Attributes
     ----------
     time : float
-        s, on any steady clock.
+        Time on any steady clock, s.
     status : GapStatus
     long : bool
         True for a window of the length and pre-trigger that would be requested, or cut for a probing move.
@@ -111,7 +111,7 @@ class ExcitationState:
     Attributes
     ----------
     misses : int
-        Windows in a row that told too little, since the last informative one or the last request.
+        Consecutive uninformative windows, since the last informative one or the last request.
     window, probing : Stage
     probed : float
         s, time of the last request for a probing move.

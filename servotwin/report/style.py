@@ -61,7 +61,7 @@ def panels(
     return figure, axes
 
 
-def letter(axes: Sequence[Axes]) -> None:
+def label_panels(axes: Sequence[Axes]) -> None:
     """Write (a), (b), ... at the panels' upper left, beside the titles."""
     for one, name in zip(axes, "abcdefghij", strict=False):
         one.set_title(f"({name})", loc="left", fontweight="bold")

@@ -170,6 +170,7 @@ class Child:
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # several children share the cores
             )
         assert self._process.stdout is not None
+        # Without blocking: the caller watches several children in one loop.
         os.set_blocking(self._process.stdout.fileno(), False)
         self._received = b""
 
@@ -178,6 +179,7 @@ class Child:
         if self._process is None or self._process.stdout is None:
             return
         while data := self._process.stdout.read(65536):
+            # Bounded: a child that prints without line ends must not fill the memory.
             self._received = (self._received + data)[-65536:]
         *lines, self._received = self._received.split(b"\n")
         for line in lines:
@@ -244,6 +246,7 @@ def _end_with_stdin() -> None:
         pass
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(GRACE_S)
+    # The module did not end by itself; its own children go with it.
     os.killpg(0, signal.SIGKILL)
 
 

@@ -37,6 +37,7 @@ def replace_file(path: Path, data: bytes, *, durable: bool = False, mode: int | 
     try:
         with open(beside, "wb", opener=partial(os.open, mode=0o666 if mode is None else mode)) as file:
             if mode is not None:
+                # The umask may have removed bits that `mode` has.
                 os.fchmod(file.fileno(), mode)
             file.write(data)
             if durable:
@@ -129,6 +130,7 @@ def _check_writable(directory: Path) -> None:
 
 
 def _umask() -> int:
+    # The mask can only be read by setting it.
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -87,6 +87,7 @@ class FrameSocket:
             return
         self.backlog -= sent
         if sent < len(piece):
+            # The rest goes first: parts of two frames must not mix.
             self._out.appendleft(piece[sent:])
 
     def receive(self) -> list[bytes]:
@@ -103,6 +104,7 @@ class FrameSocket:
             return []
         except OSError:
             data = b""
+        # No bytes where there was no error: the other end has closed the connection.
         if not data:
             self.broken = True
             return []

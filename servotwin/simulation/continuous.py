@@ -98,6 +98,7 @@ class ContinuousEngine:
             times = self.inputs.times(self.index + 1, index + 1).tolist()
             for time, value in zip(times, self.noise.block(len(times)).tolist(), strict=True):
                 knots.setdefault(time, {})[self.loop.automaton.index("noise")] = value
+        # One jump per time: inputs that change together must not be followed by guards in between.
         jumps = [Jump(min(t, end), knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
         self.trajectory.advance(index, jumps)
 
@@ -121,6 +122,7 @@ class ContinuousEngine:
             values |= dict.fromkeys(names, 0.0) | {"tolerance": tolerance}
         now, index = LoopState(self.loop, self.trajectory.state, self.trajectory.mode), self.index
         place = change_controller(now, controller, values, lambda offset: self._automaton(controller, offset))
+        # Another controller is another automaton: samples before it are read from the old trajectory.
         self.past.append((self.loop, self.trajectory))
         self.controller, self.loop = controller, place.loop
         step = 1.0 / self.inputs.sample_rate

@@ -155,6 +155,7 @@ class SampledEngine:
 
     def _run(self, end: int) -> None:
         while self.base < end:
+            # In chunks, which bound the memory of the inputs that are laid out for the ticks.
             stop = min(end, self.base + _CHUNK)
             self.flow(stop, self.tick_inputs(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
 
@@ -187,10 +188,12 @@ class SampledEngine:
         end = (base + 1) * self.port.searches
         steps, fractions, values, modes = schedule_of(jumps, self.step, self.plant.automaton, end)
         place, status = np.zeros(1), FULL
+        # A full record is enlarged, and the same schedule goes on where it stopped.
         while status == FULL:
             status = follow_schedule(
                 self.tables, self.state, place, at, steps, fractions, values, modes, self.record, self.scratch
             )
+            # Segments are not needed: the samples are written as the plant flows.
             self.record.size[0] = 0
             self._check(status)
         self.mode, self.base = int(at[1]), base + 1

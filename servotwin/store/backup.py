@@ -115,6 +115,7 @@ def _copied(source: Path, target: Path, progress: Progress | None) -> RowCounts:
         faults = [row[0] for row in copy.execute("PRAGMA integrity_check(1)")]
         if faults != ["ok"]:
             raise InvalidInput(f"store {source}: is damaged ({faults[0]}); restore an earlier backup")
+        # Compared as well as checked: a copy may be sound and yet lack rows.
         if _counts(copy) != expected:
             raise InvalidInput(f"store {source}: its copy does not hold the same rows; try again")
         return expected

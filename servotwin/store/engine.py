@@ -148,6 +148,7 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
     engine = sa.create_engine(
         address,
         hide_parameters=True,
+        # No overflow: one writing connection is what serialises the writers of SQLite.
         poolclass=QueuePool,
         pool_size=connections,
         max_overflow=0,
@@ -159,6 +160,7 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
 
     @event.listens_for(engine, "connect")
     def configure(connection: Any, _record: Any) -> None:
+        # The driver would begin transactions itself, and late; `begin_transaction` does it.
         connection.isolation_level = None
         for pragma in _pragmas(reading):
             connection.execute(f"PRAGMA {pragma}")
@@ -183,6 +185,7 @@ def _pragmas(reading: bool) -> tuple[str, ...]:
 def _make_private(path: Path) -> None:
     """Create the file readable by its owner only; SQLite gives its log the same mode."""
     try:
+        # With its mode from the start: between creation and a chmod others could open it.
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except FileExistsError:
         return

@@ -81,6 +81,7 @@ class GroupCommit:
         """
         size = len(item.body)
         with self._changed:
+            # Refused rather than queued without bound: the edge has the message on its disk and repeats it.
             if self._messages >= self._limits.waiting or self._bytes + size > self._limits.waiting_bytes:
                 raise StoreBusy(f"store {self._store.name}: {self._messages} messages wait to be committed; try later")
             future: Future[PutResult] = self._enqueue(item, size)
@@ -124,6 +125,8 @@ class GroupCommit:
         batch: list[_Write] = []
         size = 0
         with self._changed:
+            # Without a delay to collect more: while one transaction is being written, the next ones gather by
+            # themselves.
             self._changed.wait_for(lambda: self._jobs or self._closing)
             while self._jobs and len(batch) < self._limits.together and size < self._limits.together_bytes:
                 job = self._jobs.popleft()

@@ -59,6 +59,7 @@ def _insert(connection: sa.Connection, items: Sequence[Incoming]) -> dict[Name, 
     """Insert messages; returns the ids of those that were new."""
     rows = connection.execute(_inserting(connection.dialect.name), [_row(item) for item in items])
     ids = {(servo, key): id_ for id_, servo, key in rows}
+    # Bodies of new messages only: a repeated one has its body already.
     filled = [{"message": ids[i.servo, i.key], "body": i.body} for i in items if (i.servo, i.key) in ids]
     if filled:
         connection.execute(sa.insert(bodies), filled)

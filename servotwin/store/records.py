@@ -33,7 +33,7 @@ class Incoming(NamedTuple):
     received : float
         s since the epoch.
     boot, sequence, start : str, int, float
-        Of a window; elsewhere "", 0 and 0.0.
+        Key and sample time of a window; "", 0 and 0.0 for other kinds.
     """
 
     servo: str
@@ -291,12 +291,12 @@ class WindowTrace(NamedTuple):
     Attributes
     ----------
     window : StoredWindow
-    found : tuple of StoredEvidence
+    evidence : tuple of StoredEvidence
         Glances, estimates, redesigns and so on, updates excepted.
     steps : tuple of UpdateTrace
         Its updates: mostly none or one.
     """
 
     window: StoredWindow
-    found: tuple[StoredEvidence, ...]
+    evidence: tuple[StoredEvidence, ...]
     steps: tuple[UpdateTrace, ...]

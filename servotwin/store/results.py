@@ -74,6 +74,8 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[An
     queues: list[tuple[sa.Select[Any], float]] = []
     if MessageKind.WINDOW in kinds or MessageKind.LETTER in kinds:
         due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
+        # Half of the places at most before those with messages, the rest after them: neither queue can starve the
+        # other.
         queues.append((_next(due, twins.c.wake, one), 0.5))
         queues.append((_next(ready, twins.c.ready, one), 1.0))
         queues.append((_next(due, twins.c.wake, one), 1.0))
@@ -171,6 +173,7 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
     rows = connection.execute(_locked_serials(connection.dialect.name), {"_servos": servos})
     serials = {row.servo: (row.serial, row.posted) for row in rows}
     valid: dict[int, int] = {}
+    # Stable: results of one servo stay in their order, so that the serial of each follows on the one before.
     for i in sorted(range(len(results)), key=lambda i: results[i].servo):
         serial, posted = serials.get(results[i].servo, (None, 0))
         # A later result of the same servo in this batch has to name the serial after this one.
@@ -233,6 +236,7 @@ def _done(connection: sa.Connection, results: Sequence[WorkResult], now: float) 
         for result in results
         for message in dict.fromkeys(result.done)
     ]
+    # Every message is completed once: a result that covers another's message would make an effect happen twice.
     if rows and connection.execute(_DONE, rows).rowcount != len(rows):
         servos = ", ".join(sorted({result.servo for result in results}))
         raise ValueError(f"work result of {servos}: covers a message that is not an unprocessed one of its own")

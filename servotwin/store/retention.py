@@ -61,6 +61,7 @@ def delete_old_bodies(
         # Ids rise with time, except after a clock was set back: a whole batch of newer windows ends the scan.
         if not old:
             break
+        # Read and delete are separate transactions, so that reading does not hold the write lock.
         total = _add(total, _empty(store, old))
         after = rows[-1].id
         if pause is not None:

@@ -1,1 +1,1 @@
-"""The remote side: windows come in, estimates are made, new parameters go out. Plain classes, no clock, no I/O."""
+"""The twin: it estimates the gap from windows, redesigns the setting and sends updates; plain classes without I/O."""

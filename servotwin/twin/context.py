@@ -1,6 +1,6 @@
 """Context of an estimate: versions, model and settings under which it was computed, as text under its digest.
 
-Under an equal context an equal window with an equal prior gives an equal estimate, bit for bit. Under another one it
+Equal window, prior and context give an equal estimate, bit for bit. Under another one it
 need not: then the parts that differ are named. Model and settings can be made again from the text.
 """
 
@@ -28,7 +28,7 @@ from servotwin.redesign.certified.lookup_file import flattened
 from servotwin.twin.settings import TwinSettings
 
 SOURCES = ("control", "estimation", "hybrid", "messages", "plant", "redesign", "simulation", "twin")
-"""Packages that an estimate, or what is made of it, may depend on; each has a digest of its own."""
+"""Packages on which an estimate or a redesign may depend; each has a digest of its own."""
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
 _BLAS = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _MODEL, _SETTINGS = "model", "settings"
@@ -39,7 +39,7 @@ _INFINITE = re.compile(r"\binf\b(?!')")
 def context_of(servo: Servo, settings: TwinSettings) -> tuple[str, str]:
     """(digest, JSON) of the context of a model and its settings in this process.
 
-    The JSON is one object of texts: what each thing is called, and the value in full.
+    The JSON is one object of texts: the name of each part, and its value in full.
     """
     parts = {**surroundings(), **dict(flattened(_MODEL, servo)), **dict(flattened(_SETTINGS, settings))}
     text = json.dumps(parts, sort_keys=True, indent=0)
@@ -52,7 +52,7 @@ def parts_of(context: str) -> dict[str, str]:
     Raises
     ------
     InvalidInput
-        It is none.
+        The text is not the JSON of a context.
     """
     try:
         return msgspec.json.decode(context, type=dict[str, str])
@@ -67,12 +67,12 @@ def differing(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...
 
 
 def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
-    """Model and settings that a context's parts describe.
+    """Return the model and the settings that a context's parts describe.
 
     Raises
     ------
     InvalidInput
-        They describe none that this version knows.
+        This version cannot read them.
     """
     try:
         servo = msgspec.convert(_nested(parts, _MODEL), Servo)

@@ -1,4 +1,4 @@
-"""From a window message to an estimate: decoding, the estimator by name, and the wear between windows. Pure."""
+"""Estimation in the twin: decoding of a window, choice of the estimator, and wear between windows. Pure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Expectation:
     Attributes
     ----------
     previous : float
-        rad: the last gap that was accepted, or what was believed at the start.
+        rad: the last accepted gap, or the initial gap.
     trend : Trend or None
         The wear as predicted for the middle of the window; None before the first accepted estimate.
     """
@@ -42,15 +42,15 @@ class Expectation:
 
     @property
     def prior(self) -> float | GapEstimate:
-        """Start of an estimator: the prediction, or the previous gap while there is none."""
+        """Starting point of an estimator: the predicted gap, or the previous one while there is no prediction."""
         return self.previous if self.trend is None else self.trend.as_estimate()
 
     @property
     def offset(self) -> tuple[float, float] | None:
         """Mean and standard deviation (rad) of the encoder's offset; None while no window of this boot showed it.
 
-        The offset is the middle between two contacts, the gap the distance: of the error that all windows share, which
-        does not average away, it has half.
+        The offset is the middle between two contacts, and the gap their distance. So half of the error that all windows
+        share applies to the offset.
         """
         if self.trend is None or self.trend.prior.offset_std >= self.trend.settings.offset_std_rad:
             return None
@@ -63,7 +63,7 @@ class Expectation:
         return math.inf if self.trend is None else self.trend.gap_interval[1]
 
     def gap_rate(self, settings: TrendSettings) -> float:
-        """Root mean square of the growth to reckon with inside the window, rad/s.
+        """Expected growth of the gap within the window, root mean square, rad/s.
 
         Without it a growing gap is taken for a wrong model, and its value is that of whenever the screw crossed it: of
         Fig 16's windows one in three was refused, and in the calm loop estimates were off by up to 0.04 deg.
@@ -85,7 +85,7 @@ class TrendState(Struct, frozen=True):
 
     @classmethod
     def of(cls, trend: Trend) -> TrendState:
-        """The numbers of a trend."""
+        """Make the plain numbers of a trend."""
         return cls(
             time=float(trend.time),
             mean=tuple(trend.mean.tolist()),
@@ -97,7 +97,7 @@ class TrendState(Struct, frozen=True):
         )
 
     def trend(self, settings: TrendSettings) -> Trend:
-        """The trend, bit for bit."""
+        """Make the trend again, bit for bit."""
         return Trend(
             time=self.time,
             mean=np.array(self.mean),
@@ -119,9 +119,9 @@ class Wear(Struct, frozen=True):
     Attributes
     ----------
     previous : float
-        rad, gap of the last accepted estimate; before, the gap believed at the start.
+        rad, gap of the last accepted estimate; before the first one, the initial gap.
     boot, arrived : str, float
-        Of the last window that moved the trend; s, on the twin's clock.
+        Boot and arrival (s, on the twin's clock) of the last window that changed the trend.
     state : TrendState or None
         None before the first estimate.
     """
@@ -138,13 +138,13 @@ class Wear(Struct, frozen=True):
     def expect(self, settings: TrendSettings, boot: str, time: float, now: float) -> Expectation:
         """Expectation of a window of `boot` with its middle at `time` (s) that arrived at `now`.
 
-        For a window older than the trend, it is the trend as it stands.
+        For a window older than the trend it is the present trend, not predicted.
         """
         trend = self._on_clock(settings, boot, time, now)
         return Expectation(self.previous, trend and trend.predict(max(time, trend.time)))
 
     def update(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
-        """The wear after an estimate, and why no parameters may stand on that; empty where they may.
+        """Return the wear after an estimate, and the reason for which no update may follow from it; empty: it may.
 
         An estimate that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the
         reason in the trend's `reasons`, until others agree with it.
@@ -175,30 +175,30 @@ Observer = Callable[[Window], Disturbance]
 """window -> input bias and noise."""
 
 UNUSABLE = "none"
-"""Method of the estimate of a window that no estimator took: no motion would make it better."""
+"""Method of the estimate of an unusable window; a probing move would not improve it."""
 
 _TAIL = 10  # the last one of so many parts of a window
 
 
 def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
-    """The estimator that `settings` name, with a servo as its model.
+    """Make the estimator that `settings` name, with a servo as its model.
 
-    The published one starts from the previous gap, as printed. The default one is given the trend's prediction, the
+    The published estimator starts from the previous gap, as printed. The default one gets the trend's prediction, the
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
-    given = settings_of(settings.method, settings.estimator)
+    options = settings_of(settings.method, settings.estimator)
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        if not isinstance(given, whitened.WhitenedSettings):
-            return estimate_gap(window, servo, settings.method, expected.previous, given)
-        drift = given.gap_rate or expected.gap_rate(settings.trend)
-        return estimate_carrying(window, servo, expected.prior, replace(given, gap_rate=drift), expected.offset)
+        if not isinstance(options, whitened.WhitenedSettings):
+            return estimate_gap(window, servo, settings.method, expected.previous, options)
+        drift = options.gap_rate or expected.gap_rate(settings.trend)
+        return estimate_carrying(window, servo, expected.prior, replace(options, gap_rate=drift), expected.offset)
 
     return estimate
 
 
 def known_gap(gap: SignalLike, duration: float) -> Estimator:
-    """An estimator that ignores the measurements and gives the true total gap in the middle of the window.
+    """Make an estimator that ignores the measurements and returns the true total gap in the middle of the window.
 
     It shows what the loop could do if estimation were perfect.
 
@@ -207,7 +207,7 @@ def known_gap(gap: SignalLike, duration: float) -> Estimator:
     gap : number or signal
         rad, total gap.
     duration : float
-        s, up to when the signal is asked for.
+        s, end of the time for which the signal is evaluated.
     """
     truth = as_nonnegative(gap, duration, "gap", "rad")
 
@@ -226,9 +226,9 @@ class DecodedWindow(NamedTuple):
     ----------
     message : messages.WindowMessage
     window : Window or None
-        None: it cannot be used.
+        None: the window is unusable.
     problem : str
-        Why it cannot be used.
+        Reason for which it is unusable; empty: none.
     """
 
     message: messages.WindowMessage
@@ -237,14 +237,14 @@ class DecodedWindow(NamedTuple):
 
     @classmethod
     def of(cls, message: messages.WindowMessage) -> DecodedWindow:
-        """Decode a message, once for all who need its numbers."""
+        """Decode a message once, for all who need its numbers."""
         try:
             return cls(message, decode_window(message))
         except InvalidInput as error:
             return cls(message, None, str(error))
 
     def estimate(self, estimator: Estimator, expected: Expectation) -> GapEstimate:
-        """Estimate the gap; UNIDENTIFIABLE with the reason where the window cannot be used."""
+        """Estimate the gap; UNIDENTIFIABLE with the reason where the window is unusable."""
         problem = self.problem
         if self.window is not None:
             try:
@@ -254,7 +254,7 @@ class DecodedWindow(NamedTuple):
         return no_estimate(self.message.middle, (problem,), method=UNUSABLE)
 
     def disturbance(self, observer: Observer | None) -> Disturbance:
-        """Estimate input bias and noise; nothing known, with the reason, where the window cannot be used."""
+        """Estimate input bias and noise; unknown, with the reason, where the window is unusable."""
         if observer is None:
             return NOT_OBSERVED
         problem = self.problem
@@ -277,7 +277,7 @@ class DecodedWindow(NamedTuple):
 
 
 def decode_window(message: messages.WindowMessage) -> Window:
-    """Decode the numbers of a message; channels that no estimator knows are left out.
+    """Decode the numbers of a message; channels that no estimator uses are left out.
 
     Raises
     ------

@@ -41,7 +41,7 @@ MAX_STATUS = 300
 
 
 class GlanceRecord(NamedTuple):
-    """A glance at a window, all there is of one for which it was enough; `tail` as in `EvidenceRecord`."""
+    """Glance at a window, which got no estimate where that was enough; `tail` as in `EvidenceRecord`."""
 
     window: WindowMessage
     glance: Glance
@@ -49,7 +49,7 @@ class GlanceRecord(NamedTuple):
 
 
 class GapEstimateRecord(NamedTuple):
-    """An estimate with what was expected before, so that it can be made again."""
+    """An estimate with the expectation before it, so that it can be repeated."""
 
     window: WindowMessage
     estimate: GapEstimate
@@ -72,14 +72,14 @@ class TrendRecord(NamedTuple):
 
 
 class RedesignRecord(NamedTuple):
-    """A redesign, or why there is none."""
+    """A redesign, or the reason why there is none."""
 
     window: WindowMessage
     redesign: Redesign
 
 
 class ExcitationRecord(NamedTuple):
-    """A decision to request a more informative window, or why not."""
+    """A decision for or against the request of a more informative window, with the reason."""
 
     window: WindowMessage
     decision: Decision
@@ -93,7 +93,7 @@ class VerificationRecord(NamedTuple):
 
 
 class WithdrawalRecord(NamedTuple):
-    """A setting that is withdrawn, and why."""
+    """A setting that is withdrawn, with the reason."""
 
     request: VerificationRequest
     why: str
@@ -104,7 +104,7 @@ Record = (
     | VerificationRecord | WithdrawalRecord | VerificationRequest
     | Update | Request | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
-"""Evidence of one step; messages stand for themselves: an update or a request on its way, a receipt that came."""
+"""Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
 
 WindowId = tuple[str, str, int]
 """(servo, boot, sequence) of a window."""
@@ -132,7 +132,7 @@ class EvidenceLog:
     withdrawals: list[WithdrawalRecord] = field(default_factory=list)
 
     def add_window(self, window: WindowMessage) -> bool:
-        """Store a window under its identity; False when it was there already."""
+        """Store a window under its identity; False when it was stored already."""
         new = window.identity not in self.windows
         self.windows.setdefault(window.identity, window)
         return new
@@ -188,7 +188,7 @@ class StoredExpectation(Struct, frozen=True):
         return cls(float(expected.previous), None if expected.trend is None else TrendState.of(expected.trend))
 
     def expectation(self, settings: TrendSettings) -> Expectation:
-        """The expectation, bit for bit."""
+        """Make the expectation again, bit for bit."""
         return Expectation(self.previous, None if self.trend is None else self.trend.trend(settings))
 
 
@@ -201,7 +201,7 @@ class StoredEstimate(Struct, frozen=True):
 
 
 def rows(records: Sequence[Record], message: int, context: str) -> list[EvidenceRecord]:
-    """Rows for the store.
+    """Make the rows for the store.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ _WITHOUT_CONTEXT = ("request", "receipt", "fallback", "answer", "hello")
 
 
 def _row(record: Record) -> EvidenceRecord | None:
-    """The row of a record, without message and context; None before there is a trend."""
+    """Make the row of a record, without message and context; None for a trend that does not exist yet."""
     match record:
         case GlanceRecord(window, glance, tail):
             made = _made("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
@@ -267,7 +267,7 @@ def _row(record: Record) -> EvidenceRecord | None:
             return _sent("answer", record, record.outcome.value)
         case Hello():
             return _sent("hello", record, record.boot, record.parameter_version)
-    raise TypeError(f"{type(record).__name__} is no evidence")
+    raise TypeError(f"{type(record).__name__} is not a record of evidence")
 
 
 def _made(kind: str, body: object, status: str, **values: Any) -> EvidenceRecord:
@@ -283,23 +283,23 @@ def _of_update(request: VerificationRequest) -> dict[str, Any]:
 
 
 def failure_row(message: int, why: str, body: Mapping[str, Any] | None = None) -> EvidenceRecord:
-    """A row for a message of which nothing could be made."""
-    said = {"failed": why, **(body or {})}
-    return EvidenceRecord("estimate", message, plain(said), status=short(f"failed: {why}"))
+    """Make the row of a message whose processing failed."""
+    content = {"failed": why, **(body or {})}
+    return EvidenceRecord("estimate", message, plain(content), status=short(f"failed: {why}"))
 
 
 def plain(value: object) -> bytes:
-    """MessagePack of dataclasses, structs and arrays; infinities and NaN stay what they are."""
+    """Encode dataclasses, structs and arrays as MessagePack; infinities and NaN stay."""
     return _encoder.encode(value)
 
 
 def short(status: str) -> str:
-    """A status that every database takes."""
+    """Shorten a status to the length that every database accepts."""
     return status.replace("\0", "")[:MAX_STATUS]
 
 
 def _redesign_body(redesign: Redesign) -> dict[str, Any]:
-    """All of a redesign but how long its certificate took, so that equal twins store equal evidence."""
+    """Body of a redesign without the computing time of its certificate: equal twins store equal evidence."""
     parts = {each.name: getattr(redesign, each.name) for each in fields(redesign)}
     return {**parts, "certificate": redesign.certificate and _timeless(redesign.certificate)}
 
@@ -309,10 +309,10 @@ def _timeless(certificate: Certificate) -> dict[str, Any]:
 
 
 def _plain_value(value: object) -> object:
-    """The value of a number or an array of numpy's that MessagePack knows."""
+    """Convert a number or an array of numpy's to plain Python, which MessagePack can encode."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
-    raise TypeError(f"evidence holds {type(value).__name__}, which has no place in it")
+    raise TypeError(f"evidence holds a {type(value).__name__}, which cannot be encoded")
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_plain_value)

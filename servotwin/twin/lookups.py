@@ -1,4 +1,4 @@
-"""Settings looked up in a table: each is verified for the exact evidence later, and withdrawn where that fails.
+"""Settings looked up in a table; each is verified afterwards for the exact evidence, and withdrawn where that fails.
 
 An optional part, pure.
 """
@@ -21,7 +21,7 @@ from servotwin.redesign.policy import Evidence, Redesign
 
 
 class VerificationRequest(Struct, frozen=True, tag="proof/1"):
-    """A verification that a twin requests of itself, through the service's queue.
+    """A verification that a twin schedules for itself through the service's queue.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
     version : int
         Of the update as it was issued.
     window : (str, int)
-        Boot and sequence of the one that it stands on.
+        Boot and sequence of the window from which the update was computed.
     region : Region
         Range that the setting must serve.
     setting : Design
@@ -44,7 +44,7 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
 
     @classmethod
     def of(cls, update: Update, redesign: Redesign) -> VerificationRequest | None:
-        """The verification that an update still needs; None: none."""
+        """Make the verification that an update still needs; None: none."""
         if redesign.to_verify is None:
             return None
         assert redesign.certificate is not None
@@ -52,15 +52,14 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
 
 
 class LookupState(Struct, frozen=True):
-    """Slice of the twin's state.
+    """Part of the twin's state that belongs to settings looked up.
 
     Attributes
     ----------
     why : str
-        Why the fallback set goes out next; empty: nothing is withdrawn.
+        Reason for which the fallback set is sent next; empty: nothing is withdrawn.
     misled : bool
-        True once a verification has failed: then nothing is looked up any more, and every setting is verified before it
-        is sent.
+        True once a verification has failed: from then on every setting is verified before it is sent.
     """
 
     why: str = ""
@@ -69,7 +68,7 @@ class LookupState(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Lookups:
-    """The table's policy with the memory of what failed.
+    """Policy that looks settings up, with the memory of failed verifications.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ class Lookups:
     policy: TablePolicy
 
     def redesign(self, state: LookupState, evidence: Evidence) -> tuple[LookupState, Redesign]:
-        """A setting of the table; the fallback set once after a verification has failed, and none of the table then."""
+        """Look a setting up; after a failed verification return the fallback set once, and nothing from the table."""
         if state.why:
             redesign = self.policy.withdrawn(evidence, state.why)
             return (state if redesign.setting is None else LookupState(misled=True)), redesign
@@ -95,12 +94,12 @@ class Lookups:
         state : LookupState
         request : VerificationRequest
         current : sequence of Setting or None
-            In force, or pending: another setting is neither verified any more nor withdrawn.
+            In force, or pending; a setting that is neither is not verified any more.
 
         Returns
         -------
         LookupState, Certificate or NotVerified, str
-            The last: why the setting is withdrawn; empty where it is not.
+            The last one is the reason for which the setting is withdrawn; empty: it is not.
         """
         sent = request.setting.setting()
         if not any(setting is not None and sent.same_loop(setting) for setting in current):
@@ -123,7 +122,7 @@ def decode_request(data: bytes) -> VerificationRequest:
     Raises
     ------
     InvalidInput
-        The bytes hold none.
+        The bytes are not a request.
     """
     try:
         return _decoder.decode(data)

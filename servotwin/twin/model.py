@@ -1,4 +1,4 @@
-"""Model of a twin: everything about it that no step changes."""
+"""Model of a twin: its constant parts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class TwinModel:
     estimator : callable
         (estimation.Window, Expectation) -> GapEstimate.
     policy : Policy
-        Makes a setting of the evidence; where it raises InvalidInput, there is none.
+        Computes a setting from the evidence; where it raises InvalidInput there is none.
     settings : TwinSettings
     observer : callable, optional
         estimation.Window -> Disturbance; None: input bias and noise are not estimated.
@@ -42,7 +42,7 @@ class TwinModel:
     triage : Triage, optional
         Decides for which windows a glance is enough.
     lookups : Lookups, optional
-        Verifies settings after they were looked up and sent; then `policy` is not used.
+        Looks settings up, and verifies them after they were sent; `policy` is not used then.
     """
 
     estimator: Estimator
@@ -63,7 +63,7 @@ class TwinModel:
         estimator: Estimator | None = None,
         policy: Policy | None = None,
     ) -> TwinModel:
-        """The model that `settings` describe for a servo, with the controller that runs: policies design for it.
+        """Make the model that `settings` describe for a servo with the controller that runs.
 
         `estimator` and `policy` replace those of the settings.
 
@@ -85,17 +85,17 @@ class TwinModel:
         )
 
     def initial_state(self, servo: str) -> TwinState:
-        """State of the twin of a servo of that name before its first message."""
+        """Make the state of a servo's twin before its first message."""
         known = {} if self.start is None else {0: self.start}
         return self._fitted(TwinState(servo, Versions(), known, Wear(self.settings.initial_gap)))
 
     def restored(self, servo: str, data: bytes) -> TwinState:
-        """The stored state of a servo, with a slice for each optional part of this model and no other.
+        """Decode the stored state of a servo, with a slice for each optional part of this model and no other.
 
         Raises
         ------
         InvalidInput
-            The bytes are no state, or another servo's.
+            The bytes are not a state, or belong to another servo.
         """
         return self._fitted(decode_state(servo, data))
 

@@ -4,18 +4,18 @@ In a file::
 
     [models.axis]
     servo = "paper"                 # a preset, or a servo's TOML relative to this file
-    [models.axis.controller]        # what runs there instead of the servo's own controller
+    [models.axis.controller]        # changes of the servo's own controller
     ki_v_per_m_s = 0.0
     [models.axis.twin]              # keys as in a scenario's [twin]
     policy = "certified"
 
     [servos]
     "ax-1" = "axis"                 # one servo
-    "line-*" = "axis"               # all whose names begin so; the first pattern that fits counts
+    "line-*" = "axis"               # all names with this beginning; the first match counts
 
-A `ModelRegistry` is a value: frozen, quickly made and small. It can be pickled to a pool's workers when these start (it
-is the service's own and never crossed a link), or read anew there from the same text. The slow parts of a model, a
-certified fallback set above all, are made by each process when it first needs them, and cached.
+A `ModelRegistry` is a frozen, small value, which is quickly made. It can be pickled to a pool's workers at their start
+(it belongs to the service and never crossed a link), or read there from the same text. Each process computes the slow
+parts of a model, mainly the certified fallback set, at the first use, and caches them.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class ServoModel:
         The model, with the controller that runs.
     settings : TwinSettings
     start : Setting or None
-        What the edge runs before the first update, as far as it does not say so itself (`messages.Hello`). None: the
-        fallback set certified for the whole stated range, as the edge of a policy "certified" begins with; it is
-        made when a twin first needs it, which takes seconds.
+        Setting of the edge before the first update, where the hello of the edge does not state it. None: the fallback
+        set certified for the whole stated range, with which an edge under the policy "certified" begins; it is
+        computed at the first use, which takes seconds.
     """
 
     name: str
@@ -65,16 +65,16 @@ class ServoModel:
 
     @property
     def first_setting(self) -> Setting | None:
-        """`start`, or the certified fallback set; None where there is none for the whole stated range."""
+        """Return `start`, or the certified fallback set; None where none is verified for the whole stated range."""
         return _certified_start(self) if self.start is None else self.start
 
     def twin(self, restored: bool) -> TwinModel:
-        """Model of the twins; estimator and policy are made once per process.
+        """Make the model of the twins; estimator and policy are made once per process.
 
         Parameters
         ----------
         restored : bool
-            True for a twin that goes on from a state: then `start` is not needed, and not made.
+            True for a twin that continues from a state, which does not need `start`.
 
         Raises
         ------
@@ -91,14 +91,14 @@ class ModelRegistry:
     Parameters
     ----------
     models : tuple of ServoModel
-        With names of their own.
+        Their names are unique.
     servos : tuple of (str, str)
         (name of a servo, or a pattern with *, name of its model).
 
     Raises
     ------
     InvalidInput
-        A name is none, comes twice, or a model does not exist.
+        A name is not allowed or occurs twice, or a model does not exist.
     """
 
     models: tuple[ServoModel, ...]
@@ -106,7 +106,7 @@ class ModelRegistry:
 
     def __post_init__(self) -> None:
         if len(self._by_name) < len(self.models) or not 1 <= len(self.models) <= MAX_MODELS:
-            raise InvalidInput(f"fleet: has {len(self.models)} models: 1 to {MAX_MODELS} with names of their own")
+            raise InvalidInput(f"fleet: has {len(self.models)} models: must be 1 to {MAX_MODELS} with different names")
         if not self.servos:
             raise InvalidInput('servos: is empty; give at least one, such as "ax-1" = "NAME OF A MODEL"')
         for servo, model in self.servos:
@@ -119,7 +119,7 @@ class ModelRegistry:
     def read(cls, table: Table, folder: Path) -> ModelRegistry:
         """Read [models] and [servos] of a twin's file; paths are relative to `folder`.
 
-        Other keys of the table are left to others, who have to ask for them before `table.done()`.
+        The caller reads the other keys of the table before `table.done()`.
 
         Raises
         ------
@@ -134,21 +134,21 @@ class ModelRegistry:
 
     @classmethod
     def loads(cls, text: str, source: str, folder: Path) -> ModelRegistry:
-        """From a file's text; `source` is its name in messages. What else the file holds is not looked at."""
+        """Read the text of a file, whose name in messages is `source`; its other tables are ignored."""
         return cls.read(parse_toml(text, source), folder)
 
     def model_of(self, servo: str) -> ServoModel:
-        """The model of a servo.
+        """Return the model of a servo.
 
         Raises
         ------
         InvalidInput
-            There is none.
+            The servo has no model.
         """
         exact = self._exact.get(servo)
         model = exact or next((model for pattern, model in self._patterns if fnmatchcase(servo, pattern)), None)
         if model is None or not re.match(NAME_PATTERN, servo):
-            raise InvalidInput(f"servo {servo!r} has no model: [servos] names it neither by itself nor by a pattern")
+            raise InvalidInput(f"servo {servo!r} has no model: [servos] has neither its name nor a pattern that fits")
         return self._by_name[model]
 
     @cached_property
@@ -165,7 +165,7 @@ class ModelRegistry:
 
 
 def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[ServoModel, ...]:
-    """[models] of a twin's file; unless they are `checked`, what their policies need may still be missing."""
+    """Read [models] of a twin's file; where not `checked`, values that a policy needs may be missing."""
     inner = table.table("models", required=True)
     make = partial(_model, folder=folder, checked=checked)
     return tuple(read_inner(inner, name, partial(make, name=name)) for name in inner.values)
@@ -173,13 +173,13 @@ def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[ServoMo
 
 def _check_pattern(servo: str) -> None:
     if not re.match(NAME_PATTERN, servo.replace("*", "a")):
-        raise InvalidInput(f"servos: {servo!r} names no servo: 1 to 64 of A-Z a-z 0-9 . _ - are allowed, and * for any")
+        raise InvalidInput(f"servos: {servo!r} is not allowed: 1 to 64 of A-Z a-z 0-9 . _ - and * for any")
 
 
 def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
-    """One table of [models]."""
+    """Read one table of [models]."""
     if not re.match(NAME_PATTERN, name):
-        raise InvalidInput(f"{name!r} is no model's name: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
+        raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo = _servo(table, folder)
     law = read_inner(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder))
@@ -199,7 +199,7 @@ def _servo(table: Table, folder: Path) -> Servo:
 
 
 def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
-    """Setting that an edge begins with, as `Commissioning.start` has it; `own`: the gains are the servo's own."""
+    """Setting with which an edge begins, as in `Commissioning.start`; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
         return None if own else Setting(0.0, gains_of(law))
     return Setting(settings.initial_tolerance(servo), gains_of(law))

@@ -22,14 +22,14 @@ class ReplayResult(NamedTuple):
     Attributes
     ----------
     estimate : GapEstimate
-        As it comes out now.
+        Of the repetition.
     same : bool
-        True where it is the stored one, bit for bit.
+        True where it equals the stored one, bit for bit.
     differs : tuple of str
-        What is not as it was then: versions, sources, processor and, under another model, its numbers and settings;
-        each with both values.
+        Differences of the context, each with both values: versions, sources, processor and, under another model, its
+        numbers and settings.
     changed : tuple of str
-        What of the estimate comes out otherwise.
+        Names of the values of the estimate that differ.
     """
 
     estimate: GapEstimate
@@ -42,23 +42,23 @@ _estimated = msgspec.msgpack.Decoder(StoredEstimate)
 
 
 def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = None) -> ReplayResult:
-    """Make an estimate again and compare.
+    """Repeat an estimate and compare it with the stored one.
 
     Parameters
     ----------
     window : bytes
         The message, decompressed.
     body : bytes
-        Of the estimate's evidence.
+        Body of the estimate's evidence.
     context : str
-        The JSON that the evidence names.
+        JSON of the context that the evidence names.
     model : ServoModel, optional
-        What to estimate with; None: model and settings as they were then.
+        Model to estimate with; None: model and settings of the stored estimate.
 
     Raises
     ------
     InvalidInput
-        One of them is not understood.
+        The window, the evidence or the context cannot be read.
     """
     message, stored, then = _window(window), _stored(body), parts_of(context)
     servo, settings = described(then) if model is None else (model.servo, model.settings)
@@ -91,7 +91,7 @@ def _stored(body: bytes) -> StoredEstimate:
 
 
 def _changed(then: bytes, now: bytes) -> tuple[str, ...]:
-    """Names of the values that are not the same, bit for bit."""
+    """Names of the values that differ in any bit."""
     one, other = (msgspec.msgpack.decode(each, type=dict[str, msgspec.Raw]) for each in (then, now))
     keys = sorted({*one, *other})
     return tuple(key for key in keys if bytes(one.get(key, b"")) != bytes(other.get(key, b"")))

@@ -1,4 +1,4 @@
-"""Requests for more informative windows: one at a time, repeated until it is answered. An optional part, pure."""
+"""Requests for more informative windows: one at a time, each repeated until it is answered. An optional part, pure."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from servotwin.twin.versions import Attempts
 
 
 class RequestState(Struct, frozen=True):
-    """Slice of the twin's state.
+    """Part of the twin's state that belongs to requests.
 
     Attributes
     ----------
     pending : Request or None
-        Sent, and not answered yet.
+        Request that was sent and is not answered yet.
     excitation : ExcitationState
     boot : str
-        Of the edge.
+        Boot of the edge.
     serial : int
-        Highest given out in this boot.
+        Highest serial used in this boot.
     attempts : Attempts
-        Of the pending request.
+        Sendings of the pending request.
     """
 
     pending: Request | None = None
@@ -40,14 +40,14 @@ class RequestState(Struct, frozen=True):
     attempts: Attempts = Attempts()
 
     def not_after(self, now: float) -> RequestState:
-        """The same on a clock that was put back to `now` (s)."""
+        """Copy in which no time is later than `now` (s), for a clock that was set back."""
         excitation = self.excitation
         if excitation.probed > now:
             excitation = changed(excitation, probed=now)
         return replace(self, attempts=self.attempts.not_after(now), excitation=excitation)
 
     def closed(self, outcome: RequestOutcome | None) -> RequestState:
-        """With the pending request over; outcome None: the edge never answered."""
+        """Copy without the pending request, whose outcome is noted; None: the edge never answered."""
         assert self.pending is not None
         return replace(self, excitation=self.excitation.answered(self.pending.ask, outcome), pending=None)
 
@@ -62,11 +62,11 @@ class Requests:
     retry : float
         s without an answer after which a request is sent again.
     attempts : int
-        Number of times a request is sent before it is given up.
+        Number of sendings after which a request is abandoned.
     validity : float
-        s after a window's first sample for which a request that stands on it may still be begun.
+        s after a window's first sample, within which the edge may begin the request that followed from it.
     widest : float
-        rad: the gap is no wider than this.
+        Upper bound of the gap, rad.
     """
 
     policy: ExcitationPolicy
@@ -77,7 +77,7 @@ class Requests:
 
     @classmethod
     def of(cls, servo: Servo, settings: TwinSettings) -> Requests | None:
-        """The part that a twin's settings describe; None: nothing is ever requested."""
+        """Make the part that a twin's settings describe; None: the twin requests nothing."""
         if settings.excitation is None:
             return None
         policy = ExcitationPolicy(servo.p, settings.excitation)
@@ -92,16 +92,16 @@ class Requests:
         in_force: Setting | None,
         now: float,
     ) -> tuple[RequestState, Decision]:
-        """Decide after a window; a new request is pending, and counts as sent.
+        """Decide about a request after a window; a new one becomes pending and counts as sent.
 
         Parameters
         ----------
         state : RequestState
         window : WindowMessage
         estimate : GapEstimate
-            Of its gap.
+            Estimate from the window.
         widest : float
-            rad: another upper bound of the gap.
+            Upper bound of the gap from the trend, rad.
         in_force : Setting or None
         now : float
             s.
@@ -122,7 +122,7 @@ class Requests:
         return replace(state, pending=request, serial=serial, attempts=Attempts(now, 1)), decision
 
     def answered(self, state: RequestState, answer: Answer, now: float) -> tuple[RequestState, Request | None]:
-        """The state after an answer, and the request to send instead, where the twin had lost count of its serials."""
+        """Return the state after an answer, and the request to send instead where its serial was used before."""
         pending = state.pending
         if (
             pending is None
@@ -133,15 +133,16 @@ class Requests:
         if answer.outcome is not RequestOutcome.DUPLICATE:
             return state.closed(answer.outcome), None
         serial = max(state.serial, answer.newest) + 1
-        again = replace(pending, serial=serial)
-        return replace(state, pending=again, serial=serial, attempts=Attempts(now, 1)), again
+        # A twin that lost its state counts from 1 again, and the edge takes the serial for a repetition.
+        renumbered = replace(pending, serial=serial)
+        return replace(state, pending=renumbered, serial=serial, attempts=Attempts(now, 1)), renumbered
 
     def next_wake(self, state: RequestState) -> float | None:
-        """Time at which the answer is overdue, s; None: none is awaited."""
+        """Time at which the answer is overdue, s; None: no request is pending."""
         return None if state.pending is None else state.attempts.sent_at + self.retry
 
     def wake(self, state: RequestState, now: float) -> tuple[RequestState, tuple[Request, ...]]:
-        """The pending request once more when its answer is overdue; given up after `attempts`."""
+        """Repeat the pending request when its answer is overdue; abandon it after `attempts` sendings."""
         due = self.next_wake(state)
         if state.pending is None or due is None or now < due:
             return state, ()
@@ -151,16 +152,16 @@ class Requests:
 
 
 def _extent(window: WindowMessage) -> tuple[float, float]:
-    """Length, and how much of it lies before the first change of the reference, s.
+    """Length of a window, and of its part before the first change of the reference, s.
 
-    Nothing lies before a boot's first sample: there, no longer pre-trigger could be had.
+    The second is inf for a window that begins with the boot's first sample: no pre-trigger could be longer.
     """
     first = next((time for time, _ in window.reference_changes), window.start)
     return window.samples / window.rate, math.inf if window.start == 0.0 else first - window.start
 
 
 def _slack(setting: Setting | None) -> float:
-    """Both thresholds of the dead zone together, m; NaN: not known."""
+    """Sum of both thresholds of the dead zone, m; NaN: not known."""
     if setting is None or setting.gains is None:
         return math.nan
     return (setting.gains.enter + setting.gains.leave) * setting.tolerance

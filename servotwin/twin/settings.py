@@ -24,7 +24,7 @@ from servotwin.redesign.registry import POLICIES
 @settings("triage")
 @dataclass(frozen=True)
 class TriageSettings:
-    """When a glance at a window is enough.
+    """Conditions under which a glance at a window is enough.
 
     Raises
     ------
@@ -32,20 +32,26 @@ class TriageSettings:
         A value is not finite and above 0, or `every` is not a whole number.
     """
 
-    gap: Annotated[float, key("gap_deg", above=0.0, help="A gap that moved by less is no news.")] = math.radians(0.1)
+    gap: Annotated[float, key("gap_deg", above=0.0, help="A smaller change of the gap needs no estimate.")] = (
+        math.radians(0.1)
+    )
     deviations: Annotated[
-        float, key(above=0.0, help="Standard deviations by which gap and input bias have to be off to have moved.")
+        float, key(above=0.0, help="Smallest change of gap and input bias, in standard deviations.")
     ] = 3.0
     widest: Annotated[
-        float, key("widest_deg", above=0.0, help="A glance with a larger spread does not show the gap.")
+        float, key("widest_deg", above=0.0, help="Largest standard deviation of a glance that decides.")
     ] = math.radians(0.1)
-    misfit: Annotated[float, key(above=0.0, help="A misfit so many times the usual one is unusual.")] = 3.0
-    least_misfit: Annotated[float, key("least_misfit_um", above=0.0, help="No misfit below is unusual.")] = 1e-7
-    bias: Annotated[float, key("bias_mv", above=0.0, help="An input bias that moved by less is no news.")] = 2e-3
-    every: Annotated[int, key(minimum=1, help="At least every so many windows one is estimated.")] = 50
-    longest: Annotated[float, key("longest_s", above=0.0, help="At least once in so long a window is estimated.")] = (
-        3600.0
+    misfit: Annotated[
+        float, key(above=0.0, help="Factor above the usual misfit from which a misfit counts as unusual.")
+    ] = 3.0
+    least_misfit: Annotated[
+        float, key("least_misfit_um", above=0.0, help="Smallest misfit that counts as unusual.")
+    ] = 1e-7
+    bias: Annotated[float, key("bias_mv", above=0.0, help="A smaller change of the input bias needs no estimate.")] = (
+        2e-3
     )
+    every: Annotated[int, key(minimum=1, help="Largest number of windows from one estimate to the next.")] = 50
+    longest: Annotated[float, key("longest_s", above=0.0, help="Longest time from one estimate to the next.")] = 3600.0
 
     def __post_init__(self) -> None:
         check(self)
@@ -54,48 +60,48 @@ class TriageSettings:
 @settings("twin")
 @dataclass(frozen=True)
 class TwinSettings:
-    """How a twin estimates, redesigns and insists.
+    """Settings of a twin: estimator, policy, and repetition of its messages.
 
     Parameters
     ----------
     estimator : object, optional
-        Settings of the estimator; None: its defaults. Those of "whitened" must leave `combine` off, as the trend joins
-        the windows already; where their `gap_rate` is 0, it is taken from the trend.
+        Settings of the estimator; None: its defaults. Those of "whitened" must leave `combine` off, because the
+        trend already combines the windows; a `gap_rate` of 0 is replaced by that of the trend.
 
     Raises
     ------
     InvalidInput
-        A value is not a finite number in its range, the method or the policy does not exist, the settings are another
-        method's or another policy's.
+        A value is not a finite number in its range, the method or the policy does not exist, or the settings belong to
+        another method or policy.
     """
 
     enabled: Annotated[bool, key(help="Answer the edge's windows.")] = True
-    method: Annotated[
-        str, key(choices=tuple(METHODS), help="Estimator; its settings stand in the table [estimator].")
-    ] = whitened.METHOD
+    method: Annotated[str, key(choices=tuple(METHODS), help="Estimator; the table [estimator] has its settings.")] = (
+        whitened.METHOD
+    )
     estimator: Any = None
     policy: Annotated[
         str,
         key(
             choices=tuple(POLICIES),
-            help="What makes a setting of an estimate: certified sends what it has verified, margin and hysteresis set "
-            "a dead zone, paper is Eq 21.",
+            help="Rule that computes a setting from an estimate: certified sends verified settings, margin and "
+            "hysteresis set a dead zone, paper is Eq 21.",
         ),
     ] = next(iter(POLICIES))
     uncertainty: Annotated[
         Uncertainty,
         key(
-            help="How wrong the model may be, and the stated range of gaps, steps and input bias for which settings "
-            "are verified; the policy margin needs the steps."
+            help="Uncertainty of the model, and the stated range of gaps, steps and input bias for which settings are "
+            "verified; the policy margin needs the steps."
         ),
     ] = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
-    demands: Annotated[Demands, key(help="What a certified setting must show.")] = field(default_factory=Demands)
+    demands: Annotated[Demands, key(help="Requirements on a certified setting.")] = field(default_factory=Demands)
     table: Annotated[
         str | None,
         key(
             relative=True,
-            help="File of settings verified beforehand (`servotwin certify`), for the policy certified. They "
-            "are looked up, and the verification for the exact evidence follows; else it precedes every update.",
+            help="File of settings verified in advance (`servotwin certify`), for the policy certified. The twin looks "
+            "a setting up, sends it and verifies it afterwards; without the file it verifies before it sends.",
         ),
     ] = None
     k_dz: Annotated[
@@ -115,11 +121,11 @@ class TwinSettings:
     ] = None
     excitation: Annotated[
         ExcitationSettings | None,
-        key(help="What is asked of the edge when windows tell too little of the gap; nothing where absent."),
+        key(help="Requests to the edge when windows are not informative enough; none where absent."),
     ] = None
     triage: Annotated[
         TriageSettings | None,
-        key(help="When a glance at a window is enough; where absent every window is estimated."),
+        key(help="Conditions under which a glance at a window is enough; where absent every window is estimated."),
     ] = None
     initial_gap: Annotated[
         float, key("initial_gap_deg", minimum=0.0, help="Gap before the first estimate (section 4.2: zero).")
@@ -129,7 +135,11 @@ class TwinSettings:
     )
     gap_limit: Annotated[
         float | None,
-        key("gap_limit_deg", minimum=0.0, help="Gap that is one too many: the twin reports the time until then."),
+        key(
+            "gap_limit_deg",
+            minimum=0.0,
+            help="Largest acceptable gap; the twin reports the time until then.",
+        ),
     ] = None
     processing: Annotated[
         float,
@@ -144,7 +154,7 @@ class TwinSettings:
         key(
             "validity_s",
             above=0.0,
-            help="Time after a window's first sample for which an update that stands on it may still be applied.",
+            help="Time after a window's first sample within which an update computed from it may be applied.",
         ),
     ] = 60.0
     retry: Annotated[
@@ -152,13 +162,11 @@ class TwinSettings:
         key(
             "retry_s",
             above=0.0,
-            help="Time without a receipt after which an update is sent again; longer than a round trip, or each goes "
-            "out twice.",
+            help="Time without a receipt after which an update is sent again; if it is shorter than a round trip, each "
+            "update is sent twice.",
         ),
     ] = 5.0
-    attempts: Annotated[
-        int, key(minimum=1, help="Number of times that an update is sent before the twin gives it up.")
-    ] = 4
+    attempts: Annotated[int, key(minimum=1, help="Number of sendings after which the twin abandons an update.")] = 4
 
     def __post_init__(self) -> None:
         check(self)
@@ -167,7 +175,7 @@ class TwinSettings:
             if value is not None and owner != self.policy:
                 raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
         if getattr(settings_of(self.method, self.estimator), "combine", False):
-            raise InvalidInput("twin estimator combine = True: must be False, as the trend already joins the windows")
+            raise InvalidInput("twin estimator combine = True: must be False: the trend already combines the windows")
 
     def initial_tolerance(self, servo: Servo) -> float:
         """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""
@@ -179,7 +187,7 @@ class TwinSettings:
 
 
 def read_twin_settings(table: Table, folder: Path = Path()) -> TwinSettings:
-    """[twin] with its inner tables; those of `estimator` are the method's."""
+    """Read [twin] with its inner tables; the method declares the keys of [estimator]."""
     method = table.text("method", whitened.METHOD, choices=tuple(METHODS))
     estimator = part(table, "estimator", METHODS[method].settings)
     made: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)

@@ -1,7 +1,7 @@
-"""State of a twin: everything that it knows of its servo, as one frozen value that is stored as it is.
+"""State of a twin: its knowledge of the servo, as one frozen value that is stored unchanged.
 
 MessagePack with a tag that carries the schema's version, every float with all its bits, arrays as lists. The settings
-are no part of it: a twin restored under other settings goes on with these.
+are no part of the state: a twin that is restored under other settings uses those.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         Setting of each version of the parameters, as far as it is known.
     wear : Wear
     attempts : Attempts
-        Of the pending update.
+        Sendings of the pending update.
     tuned_for : float or None
         rad, gap of the last redesign.
     requests, triage, lookups : RequestState, TriageState, LookupState, or None
-        Slices of the optional parts; None: the twin has no such part.
+        State of the optional parts; None: the twin has no such part.
     """
 
     servo: str
@@ -60,12 +60,12 @@ def encode_state(state: TwinState) -> bytes:
 
 
 def decode_state(servo: str, data: bytes) -> TwinState:
-    """Decode the state of a servo, of this version's schema or the one before.
+    """Decode the state of a servo, in this version's schema or the previous one.
 
     Raises
     ------
     InvalidInput
-        The bytes are no such state, or another servo's.
+        The bytes are not such a state, or belong to another servo.
     """
     try:
         try:
@@ -78,12 +78,12 @@ def decode_state(servo: str, data: bytes) -> TwinState:
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError, LookupError, TypeError) as error:
         raise InvalidInput(f"the state of servo {servo!r} is not understood: {error}") from None
     if state.servo != servo:
-        raise InvalidInput(f"the state of servo {servo!r} is that of {state.servo!r}; each servo needs its own")
+        raise InvalidInput(f"the state of servo {servo!r} belongs to {state.servo!r}; each servo needs its own")
     return state
 
 
 def _upgraded(old: dict[str, Any]) -> dict[str, Any]:
-    """A document of the schema before as one of this one: there a known setting was a whole controller."""
+    """Convert a document of the previous schema, in which a known setting was a whole controller."""
     versions, wear, requests = old["versions"], old["wear"], old["requests"]
     known = {version: _setting(one) for version, one in old["known"].items() if one["tolerance"] is not None}
     return {

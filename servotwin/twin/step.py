@@ -1,9 +1,10 @@
 """One step of a twin: model, state and an event in; the next state, messages and evidence out. Pure: no clock, no I/O.
 
-A window is to be safe in the store before its step, and new: the caller knows. Windows may come in any order; every one
-is estimated, but only one that is newer than all before moves the parameters, the trend and the starting point of the
-next estimate. Only an estimate whose status is OK moves the trend, and one that does not fit it only once others agree.
-Of a window with another status a policy may use the rest, its input bias and noise, with the gap as the trend knows it.
+The caller commits a window to the store before its step, and passes each window once. Windows may come in any order;
+every one is estimated, but only one that is newer than all before changes the parameters, the trend and the starting
+point of the next estimate. Only an estimate with the status OK changes the trend; an outlier does so only once others
+agree with it.
+With another status a policy may still use the window's input bias and noise, with the gap of the trend.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ _STALE = "the window is not newer than what the parameters stand on, or of an ea
 
 
 class WindowArrival(NamedTuple):
-    """A new window that is safe in the store, and when it arrived, s, on the clock of `now`.
+    """A new window that the store has committed, and its arrival time (s, on the clock of `now`).
 
     The time between two boots of the edge is taken from `time`.
     """
@@ -60,7 +61,7 @@ class WindowArrival(NamedTuple):
 
 
 class Wake(NamedTuple):
-    """The time that `next_wake` gave."""
+    """Event: the time that `next_wake` returned has come."""
 
 
 Event = WindowArrival | ParameterMessage | VerificationRequest | Wake
@@ -73,9 +74,9 @@ class StepResult(NamedTuple):
     ----------
     state : TwinState
     messages : tuple of Message
-        To be sent to the edge, in order.
+        Messages to the edge, in order.
     evidence : tuple of Record
-        To be stored, in order; of a `VerificationRequest` among them the caller makes an event, at any later time.
+        Evidence to store, in order; the caller passes a `VerificationRequest` among it as an event, at any later time.
     """
 
     state: TwinState
@@ -92,14 +93,14 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
     state : TwinState
     event : WindowArrival, message, VerificationRequest or Wake
     now : float
-        s, a clock of the twin's own. It may jump: nothing is waited for longer than from `now` on.
+        Time on the twin's own clock, s. It may jump: no wait becomes longer than one that begins at `now`.
 
     Raises
     ------
     InvalidMessage
         The message is for another servo, or of a kind that only an edge receives.
     InvalidInput
-        A verification is requested, and no table is used any more.
+        A verification is requested, but the twin uses no table any more.
     """
     if isinstance(event, VerificationRequest):
         return _verify(model, state, event)
@@ -107,7 +108,7 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
         servo = event.window.servo if isinstance(event, WindowArrival) else event.servo
         if servo != state.servo:
             raise InvalidMessage(f"message of servo {servo!r} came to the twin of {state.servo!r}")
-    # A clock that was put back must not make anything wait for it to come round again.
+    # After a clock was set back, no retry may wait until it has caught up.
     requests = None if state.requests is None else state.requests.not_after(now)
     state = replace(state, attempts=state.attempts.not_after(now), requests=requests)
     match event:
@@ -128,14 +129,14 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
 
 
 def next_wake(model: TwinModel, state: TwinState) -> float | None:
-    """Time at which a `Wake` is due, s; None: nothing is awaited."""
+    """Time at which a `Wake` is due, s; None: no answer is pending."""
     update = None if state.versions.pending is None else state.attempts.sent_at + model.settings.retry
     request = None if model.requests is None or state.requests is None else model.requests.next_wake(state.requests)
     return min((due for due in (update, request) if due is not None), default=None)
 
 
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
-    """Estimate, redesign, request: whatever a window gives rise to."""
+    """Process a window: estimate, redesign, and request."""
     message, arrived, trends = event.window, event.time, model.settings.trend
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records = DecodedWindow.of(message), list[Record]()
@@ -183,12 +184,12 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
     unverified = VerificationRequest.of(versions.pending, redesign)
-    found = sent.evidence if unverified is None else (*sent.evidence, unverified)
-    return StepResult(sent.state, sent.messages + requests, found)
+    all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
+    return StepResult(sent.state, sent.messages + requests, all_records)
 
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
-    """Consult the policy; no setting, with the reason, where it is not consulted or finds none."""
+    """Consult the policy; without a setting the result has the reason."""
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)
@@ -202,16 +203,16 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
 
 
 def _send(state: TwinState, update: Update | None, now: float, records: tuple[Record, ...]) -> StepResult:
-    """Send the pending update for the first time; None: nothing."""
+    """Send the pending update for the first time; None: there is none."""
     if update is None:
         return StepResult(state, (), records)
-    # The receipt may never come: what the update sets is noted when it leaves.
+    # The receipt may get lost: the setting is noted when the update is sent.
     known = noted_setting(state.known, update.version, update.setting, update.base_version, state.versions.in_force)
     return StepResult(replace(state, known=known, attempts=Attempts(now, 1)), (update,), (*records, update))
 
 
 def _take_hello(state: TwinState, hello: Hello) -> StepResult:
-    """Note that the edge started or came back, and what it runs: it may be a setting stored in an earlier boot."""
+    """Note that the edge started or reconnected, and its setting, which may come from an earlier boot."""
     versions = state.versions.noted(hello.boot, hello.parameter_version)
     if versions.has_ended(hello.boot):
         return StepResult(state, (), (hello,))
@@ -220,7 +221,7 @@ def _take_hello(state: TwinState, hello: Hello) -> StepResult:
 
 
 def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:
-    """Note that the edge has left what this twin gave it: nothing made before is sent again."""
+    """Note that the edge has fallen back: no earlier update is sent again."""
     versions = state.versions.noted(fallback.boot, fallback.parameter_version)
     if versions.has_ended(fallback.boot):
         return StepResult(state, (), (fallback,))
@@ -243,7 +244,7 @@ def _take_answer(model: TwinModel, state: TwinState, answer: Answer, now: float)
 
 
 def _wake(model: TwinModel, state: TwinState, now: float) -> StepResult:
-    """The pending update and request once more when their answers are overdue; given up after some attempts."""
+    """Repeat the pending update and request when their answers are overdue; abandon them after `attempts`."""
     repeated: tuple[Message, ...] = ()
     if model.requests is not None and state.requests is not None:
         requests, repeated = model.requests.wake(state.requests, now)
@@ -257,9 +258,9 @@ def _wake(model: TwinModel, state: TwinState, now: float) -> StepResult:
 
 
 def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) -> StepResult:
-    """Verify what was looked up, and withdraw it where that fails: then the next update is the fallback set."""
+    """Verify a setting that was looked up; where that fails withdraw it, so that the fallback set is sent next."""
     if model.lookups is None or state.lookups is None:
-        raise InvalidInput("nothing is to be verified, as no table is used any more")
+        raise InvalidInput("no setting has to be verified, because the twin uses no table any more")
     current = [state.known.get(version) for version in state.versions.current]
     lookups, result, why = model.lookups.verify(state.lookups, request, current)
     record = VerificationRecord(request, result)
@@ -271,7 +272,7 @@ def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) ->
 
 
 def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
-    """An update but for its version and base; it may be applied until `validity` (s) after the window's start."""
+    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
     assert redesign.setting is not None
     estimate = evidence.estimate
     low, high = estimate.interval
@@ -292,7 +293,7 @@ def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, valid
 
 
 def verification_of(certificate: Certificate) -> Verification:
-    """Summarise a certificate for an update, without how long it took: equal twins send equal bytes."""
+    """Summarise a certificate for an update, without its computing time: equal twins send equal bytes."""
     return Verification(
         members=certificate.members,
         looked_at=certificate.looked_at,

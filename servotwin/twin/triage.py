@@ -1,9 +1,8 @@
-"""Triage of windows: all get a glance, and only those that may say something new are estimated. An optional part, pure.
+"""Triage of windows: all get a glance, and only informative ones a full estimate. An optional part, pure.
 
-A glance takes the plain fit next to the gap that was estimated last, and compares. Nothing moved only where that was
-possible to see: a window that does not show the gap, a fit that does not converge, and anything unusual is estimated,
-and the reason stored. After every estimate the glance at the same window is compared with it: a servo on which glances
-mislead gets none.
+A glance is the plain fit that starts from the gap estimated last; the two are compared. A window is estimated, and the
+reason stored, where the gap is not identifiable from it, the fit does not converge, or anything is unusual. After every
+estimate the glance at the same window is compared with it: where glances mislead, every window is estimated.
 """
 
 from __future__ import annotations
@@ -26,20 +25,22 @@ from servotwin.twin.estimating import Expectation
 from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")
-"""Reasons of windows that come anyway; any other says that something is new, or was asked for."""
+"""Reasons of routine windows; any other reason means a change, or a request of the twin."""
 
 _SHORTEST = 400  # samples, as for the estimator
-_FADES = 0.95  # of the usual misfit, per window: steps to one side may leave more than those to the other
-_PATIENCE, _SPARSE = 3, 8  # estimates in a row that did not count, after which only one window in so many is tried
+# Factor per window on the usual misfit. It fades slowly, because steps to one side may leave a larger misfit than those
+# to the other.
+_FADES = 0.95
+_PATIENCE, _SPARSE = 3, 8  # rejected estimates in a row, after which one window in _SPARSE is tried
 
 
 class TriageState(Struct, frozen=True):
-    """Slice of the twin's state: the window that was estimated last, with which glances are compared.
+    """Part of the twin's state that belongs to triage: the window estimated last, with which glances are compared.
 
     Attributes
     ----------
     doubt : str
-        Why no glance is enough; empty: the last window that was estimated may be relied on.
+        Reason for which no glance is enough; empty: the last estimate is reliable.
     boot, version : str, int
         Of the window that was estimated last, and of the parameters in force in it.
     time : float
@@ -47,7 +48,7 @@ class TriageState(Struct, frozen=True):
     gap, std : float
         rad, as estimated.
     bias, bias_std : float
-        V; NaN and inf where it did not rest.
+        V; NaN and inf where the loop did not rest.
     misfit : float
         m, usual.
     glances : int
@@ -69,12 +70,12 @@ class TriageState(Struct, frozen=True):
     vain: int = 0
 
     def doubted(self, why: str) -> TriageState:
-        """With a reason for which the next window is estimated, whatever it shows."""
+        """Copy with a reason for which the next window is estimated in any case."""
         return replace(self, doubt=why, glances=0, vain=0)
 
-    def glanced(self, found: Glance) -> TriageState:
-        """After a window of which a glance was enough."""
-        usual = self.misfit if math.isnan(found.misfit) else max(_FADES * self.misfit, found.misfit)
+    def glanced(self, result: Glance) -> TriageState:
+        """Copy after a window for which a glance was enough."""
+        usual = self.misfit if math.isnan(result.misfit) else max(_FADES * self.misfit, result.misfit)
         return replace(self, misfit=usual, glances=self.glances + 1)
 
 
@@ -84,15 +85,15 @@ class Glance(Struct, frozen=True):
     Attributes
     ----------
     gap, std : float
-        rad; NaN and inf where it saw none.
+        rad; NaN and inf where it has no result.
     misfit : float
         m.
     bias, bias_std : float
-        V; NaN and inf where nothing rests.
+        V; NaN and inf where the loop does not rest.
     moved : bool
         True where the window is to be estimated.
     why : str
-        The reason, in words; where it is not, what was found.
+        The reason for that decision, in words.
     """
 
     gap: float
@@ -105,7 +106,7 @@ class Glance(Struct, frozen=True):
 
 
 def due(message: WindowMessage, state: TriageState, settings: TriageSettings) -> str:
-    """Reason to estimate a window whatever it shows; empty: a glance may be enough."""
+    """Reason to estimate a window in any case; empty: a glance may be enough."""
     if state.doubt:
         return state.doubt
     if message.boot != state.boot:
@@ -120,9 +121,9 @@ def due(message: WindowMessage, state: TriageState, settings: TriageSettings) ->
 
 
 def in_vain(message: WindowMessage, state: TriageState) -> str:
-    """Reason to skip a window without a glance: estimates of such windows have not counted lately; empty: none.
+    """Reason to skip a window without a glance: the last estimates of such windows were not accepted; empty: none.
 
-    A loop that always shows one contact, of an encoder whose offset is not known, would be estimated for ever.
+    Otherwise every window would be estimated of a loop that shows one contact only, with the encoder's offset unknown.
     """
     changed = (message.boot, message.parameter_version) != (state.boot, state.version) or message.reason not in ROUTINE
     if changed or state.vain < _PATIENCE or state.glances + 1 >= _SPARSE:
@@ -138,35 +139,35 @@ def glance(
     offset: tuple[float, float] | None = None,
     settings: TriageSettings | None = None,
 ) -> Glance:
-    """Glance at a window: does it have to be estimated?
+    """Glance at a window, and decide if it must be estimated.
 
     Parameters
     ----------
     message : messages.WindowMessage
-        For its boot, version and reason.
+        Gives boot, version and reason.
     window : Window
-        The same, decoded.
+        The window of the message, decoded.
     servo : Servo
     state : TriageState
     offset : (float, float), optional
-        The encoder's offset as earlier windows showed it, mean and standard deviation, rad.
+        The encoder's offset from earlier windows, mean and standard deviation, rad.
     settings : TriageSettings, optional
     """
-    settings, tired = settings or TriageSettings(), in_vain(message, state)
-    if tired:
-        return _blind(tired, moved=False)
+    settings, skipped = settings or TriageSettings(), in_vain(message, state)
+    if skipped:
+        return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:
-        return _blind("the window has no theta_m, or too few samples: what to make of it, the estimator says")
+        return _without_result("the window has no theta_m, or too few samples: what to make of it, the estimator says")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
-        return _blind(state.doubt or "the motor's angle is constant")
+        return _without_result(state.doubt or "the motor's angle is constant")
     fit = quick_fit(window, servo, state.gap, offset)
     bias, bias_std = quick_bias(window, servo)
-    found = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "")
-    why = due(message, state, settings) or _unclear(fit, settings) or _moved(found, state, settings)
-    return replace(found, moved=bool(why), why=why or "nothing moved")
+    result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "")
+    why = due(message, state, settings) or _unclear(fit, settings) or _moved(result, state, settings)
+    return replace(result, moved=bool(why), why=why or "nothing moved")
 
 
-def _blind(why: str, moved: bool = True) -> Glance:
+def _without_result(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
@@ -179,22 +180,22 @@ def _unclear(fit: QuickFit, settings: TriageSettings) -> str:
     return ""
 
 
-def _moved(found: Glance, state: TriageState, settings: TriageSettings) -> str:
+def _moved(result: Glance, state: TriageState, settings: TriageSettings) -> str:
     """Change since the last estimate, in words; empty: none."""
-    off = abs(found.gap - state.gap)
-    if not off <= allowed(math.hypot(found.std, state.std), settings):
-        now, before = math.degrees(found.gap), math.degrees(state.gap)
+    off = abs(result.gap - state.gap)
+    if not off <= allowed(math.hypot(result.std, state.std), settings):
+        now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
-    if not found.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
-        return f"{1e6 * found.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
-    spread = settings.deviations * math.hypot(found.bias_std, state.bias_std)
-    if abs(found.bias - state.bias) > max(settings.bias, spread):
-        return f"the input bias moved: {found.bias:.4g} V, {state.bias:.4g} V before"
+    if not result.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
+        return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
+    spread = settings.deviations * math.hypot(result.bias_std, state.bias_std)
+    if abs(result.bias - state.bias) > max(settings.bias, spread):
+        return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
     return ""
 
 
 def allowed(std: float, settings: TriageSettings) -> float:
-    """rad by which gaps may differ that are one, for a spread (rad) of their difference."""
+    """Largest difference (rad) of two estimates of one gap, for a standard deviation (rad) of the difference."""
     return max(settings.gap, settings.deviations * std)
 
 
@@ -214,24 +215,24 @@ class Triage:
     def glance(
         self, state: TriageState, message: WindowMessage, window: Window, trend: Trend | None, requested: bool
     ) -> tuple[TriageState, Glance | None]:
-        """Glance at a window; None where that is not possible, and the estimator says why.
+        """Glance at a window; None where that is not possible: the estimator then reports the reason.
 
         Parameters
         ----------
         state : TriageState
         message, window
-            The window, and the same decoded.
+            The window's message, and the decoded window.
         trend : Trend or None
-            As it was left by the windows that counted.
+            Trend after the accepted windows.
         requested : bool
-            True while the edge is asked for a more informative window: all are estimated then.
+            True while a request for a more informative window is pending: every window is estimated then.
         """
         compared = replace(state, doubt="a request is open", vain=0) if requested else state
         try:
-            found = glance(message, window, self.servo, compared, _offset(trend), self.settings)
+            result = glance(message, window, self.servo, compared, _offset(trend), self.settings)
         except InvalidInput:
             return state, None
-        return (state if found.moved else state.glanced(found)), found
+        return (state if result.moved else state.glanced(result)), result
 
     def estimated(
         self,
@@ -242,17 +243,17 @@ class Triage:
         trend: Trend | None,
         rejection: str,
     ) -> TriageState:
-        """The state after an estimate; one that was rejected, and why, makes the next window estimated too.
+        """Return the state after an estimate; after a rejected one the next window is estimated too.
 
-        The glance at the estimate's own window is what later ones are compared with.
+        Later glances are compared with the glance at the estimated window itself.
         """
         if rejection or window is None:
             boot, version = message.boot, message.parameter_version
             return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
-        found = quick_fit(window, self.servo, estimate.gap, _offset(trend))
+        fit = quick_fit(window, self.servo, estimate.gap, _offset(trend))
         bias, bias_std = quick_bias(window, self.servo)
         return TriageState(
-            doubt=self._misled(found, estimate),
+            doubt=self._misled(fit, estimate),
             boot=message.boot,
             version=message.parameter_version,
             time=estimate.time,
@@ -260,13 +261,13 @@ class Triage:
             std=estimate.std,
             bias=bias,
             bias_std=bias_std,
-            misfit=found.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, found.misfit),
+            misfit=fit.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, fit.misfit),
         )
 
-    def _misled(self, found: QuickFit, estimate: GapEstimate) -> str:
-        """The error of a glance, in words; empty where it is small enough."""
-        off = abs(found.gap - estimate.gap)
-        if off <= allowed(math.hypot(found.std, estimate.std), self.settings):
+    def _misled(self, fit: QuickFit, estimate: GapEstimate) -> str:
+        """Error of a glance, in words; empty where it is small enough."""
+        off = abs(fit.gap - estimate.gap)
+        if off <= allowed(math.hypot(fit.std, estimate.std), self.settings):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
 

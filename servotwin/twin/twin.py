@@ -19,16 +19,16 @@ class Twin:
     Parameters
     ----------
     servo : str
-        Name of the servo whose messages it takes.
+        Name of the servo whose messages it processes.
     model : TwinModel
     log : EvidenceLog, optional
     state : bytes, optional
-        As `state` gave it: the twin goes on from there.
+        Earlier value of `state`, from which the twin continues.
 
     Raises
     ------
     InvalidInput
-        The state is not understood, or another servo's.
+        The state cannot be read, or belongs to another servo.
     """
 
     def __init__(self, servo: str, model: TwinModel, log: EvidenceLog | None = None, state: bytes = b"") -> None:
@@ -38,25 +38,25 @@ class Twin:
 
     @property
     def trend(self) -> Trend | None:
-        """Gap and rate of wear from all windows that counted, on the sample time of the edge's boot."""
+        """Gap and rate of wear from all accepted windows, in the sample time of the edge's boot."""
         return self._state.wear.trend(self.model.settings.trend)
 
     def state(self) -> bytes:
-        """Everything that it knows; equal twins give equal bytes."""
+        """Encoded state of the twin; equal twins give equal bytes."""
         return encode_state(self._state)
 
     def restore(self, state: bytes) -> None:
-        """Go on from an earlier state of this servo's twin; the settings stay its own.
+        """Continue from an earlier state of this servo's twin, under the present settings.
 
         Raises
         ------
         InvalidInput
-            The state is not understood, or another servo's.
+            The state cannot be read, or belongs to another servo.
         """
         self._state = self.model.restored(self.servo, state)
 
     def receive(self, message: Message, now: float) -> list[Message]:
-        """Process a message that arrived at `now` (s, a clock of the twin's own); returns what is to be sent.
+        """Process a message that arrived at `now` (s, the twin's own clock); return the messages to the edge.
 
         Raises
         ------
@@ -75,11 +75,11 @@ class Twin:
         return self._step(request, now)
 
     def next_wake(self) -> float | None:
-        """Time at which `wake` is due, s; None: nothing is awaited."""
+        """Time at which `wake` is due, s; None: no answer is pending."""
         return next_wake(self.model, self._state)
 
     def wake(self, now: float) -> list[Message]:
-        """Send again what is overdue."""
+        """Return the messages whose answers are overdue, to be sent again."""
         return self._step(Wake(), now)
 
     def _step(self, event: Event, now: float) -> list[Message]:

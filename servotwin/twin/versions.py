@@ -1,4 +1,4 @@
-"""Versions of the edge's parameters as the twin knows them: in force, pending, and what each one set. Pure."""
+"""Versions of the edge's parameters in the view of the twin: in force, pending, and the setting of each. Pure."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from servotwin.messages import Reason, Receipt, Setting, Update, WindowMessage
 
 MAX_ENDED_BOOTS = 1000
-"""Boots that a twin remembers, so that its state is bounded."""
+"""Number of boots that a twin remembers: its state must stay bounded."""
 MAX_SETTINGS = 16
-"""Versions whose setting is remembered, beside the first one and the one in force."""
+"""Number of versions whose setting is remembered, besides the first one and the one in force."""
 
 
 class Attempts(Struct, frozen=True):
@@ -22,7 +22,7 @@ class Attempts(Struct, frozen=True):
     Attributes
     ----------
     sent_at : float
-        s, of the last one.
+        Time of the last one, s.
     count : int
     """
 
@@ -30,11 +30,11 @@ class Attempts(Struct, frozen=True):
     count: int = 0
 
     def another(self, now: float) -> Attempts:
-        """After one more at `now`, s."""
+        """Count one more at `now`, s."""
         return Attempts(now, self.count + 1)
 
     def not_after(self, now: float) -> Attempts:
-        """The same on a clock that was put back to `now` (s): nothing waits longer than from now on."""
+        """Copy with the last sending at `now` (s) at the latest, for a clock that was set back."""
         return self if self.sent_at <= now else Attempts(now, self.count)
 
 
@@ -52,15 +52,15 @@ class Versions(Struct, frozen=True):
     in_force : int
         Newest version known to run at the edge.
     issued : int
-        Highest version ever given out.
+        Highest version ever used for an update.
     pending : Update or None
         The newest update, while no receipt for it has come.
     data_time : float
-        Of the newest update of this boot, s.
+        Sample time of the data of the newest update of this boot, s.
     ended_boots : tuple of str
         The last `MAX_ENDED_BOOTS` of them.
     root : int
-        First of the updates that follow on one another, the pending one last: it stands on what was in force.
+        First version of the chain of updates that ends with the pending one; its base was in force.
     """
 
     boot: str | None = None
@@ -76,7 +76,7 @@ class Versions(Struct, frozen=True):
         return boot in self.ended_boots
 
     def noted(self, boot: str, in_force: int) -> Versions:
-        """After a message from a boot that names the version in force; unchanged where that boot is over."""
+        """Note a boot and its version in force, as a message states them; a boot that is over changes nothing."""
         if self.has_ended(boot):
             return self
         now = self if boot == self.boot else self._rebooted(boot, in_force)
@@ -84,40 +84,40 @@ class Versions(Struct, frozen=True):
         return replace(now, in_force=in_force, issued=max(now.issued, in_force))
 
     def admits(self, window: WindowMessage) -> bool:
-        """True where parameters that stand on this window would be newer than all before."""
+        """True where the window is newer than the data of every update so far."""
         return window.boot == self.boot and window.start > self.data_time
 
     def with_update(self, update: Update) -> Versions:
-        """With an update pending under the next version, on the version that the edge will run when it arrives."""
+        """Make an update pending under the next version; its base is the version in force on its arrival."""
         return self._rebased(update) if self.pending is None else self._numbered(update, self.pending.version)
 
     def after_receipt(self, receipt: Receipt) -> tuple[Versions, Update | None]:
-        """The versions after a receipt, and the update to send instead of the pending one.
+        """Return the versions after a receipt, and the update to send instead of the pending one.
 
-        That is needed when the pending one was refused for its base or number, or will be, as one that it follows on
-        was refused.
+        That is necessary when the edge refused the pending update for its base or number, or will refuse it because it
+        refused an earlier one of the same chain.
         """
         now = self.noted(receipt.boot, receipt.parameter_version)
         pending = now.pending
         if self.has_ended(receipt.boot) or pending is None:
             return now, None
         if now._breaks(receipt, pending):
-            again = now._rebased(pending)
-            return again, again.pending
+            rebased = now._rebased(pending)
+            return rebased, rebased.pending
         if receipt.version != pending.version or receipt.reason is Reason.TOO_SOON:
             return now, None
         if receipt.reason is Reason.BASE_MISMATCH or now.in_force > pending.version:
-            again = now._rebased(pending)
-            return again, again.pending
+            rebased = now._rebased(pending)
+            return rebased, rebased.pending
         return now.without_pending(), None
 
     @property
     def current(self) -> tuple[int, ...]:
-        """The version in force, and the one that is pending."""
+        """Version in force, and the pending one."""
         return self.in_force, *(() if self.pending is None else (self.pending.version,))
 
     def without_pending(self) -> Versions:
-        """No longer waiting for a receipt."""
+        """Copy without the pending update."""
         return replace(self, pending=None)
 
     def _rebooted(self, boot: str, in_force: int) -> Versions:
@@ -125,16 +125,16 @@ class Versions(Struct, frozen=True):
         return replace(self, boot=boot, in_force=in_force, pending=None, data_time=-math.inf, ended_boots=ended)
 
     def _breaks(self, receipt: Receipt, pending: Update) -> bool:
-        """True where the pending update stands on one that will never be in force.
+        """True where the base of the pending update will never be in force.
 
-        A twin that is behind issues one update after the other before it reads the first receipt: were only the last
-        one's receipt to count, the edge would refuse all of them until the twin has caught up.
+        A twin with a backlog sends several updates before it reads the first receipt. If only the last receipt counted,
+        the edge would refuse all of them until the twin has caught up.
         """
         follows = self.root <= receipt.version < pending.version and self.in_force < pending.base_version
         return follows and not receipt.applied and receipt.reason is not Reason.SUPERSEDED
 
     def _rebased(self, update: Update) -> Versions:
-        """With the update pending on what is in force."""
+        """Make an update pending whose base is the version in force."""
         return replace(self._numbered(update, self.in_force), root=self.issued + 1)
 
     def _numbered(self, update: Update, base: int) -> Versions:
@@ -144,18 +144,18 @@ class Versions(Struct, frozen=True):
 
 
 Settings = Mapping[int, Setting]
-"""Setting of each version, as far as it is known."""
+"""Setting of each known version."""
 
 
 def noted_setting(known: Settings, version: int, setting: Setting, base: int, in_force: int = 0) -> dict[int, Setting]:
-    """The known settings with one more; without gains it has those of its base version.
+    """Add a setting to the known ones; where it has no gains it gets those of its base version.
 
-    The oldest are forgotten, but never the first one and the one in force.
+    The oldest are dropped, but never the first one and the one in force.
     """
     before = known.get(base)
     if setting.gains is None and before is not None:
         setting = replace(setting, gains=before.gains)
     after = {**known, version: setting}
-    # 0 is what the edge starts with, the fallback for gains that later updates leave alone.
+    # The edge starts with version 0: later updates without gains go back to its gains.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
     return {number: each for number, each in sorted(after.items()) if number in keep}

@@ -1,4 +1,4 @@
-"""A worker's job for one servo: a lease in; next state, evidence and messages out.
+"""A worker's job for one servo: it turns a lease into the next state, evidence and messages.
 
 A pure function of bytes: equal leases give equal results, in whichever process and however often, so that committing a
 result once makes every effect happen once. Nothing that a message holds, or does to the twin, raises: it becomes
@@ -23,9 +23,9 @@ from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.state import TwinState, encode_state
 from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 
-ONE_BY_ONE, GIVEN_UP = 3, 5
-"""Attempts of one lease from which on it is worked through message by message, so that the one that kills its workers
-is found; and from which on that one is given up."""
+ONE_BY_ONE, ABANDON_AFTER = 3, 5
+"""Attempts of a lease from which on it is processed message by message, which isolates the message that kills its
+workers; attempts from which on that message is abandoned."""
 
 
 def work(registry: ModelRegistry, lease: Lease, now: float) -> WorkResult:
@@ -35,16 +35,16 @@ def work(registry: ModelRegistry, lease: Lease, now: float) -> WorkResult:
     ----------
     registry : ModelRegistry
     lease : Lease
-        Of a servo that the registry does not know, every message fails.
+        Where the registry has no model of the servo, every message fails.
     now : float
-        s since the epoch; in lock-step, sample time. It may jump: nothing is waited for longer than from `now` on.
+        s since the epoch; in lock-step, sample time. It may jump: no wait becomes longer than one from `now`.
     """
-    taken = lease.messages[:1] if lease.attempts >= ONE_BY_ONE else lease.messages
+    batch = lease.messages[:1] if lease.attempts >= ONE_BY_ONE else lease.messages
     try:
-        return _Worker(registry.model_of(lease.servo), lease).result(taken, now)
+        return _Worker(registry.model_of(lease.servo), lease).result(batch, now)
     except InvalidInput as error:
-        evidence = tuple(failure_row(stored.id, str(error)) for stored in taken)
-        return WorkResult(lease.servo, lease.serial, lease.state, None, tuple(stored.id for stored in taken), evidence)
+        evidence = tuple(failure_row(stored.id, str(error)) for stored in batch)
+        return WorkResult(lease.servo, lease.serial, lease.state, None, tuple(stored.id for stored in batch), evidence)
 
 
 class _Worker:
@@ -58,23 +58,23 @@ class _Worker:
         self.sent: list[Message] = []
         self.model, self.state = self._restored()
 
-    def result(self, taken: Sequence[StoredMessage], now: float) -> WorkResult:
-        """After these messages, and what is overdue."""
-        given_up = self.lease.attempts >= GIVEN_UP
-        for stored in taken:
-            if given_up:
-                why = f"given up, as {self.lease.attempts - 1} workers died of it"
+    def result(self, batch: Sequence[StoredMessage], now: float) -> WorkResult:
+        """Process the messages and whatever is overdue, and return the result."""
+        abandoned = self.lease.attempts >= ABANDON_AFTER
+        for stored in batch:
+            if abandoned:
+                why = f"abandoned, because {self.lease.attempts - 1} workers died while they processed it"
                 self.evidence.append(failure_row(stored.id, why))
             else:
                 self._process(stored, now)
-        # A lease that kills its workers without a message is not woken again before the next message.
-        woken = not (given_up and not taken) and self._step(0, Wake(), now)
+        # A lease without messages that kills its workers must wait for the next message, not kill one at each wake.
+        woken = not (abandoned and not batch) and self._step(0, Wake(), now)
         return WorkResult(
             self.lease.servo,
             self.lease.serial,
             encode_state(self.state),
             next_wake(self.model, self.state) if woken else None,
-            tuple(stored.id for stored in taken),
+            tuple(stored.id for stored in batch),
             tuple(self.evidence),
             tuple(messages.encode(message) for message in self.sent),
             enqueue=tuple(_queued(request, now) for request in self.unverified),
@@ -82,8 +82,11 @@ class _Worker:
         )
 
     def _restored(self) -> tuple[TwinModel, TwinState]:
-        """The twin as the last result left it. One whose state cannot be read begins anew, the old state stored with
-        the reason: version numbers and boots come back with the edge's next message."""
+        """Restore the twin from the last result.
+
+        Where the state cannot be read the twin begins anew, and the old state is stored with the reason. The edge's
+        next message brings version number and boot back.
+        """
         servo, data = self.lease.servo, self.lease.state
         if data:
             model = self.servo_model.twin(restored=True)
@@ -106,15 +109,15 @@ class _Worker:
         self._step(stored.id, event, now)
 
     def _step(self, message: int, event: Event, now: float) -> bool:
-        """Step; where anything goes wrong, it is as if there had been no event, and False."""
+        """Step; after an error the state is as before the event, and the result is False."""
         try:
             result = step(self.model, self.state, event, now)
-            found = rows(result.evidence, message, self.context[0])
+            evidence = rows(result.evidence, message, self.context[0])
         except Exception as error:
             self.evidence.append(failure_row(message, f"{type(error).__name__}: {error}"))
             return False
         self.state = result.state
-        self.evidence += found
+        self.evidence += evidence
         self.unverified += [record for record in result.evidence if isinstance(record, VerificationRequest)]
         self.sent += result.messages
         return True
@@ -126,7 +129,7 @@ def _event(stored: StoredMessage) -> Event:
     Raises
     ------
     InvalidMessage, InvalidInput
-        The body is not understood, or nothing for a twin.
+        The body cannot be read, or is not for a twin.
     """
     if stored.kind is MessageKind.VERIFICATION:
         return decode_request(stored.body)
@@ -135,7 +138,7 @@ def _event(stored: StoredMessage) -> Event:
 
 
 def _queued(request: VerificationRequest, now: float) -> Incoming:
-    """A verification on the queue."""
+    """Make the queue's row of a verification."""
     body = encode_request(request)
     digest = hashlib.sha256(body).digest()
     return Incoming(request.servo, MessageKind.VERIFICATION, digest.hex(), body, "", digest, now)

@@ -114,13 +114,13 @@ class EdgeGate:
     Parameters
     ----------
     access : AccessControl
-    knows : callable
+    has_servo : callable
         Test whether a servo of that name belongs to this twin.
     limiter : RateLimiter
     """
 
-    def __init__(self, access: AccessControl, knows: Callable[[str], bool], limiter: RateLimiter) -> None:
-        self._access, self._knows, self._limiter = access, knows, limiter
+    def __init__(self, access: AccessControl, has_servo: Callable[[str], bool], limiter: RateLimiter) -> None:
+        self._access, self._has_servo, self._limiter = access, has_servo, limiter
 
     def admit(self, servo: str, token: bytes | None, *, limited: bool = True) -> None:
         """Check the token, the name and, if `limited`, the message rate of a servo; raises RequestRejected."""
@@ -129,7 +129,7 @@ class EdgeGate:
 
     def admit_authenticated(self, servo: str, *, limited: bool = True) -> None:
         """`admit` for a servo whose seal was checked already."""
-        if not self._knows(servo):
+        if not self._has_servo(servo):
             raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo[:64]!r}")
         if limited:
             self._limiter.take(servo)

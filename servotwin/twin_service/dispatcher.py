@@ -111,12 +111,15 @@ class Dispatcher:
         """Dispatch until `stop`."""
         while not self._stopping:
             worker = await self._pool.acquire()
+            # After a worker is free: a lease that waited for one would lose a part of its time, and other processes
+            # could not take it.
             leases = await self._next_leases()
             if not leases:
                 self._pool.release(worker)
                 continue
             task = asyncio.create_task(self._employ(worker, leases))
             self._tasks.add(task)
+            # The loop has weak references to tasks only; the set keeps this one from being collected.
             task.add_done_callback(self._tasks.discard)
 
     async def stop(self) -> None:
@@ -202,6 +205,8 @@ class Dispatcher:
 
     async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease]) -> None:
         """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault."""
+        # Failures of this process, not the store's count of leases: that also rises where a worker was lost to another
+        # lease.
         leases = [lease._replace(attempts=1 + self._failures[_queue(lease)]) for lease in leases]
         jobs = [
             [lease for lease in leases if lease.attempts == 1],

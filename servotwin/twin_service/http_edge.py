@@ -120,9 +120,11 @@ class LongPolls:
     async def _read_newer(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         """Read the store, unless it is known to hold nothing newer."""
         notifications = self._notifications[servo]
+        # Where other processes post too, only the store knows.
         if not self._shared and after >= self._empty_after.get(servo, _NEVER):
             return ()
         messages = await self._read(servo, after)
+        # A message that was posted while the store was read may not be in what was read.
         if not messages and notifications == self._notifications[servo]:
             self._empty_after[servo] = after
         return messages

@@ -216,7 +216,7 @@ def trace_as_json(trace: WindowTrace) -> dict[str, Any]:
     """A window's evidence chain for JSON, MessagePack bodies decoded."""
     return {
         "window": trace.window._asdict(),
-        "found": [evidence_as_json(record) for record in trace.found],
+        "found": [evidence_as_json(record) for record in trace.evidence],
         "steps": [
             {
                 "update": evidence_as_json(step.update),

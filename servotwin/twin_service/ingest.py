@@ -55,7 +55,7 @@ class Ingest:
     ----------
     put : callable
         Returns once the message is committed; raises StoreBusy where the queue is full, and StoreUnavailable.
-    knows : callable
+    has_servo : callable
         Test whether a servo of that name belongs to this twin.
     sample_times : SampleTimeLimiter
     metrics : Metrics
@@ -67,13 +67,13 @@ class Ingest:
     def __init__(
         self,
         put: Callable[[Incoming], Awaitable[PutResult]],
-        knows: Callable[[str], bool],
+        has_servo: Callable[[str], bool],
         sample_times: SampleTimeLimiter,
         metrics: Metrics,
         limit: int = MAX_BYTES,
         clocks: Clocks | None = None,
     ) -> None:
-        self._put, self._knows, self._sample_times = put, knows, sample_times
+        self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
 
@@ -153,7 +153,8 @@ class Ingest:
         return put
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
-        if not self._knows(servo):
+        # Before the body is decompressed and decoded, which costs far more.
+        if not self._has_servo(servo):
             raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo!r}")
         try:
             data = decompress(body, encoding, self._limit)

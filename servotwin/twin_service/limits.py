@@ -153,6 +153,7 @@ class RateLimiter:
         now = self._now()
         level, at = self._levels.get(servo, (self._burst, now))
         level = min(self._burst, level + self._rate * (now - at))
+        # A rejected message takes no token: a servo that repeats too fast gets through at the allowed rate.
         self._levels[servo] = (level if level < 1.0 else level - 1.0), now
         self._levels.move_to_end(servo)
         if len(self._levels) > MAX_SERVOS:
@@ -190,6 +191,7 @@ class SampleTimeLimiter:
         """Note the sample time that an edge reports; raises RequestRejected (FUTURE) where no edge runs that long."""
         _check_possible(sample_time)
         known = self._boots.get((servo, boot))
+        # Forwards only: a hello that was long on its way must not make windows appear early.
         if known is None or sample_time > self._reached(known, now):
             self._note(servo, boot, _SampleTime(now, sample_time))
 

@@ -135,6 +135,7 @@ class MqttServer:
             loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
 
         session = MqttSession(
+            # Another name at each start: a broker that sees a name twice ends the older connection.
             client_id=f"servotwin-{uuid4().hex}",
             topics=(f"$share/{self._group}/{REQUEST_TOPICS}",),
             session_s=_SESSION_S,
@@ -147,6 +148,7 @@ class MqttServer:
 
     async def stop(self) -> None:
         """Accept nothing more, finish the running requests, disconnect."""
+        # From here on `_receive` leaves requests unacknowledged, and the broker gives them to another twin.
         connection, self._connection = self._connection, None
         while self._tasks:
             await asyncio.wait(self._tasks)
@@ -160,6 +162,7 @@ class MqttServer:
             return
         task = asyncio.create_task(self._serve(self._connection, servo, payload, acknowledge))
         self._tasks.add(task)
+        # The loop has weak references to tasks only; the set keeps this one from being collected.
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, connection: Connection, servo: str, payload: bytes, acknowledge: Callable[[], None]) -> None:

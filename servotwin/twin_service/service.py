@@ -70,21 +70,22 @@ class TwinService:
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
         self._shared = not config.store.startswith(SQLITE)
+        # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
         self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
-        knows = _servo_test(twin.fleet)
+        has_servo = _servo_test(twin.fleet)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
             put=self._put,
-            knows=knows,
+            has_servo=has_servo,
             sample_times=SampleTimeLimiter(config.speed, slack),
             metrics=self.metrics,
             limit=config.max_body_bytes,
             clocks=self.clocks,
         )
         self.gate = EdgeGate(
-            self.access, knows, RateLimiter(config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
+            self.access, has_servo, RateLimiter(config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         )
         self.dispatcher = Dispatcher(
             store=store,

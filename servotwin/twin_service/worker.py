@@ -82,10 +82,12 @@ def main(descriptor: int) -> None:
         if start is None:
             return
         work = _load_work(start)
+        # Empty: the imports are done, and the worker is ready for a job.
         line.sendall(frame(b""))
         while (body := read_frame(stream)) is not None:
             job = _decode_job(body)
             for lease in job.leases:
+                # Each result at once: a lease that kills the worker must not take the results before it along.
                 line.sendall(encode_frame(_attempt(work, lease, job.now)))
 
 

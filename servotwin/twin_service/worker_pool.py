@@ -160,6 +160,7 @@ class WorkerPool:
         self.lost += 1
         self._workers.discard(worker)
         await worker.kill()
+        # A worker that cannot start (no memory, a broken installation) must not keep the processor busy.
         backoff = Backoff(Retry(0.1, 2.0, 30.0))
         while True:
             fresh = self._make()
@@ -185,4 +186,5 @@ def _environment() -> Mapping[str, str]:
     """Environment of a worker: the service's without its passwords."""
     secrets = config.PASSWORD, config.MQTT_PASSWORD
     passed = {key: value for key, value in os.environ.items() if key not in secrets}
+    # One thread each: the workers share the cores already.
     return {**passed, "OPENBLAS_NUM_THREADS": "1"}

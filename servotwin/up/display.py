@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from servotwin.up.plan import POLICIES
 from servotwin.up.speed import CORES, LIMIT, SLOWEST
 from servotwin.up.status import OK, ServoStatus, TwinStatus
 
@@ -195,7 +196,7 @@ _GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 1, "kd_v_s_per_m": 2}
 _ROWS: Sequence[tuple[str, _Cell]] = (
     ("", lambda servo: f"[dim]{servo.plan.trait}[/]"),
     ("edge's role", lambda servo: servo.plan.role),
-    ("twin's policy", lambda servo: servo.plan.model),
+    ("twin's policy", lambda servo: POLICIES[servo.plan.model]),
     ("machine time", lambda servo: _NONE if servo.machine is None else clock(servo.machine.time_s)),
     ("true gap, deg", _gap),
     ("estimate ± 95 %, deg", _estimate),

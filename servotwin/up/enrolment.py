@@ -37,21 +37,21 @@ class Enrolment:
     ----------
     servo : str
     folder : Path
-        Made if it is missing.
+        Created if it is missing.
     role : str
         "control" or "supervise".
     sample_rate : float
         Hz.
     drive : mapping
-        The table [drive] of its file.
+        The table [drive] of the edge's file.
     url : str or None
         Address at which the edge reaches the twin; None: that of the twin's file.
-    again : bool
-        Replace an existing token, which is revoked.
+    replace_token : bool
+        Replace an existing token, which thereby becomes invalid.
     noise : float
-        m rms on the measured position, which the edge's watch has to tolerate.
+        Noise on the measured position, m rms; the edge's watch is set to tolerate it.
     ca : Path or None
-        Certificates that the edge checks the twin's against. None: the twin's own if it is self-signed, otherwise
+        Certificates against which the edge checks the twin's. None: the twin's own if it is self-signed, otherwise
         those of the edge's system.
     """
 
@@ -61,13 +61,13 @@ class Enrolment:
     sample_rate: float = 5000.0
     drive: Mapping[str, object] = field(default_factory=lambda: SIMULATED)
     url: str | None = None
-    again: bool = False
+    replace_token: bool = False
     noise: float = 0.0
     ca: Path | None = None
 
 
 def enroll(path: Path, request: Enrolment) -> list[Path]:
-    """Enrol a servo with the twin of that file; returns the files that were written.
+    """Enrol a servo with the twin of a file, and return the files that were written.
 
     The edge's folder is written first, so that a token becomes valid only once the edge has it. An existing edge.toml
     stays as it is.
@@ -75,7 +75,7 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
     Raises
     ------
     InvalidInput
-        The servo has no model, has a token already, or something cannot be written.
+        The servo has no model, it has a token already, or a file cannot be written.
     """
     twin = read_twin(path)
     tokens = _tokens_file(twin)
@@ -83,33 +83,33 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
     new = not (request.folder / CONFIG).exists()
     text = edge_toml(_edge_config(twin, request)) if new else ""
     token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
-    made = _write_configuration(_trusted_certificates(twin, request), folder, text) if new else []
+    written = _write_configuration(_trusted_certificates(twin, request), folder, text) if new else []
     write_private(folder / TOKEN, token + "\n")
-    made.append(folder / TOKEN)
-    _add(tokens, "servos", request.servo, token, request.again)
-    return [*made, tokens]
+    written.append(folder / TOKEN)
+    _add(tokens, "servos", request.servo, token, request.replace_token)
+    return [*written, tokens]
 
 
-def enroll_operator(path: Path, name: str, file: Path, again: bool = False) -> list[Path]:
-    """Enrol an operator with the twin of that file and write the token to `file`; returns and raises as `enroll`."""
+def enroll_operator(path: Path, name: str, file: Path, replace_token: bool = False) -> list[Path]:
+    """Enrol an operator with the twin of a file, and write the token to `file`; returns and raises as `enroll`."""
     twin = read_twin(path)
     tokens = _tokens_file(twin)
-    _check_name(name, _read_or_create(tokens).operators, again)
-    if file.exists() and not again:
-        raise InvalidInput(f"{file}: is there already; give another file, or --again to replace it by a new token")
+    _check_name(name, _read_or_create(tokens).operators, replace_token)
+    if file.exists() and not replace_token:
+        raise InvalidInput(f"{file}: exists already; give another file, or --again to replace it by a new token")
     token = secrets.token_urlsafe(32)
     write_private(file, token + "\n")
-    _add(tokens, "operators", name, token, again)
+    _add(tokens, "operators", name, token, replace_token)
     return [file, tokens]
 
 
 def revoke(path: Path, name: str) -> Path:
-    """Revoke the token of a servo or an operator at the twin of that file; returns the file of tokens.
+    """Revoke the token of a servo or an operator at the twin of a file, and return the file of tokens.
 
     Raises
     ------
     InvalidInput
-        Nobody of that name has a token.
+        No servo and no operator of that name has a token.
     """
     tokens = _tokens_file(read_twin(path))
     with tokens_locked(tokens):
@@ -135,7 +135,7 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     Raises
     ------
     InvalidInput
-        The servo has no model, or nothing is verified for its stated range.
+        The servo has no model, or no setting is verified for its stated range.
     """
     model = twin.fleet.model_of(request.servo)
     sampled = request.role == "control" or request.noise > 0.0
@@ -158,7 +158,7 @@ def _url_of(service: ServiceConfig) -> str:
     Raises
     ------
     InvalidInput
-        The settings do not determine it: any port, all addresses, or a proxy in front.
+        The settings do not determine it: they name any port or all addresses, or a proxy is in front.
     """
     if service.behind_proxy:
         raise InvalidInput("behind_proxy = true: give the address of the proxy with --url")
@@ -169,19 +169,19 @@ def _url_of(service: ServiceConfig) -> str:
 
 
 def _write_configuration(certificates: Path | None, folder: Path, text: str) -> list[Path]:
-    made = [write_text(folder / CONFIG, text)]
+    written = [write_text(folder / CONFIG, text)]
     if certificates is not None:
-        made.append(Path(shutil.copyfile(certificates, folder / CERTIFICATE)))
-    return made
+        written.append(Path(shutil.copyfile(certificates, folder / CERTIFICATE)))
+    return written
 
 
 def _trusted_certificates(twin: TwinFile, request: Enrolment) -> Path | None:
-    """Certificates that the edge checks the twin's against; None: those of its system."""
+    """Certificates against which the edge checks the twin's; None: those of its system."""
     if request.ca is not None:
         _authorities(request.ca)
         return request.ca
     own = twin.service.tls_certificate
-    return own if own is not None and any(each["subject"] == each["issuer"] for each in _authorities(own)) else None
+    return own if own is not None and any(one["subject"] == one["issuer"] for one in _authorities(own)) else None
 
 
 def _authorities(certificates: Path) -> list[Any]:
@@ -194,16 +194,17 @@ def _authorities(certificates: Path) -> list[Any]:
 
 def _tokens_file(twin: TwinFile) -> Path:
     if twin.service.tokens is None:
-        raise InvalidInput(f'{twin.path}: [service] names no file of tokens; add tokens = "tokens.toml"')
+        raise InvalidInput(f'{twin.path}: [service] has no key tokens; add tokens = "tokens.toml"')
     return twin.service.tokens
 
 
-def _add(tokens: Path, role: str, name: str, token: str, again: bool) -> None:
-    """Add a verifier to the file of tokens as it is now: others may have been enrolled meanwhile."""
+def _add(tokens: Path, role: str, name: str, token: str, replace_token: bool) -> None:
+    """Add a verifier to the file of tokens."""
+    # Read again under the lock: another process may have enrolled a servo since the file was checked.
     with tokens_locked(tokens):
         known = _read_or_create(tokens)
         verifiers: Mapping[str, bytes] = getattr(known, role)
-        _check_name(name, verifiers, again)
+        _check_name(name, verifiers, replace_token)
         write_tokens(tokens, replace(known, **{role: {**verifiers, name: verifier_of(token)}}))
 
 
@@ -216,7 +217,7 @@ def _read_or_create(tokens: Path) -> Verifiers:
 def _check(request: Enrolment, known: Verifiers) -> None:
     if request.role not in ROLES:
         raise InvalidInput(f"role = {request.role!r} is not allowed; give one of {', '.join(ROLES)}")
-    _check_name(request.servo, known.servos, request.again)
+    _check_name(request.servo, known.servos, request.replace_token)
     _check_folder(request)
 
 
@@ -225,13 +226,13 @@ def _check_folder(request: Enrolment) -> None:
     file, token = request.folder / CONFIG, request.folder / TOKEN
     owner = load(file).agent.servo if file.exists() else request.servo
     if owner != request.servo:
-        raise InvalidInput(f"{file}: is that of servo {owner!r}; give {request.servo!r} another folder")
-    if token.exists() and not request.again:
-        raise InvalidInput(f"{token}: there is a token already; give --again to replace it by a new one")
+        raise InvalidInput(f"{file}: belongs to servo {owner!r}; give {request.servo!r} another folder")
+    if token.exists() and not request.replace_token:
+        raise InvalidInput(f"{token}: exists already; give --again to replace it by a new one")
 
 
-def _check_name(name: str, known: Mapping[str, bytes], again: bool) -> None:
+def _check_name(name: str, known: Mapping[str, bytes], replace_token: bool) -> None:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"name {name!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
-    if name in known and not again:
+    if name in known and not replace_token:
         raise InvalidInput(f"{name!r} has a token already; give --again to replace it by a new one")

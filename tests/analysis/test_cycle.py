@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from exploration import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from servotwin.analysis.limit_cycles.cycle import CycleStatus, limit_cycle
@@ -165,7 +166,7 @@ def random_servo(rng, n):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 5])
-@settings(max_examples=4)
+@examples(4)
 @given(seed=st.integers(0, 10_000), gap_deg=st.floats(0.5, 30.0), share=st.sampled_from([0.0, 0.3, 0.6]))
 def test_random_servos_against_a_long_run(n, seed, gap_deg, share):
     servo, gap = random_servo(np.random.default_rng(seed), n), math.radians(gap_deg)

@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from exploration import examples
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -38,8 +39,8 @@ def test_the_printed_gains_factor_as_stated():
 
 def test_the_tuner_is_at_least_as_good_as_the_paper_by_both_its_criteria():
     paper = PAPER.margins()
-    wanted = Specification(FIRST.omega, FIRST.phase_margin)
-    smallest = tune(PAPER.plant(), wanted)
+    specification = Specification(FIRST.omega, FIRST.phase_margin)
+    smallest = tune(PAPER.plant(), specification)
     assert smallest.margins.Ms < 0.9 * paper.Ms
     bounded = Specification(FIRST.omega, FIRST.phase_margin, Ms_max=paper.Ms, prefer="Ki")
     largest = tune(PAPER.plant(), bounded)
@@ -60,11 +61,11 @@ def lag_plant() -> linear.LinearSystem:
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 def test_every_type_meets_its_specification(kind, gain):
     system = linear.series(linear.gain(gain), lag_plant())
-    wanted = Specification(6.0, math.radians(62.0 if kind in ("PI", "PID", "PIDF") else 85.0), kind)
-    found = tune(system, wanted)
+    specification = Specification(6.0, math.radians(62.0 if kind in ("PI", "PID", "PIDF") else 85.0), kind)
+    found = tune(system, specification)
     nearest = min(found.margins.gain_crossovers, key=lambda x: abs(x.omega - 6.0))
     assert nearest.omega == pytest.approx(6.0, rel=1e-9)
-    assert nearest.phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
+    assert nearest.phase_margin == pytest.approx(specification.phase_margin, abs=1e-9)
     assert found.margins.stable
     law = found.controller
     assert (law.Ki != 0.0) is CONTROLLER_TYPES[kind].integral
@@ -88,7 +89,7 @@ def test_a_proportional_controller_takes_the_margin_it_gets():
     st.floats(20.0, 80.0),
     st.sampled_from(["PI", "PIDF", "PDF"]),
 )
-@settings(max_examples=25)
+@examples(25)
 def test_the_returned_controller_is_stable_and_meets_its_specification(crossover, margin_deg, kind):
     try:
         found = tune(PAPER.plant(), Specification(crossover, math.radians(margin_deg), kind))
@@ -102,7 +103,7 @@ def test_the_returned_controller_is_stable_and_meets_its_specification(crossover
 
 
 @given(st.floats(1.0, 15.0), st.floats(0.1, 1.5), st.floats(0.0, 1.0), st.floats(0.1, 1.4))
-@settings(max_examples=60)
+@examples(60)
 def test_nyquist_agrees_with_the_poles(wc, phz, share, al):
     factors = Factors(1.0 / abs(PAPER.plant().response(wc)), wc, phz, share * phz, al, True)
     poles = PAPER.closed_loop(factors.controller()).poles()
@@ -145,20 +146,20 @@ def test_factors_and_gains_are_inverse(wc, phz, share, al):
 def test_frequency_data_give_what_the_system_gives():
     system = PAPER.plant()
     omega = np.unique(np.concatenate([np.geomspace(1e-3, 1e4, 3000), np.linspace(5.0, 100.0, 4000)]))
-    wanted = Specification(4.2, math.radians(60.0))
-    data = tune(FrequencyData(omega, system.response(omega), integrators=1), wanted)
-    exact = tune(system, wanted)
+    specification = Specification(4.2, math.radians(60.0))
+    data = tune(FrequencyData(omega, system.response(omega), integrators=1), specification)
+    exact = tune(system, specification)
     assert data.margins.stable
     assert data.margins.Ms == pytest.approx(exact.margins.Ms, rel=0.01)
     assert data.margins.gain_crossovers[0].omega == pytest.approx(4.2, rel=1e-6)
 
 
 def test_a_delay_is_a_turn_of_the_phase_and_stays_stable():
-    delay, wanted = 0.02, Specification(4.2, math.radians(60.0))
-    found = tune(PAPER.plant(), wanted, delay)
+    delay, specification = 0.02, Specification(4.2, math.radians(60.0))
+    found = tune(PAPER.plant(), specification, delay)
     without = evaluate(PAPER.plant(), found.controller).gain_crossovers[0]
-    assert without.phase_margin == pytest.approx(wanted.phase_margin + 4.2 * delay, abs=1e-9)
-    assert found.margins.gain_crossovers[0].phase_margin == pytest.approx(wanted.phase_margin, abs=1e-9)
+    assert without.phase_margin == pytest.approx(specification.phase_margin + 4.2 * delay, abs=1e-9)
+    assert found.margins.gain_crossovers[0].phase_margin == pytest.approx(specification.phase_margin, abs=1e-9)
     assert found.margins.stable
     long = min(x.phase_margin / x.omega for x in found.margins.gain_crossovers if x.phase_margin > 0.0)
     assert not evaluate(PAPER.plant(), found.controller, delay + 1.05 * long).stable
@@ -183,7 +184,7 @@ def unstable() -> linear.LinearSystem:
 
 
 @pytest.mark.parametrize(
-    ("system", "wanted", "message"),
+    ("system", "specification", "message"),
     [
         (unstable(), (1.0, 60.0, "PI"), "has a pole at 1"),
         (PAPER.plant(), (10.0, 60.0, "PD"), "cannot be had at 10 rad/s"),
@@ -191,9 +192,9 @@ def unstable() -> linear.LinearSystem:
         (FrequencyData([1.0, 2.0, 3.0, 4.0], [1.0, 0.5, 0.3, 0.2]), (9.0, 60.0, "PI"), "1 to 4 rad/s"),
     ],
 )
-def test_an_unreachable_specification_is_refused_with_the_reason(system, wanted, message):
+def test_an_unreachable_specification_is_refused_with_the_reason(system, specification, message):
     with pytest.raises(InvalidInput, match=message):
-        tune(system, Specification(wanted[0], math.radians(wanted[1]), wanted[2]))
+        tune(system, Specification(specification[0], math.radians(specification[1]), specification[2]))
 
 
 def test_an_unreachable_sensitivity_names_the_one_that_can_be_had():

@@ -52,11 +52,11 @@ class Jobs:
 
 
 def test_contestants_take_turns():
-    jobs, told = Jobs(a=1.0, b=2.0), []
+    jobs, reported = Jobs(a=1.0, b=2.0), []
     workload = jobs.workload(missing=("c",))
-    rows = race(workload, 3, 0.0, jobs.clock, told.append)
+    rows = race(workload, 3, 0.0, jobs.clock, reported.append)
     assert "".join(jobs.calls) == "aabb" + "ab" * 3
-    assert len(told) == turns(workload, 3)
+    assert len(reported) == turns(workload, 3)
     assert [row.median for row in rows[:2]] == [1.0, 2.0]
     assert rows[1].ratios(rows[0]) == (2.0, 2.0, 2.0)
     assert rows[1].errors == {"error": 1.0}

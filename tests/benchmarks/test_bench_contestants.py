@@ -13,8 +13,8 @@ WEAR = WearWorkload(duration=4.0, period=2.0)
 SWEEP = SweepWorkload(side=3, duration=1.0)
 
 
-def error(contestant, wanted):
-    return float(np.max(np.abs(contestant.prepare()() - wanted))) / UNIT
+def error(contestant, expected):
+    return float(np.max(np.abs(contestant.prepare()() - expected))) / UNIT
 
 
 def test_servotwin_does_not_hang_on_its_search_for_events():
@@ -62,11 +62,11 @@ def test_heyoka_agrees():
 def test_predictors_are_the_observer():
     case, model = fits.cases(WearWorkload(duration=8.0, period=4.0))[2], observer(WEAR.servo, fits.ALPHA)
     theta_m, position = case.window.theta_m, case.window.position
-    wanted = model.estimate(theta_m, position, case.window.sample_rate)
+    expected = model.estimate(theta_m, position, case.window.sample_rate)
     # The package's observer starts one sample earlier.
     for predictor, tolerance in ((fits.with_loop, 1e-6), (fits.with_lfilter, 1e-2)):
         found = predictor(model, case)(theta_m)
-        assert np.max(np.abs(found - wanted)[1000:]) < tolerance * np.ptp(position)
+        assert np.max(np.abs(found - expected)[1000:]) < tolerance * np.ptp(position)
 
 
 def test_fits_find_the_gap():

@@ -119,36 +119,36 @@ class Spoken:
     """A line that answers at once, from a list of answers."""
 
     def __init__(self, *answers) -> None:
-        self.answers, self.asked = list(answers), []
+        self.answers, self.requests = list(answers), []
 
     def ask(self, head, body, answered) -> None:
-        self.asked.append((head.split(b" HTTP")[0].decode(), body))
+        self.requests.append((head.split(b" HTTP")[0].decode(), body))
         answered(*self.answers.pop(0))
 
 
 def test_a_turn_polls_answers_and_sends() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, polls=True))
-    edge, told = edges.edges[0], []
+    edge, failed = edges.edges[0], []
     edge.receipts.append(Receipt("ax-00000", 3, True, 1, "applied", 3, "boot-9"))
     line = Spoken((200, b"\x90"), (202, b""), (201, b"\x90"))
-    turn = EdgeTurn(edges, line, asyncio.Event(), told)
+    turn = EdgeTurn(edges, line, asyncio.Event(), failed)
     turn.begin(edge, 0.0)
-    assert [what for what, _ in line.asked] == [
+    assert [what for what, _ in line.requests] == [
         "GET /v1/servos/ax-00000/outgoing?after=0&wait=0",
         "POST /v1/servos/ax-00000/letters",
         "PUT /v1/servos/ax-00000/windows/boot-9/100",
     ]
     assert (edge.sequence, edges.counts.windows, edges.counts.polls) == (101, 1, 1)
     assert turn.done.is_set()
-    assert not told
+    assert not failed
 
 
 @pytest.mark.parametrize(("status", "kept", "failures"), [(503, 1, 0), (429, 1, 0), (400, 0, 1), (500, 0, 1)])
 def test_a_postponed_window_is_sent_again_and_a_refused_one_ends_the_run(status: int, kept: int, failures: int) -> None:
-    edges, told = fleet(), []
-    turn = EdgeTurn(edges, Spoken((status, b"")), asyncio.Event(), told)
+    edges, failed = fleet(), []
+    turn = EdgeTurn(edges, Spoken((status, b"")), asyncio.Event(), failed)
     turn.begin(edges.edges[0], 0.0)
-    assert (edges.waiting, len(told), edges.counts.windows) == (kept, failures, 0)
+    assert (edges.waiting, len(failed), edges.counts.windows) == (kept, failures, 0)
     assert turn.done.is_set()
 
 

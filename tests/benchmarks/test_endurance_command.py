@@ -22,7 +22,7 @@ def fake(seed: int, kind: TwinFault, friction: bool) -> HostileOutcome:
     return HostileOutcome(kind, hostile.case(seed, friction), WORST[kind], 0.0, True, seed, fallbacks, refused)
 
 
-def told(text: Console) -> str:
+def text_of(text: Console) -> str:
     return text.file.getvalue()
 
 
@@ -31,7 +31,7 @@ def found(monkeypatch: pytest.MonkeyPatch, tmp_path):
     monkeypatch.setattr(endurance, "shared", lambda _function, tasks: ((task, fake(*task)) for task in reversed(tasks)))
     console, output = Console(file=io.StringIO(), width=100), tmp_path / "hostile.json"
     outcomes = endurance.endurance("2026-11-21", output, 8, console=console)
-    return outcomes, told(console), json.loads(output.read_text())
+    return outcomes, text_of(console), json.loads(output.read_text())
 
 
 def test_every_kind_has_its_row_in_the_order_of_the_kinds(found) -> None:

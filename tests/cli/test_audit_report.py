@@ -43,26 +43,26 @@ def step(effect: Any = None, *answers: dict[str, Any]) -> dict[str, Any]:
     return {"update": found("update", "ok", version=3, body=UPDATE), "answers": list(answers), "effect": effect}
 
 
-def told(*links: dict[str, Any], events: Any = (), changes: bool = False, **servo: Any) -> list[str]:
+def report_of(*links: dict[str, Any], events: Any = (), changes: bool = False, **servo: Any) -> list[str]:
     lines = list(lines_of({**SERVO, **servo}, links[::-1], events, changes))
     assert lines[lines.index(HEAD) - 1] == ""
     return lines
 
 
 def chain(*links: dict[str, Any], **other: Any) -> list[str]:
-    lines = told(*links, **other)
+    lines = report_of(*links, **other)
     return lines[lines.index(HEAD) + 1 :]
 
 
 def test_the_head_summarises_the_servo() -> None:
     trend = found("trend", body={"mean": [0.1, math.radians(0.5) / 3600.0, 0.0], "covariance": [0.0] * 9})
-    head = told(link(1, estimate(), trend, found("disturbance", body={"bias": 0.02, "noise": 2e-6})))[:3]
+    head = report_of(link(1, estimate(), trend, found("disturbance", body={"bias": 0.02, "noise": 2e-6})))[:3]
     assert head == [
         "servo ax-1: gap 7.500 ± 0.039 deg (95 %; ok), version 3 (applied)",
         "  windows: 42 stored, 1 messages pending, last message 1970-01-01 00:00:00 UTC",
         "  wear 0.5 ± 0 deg/h (95 %), input bias 20.0 mV, noise 2.0 um",
     ]
-    assert told(link(1), gap=None, version=None, receipt="", heard=None)[:2] == [
+    assert report_of(link(1), gap=None, version=None, receipt="", heard=None)[:2] == [
         "servo ax-1: no gap known, no version sent",
         "  windows: 42 stored, 1 messages pending",
     ]
@@ -158,8 +158,8 @@ def test_starts_of_the_edge_and_faults_of_the_twin_are_listed() -> None:
 
 def test_changes_leaves_out_what_led_to_nothing() -> None:
     quiet, failed = link(1, estimate(), found("redesign", "no")), link(2, found("estimate", "failed: no"))
-    asked, sent = link(3, estimate(), found("request", "more")), link(4, estimate(), steps=[step()])
-    lines = chain(quiet, failed, asked, sent, changes=True)
+    requesting, sent = link(3, estimate(), found("request", "more")), link(4, estimate(), steps=[step()])
+    lines = chain(quiet, failed, requesting, sent, changes=True)
     assert [line.split()[2] for line in lines if line.startswith("1970")] == ["2", "3", "4"]
 
 

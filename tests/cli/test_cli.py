@@ -52,6 +52,15 @@ def test_help_loads_no_numbers_library():
     assert completed.stdout.strip() == ""
 
 
+@pytest.mark.slow
+def test_what_only_starts_a_process_imports_no_slow_part_of_scipy():
+    """A second of every start: of each command, each worker and each simulated machine."""
+    parts = "{'scipy.stats', 'scipy.signal'}"
+    code = f"import sys, servotwin.cli.audit, servotwin.drives.simulated.server; print(*{parts} & set(sys.modules))"
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert completed.stdout.strip() == ""
+
+
 def test_version():
     result = run("--version")
     assert result.exit_code == 0

@@ -49,13 +49,13 @@ def changed(folder: Path, statement: str, *values: object) -> int:
         return database.execute(statement, values).rowcount
 
 
-def asked(folder: Path, query: str) -> list[tuple[object, ...]]:
+def rows_of(folder: Path, query: str) -> list[tuple[object, ...]]:
     with closing(sqlite3.connect(folder / "twin.db")) as database:
         return database.execute(query).fetchall()
 
 
 def windows(folder: Path) -> int:
-    ((number,),) = asked(folder, "select count(*) from messages where kind = 'window'")
+    ((number,),) = rows_of(folder, "select count(*) from messages where kind = 'window'")
     assert isinstance(number, int)
     assert number > 5
     return number
@@ -80,7 +80,7 @@ def test_a_changed_version_is_named(folder: Path) -> None:
 
 def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     """One bit of one stored number: nothing explains that, and nothing else is blamed."""
-    (row, body), *_ = asked(folder, "select id, body from evidence where kind = 'estimate' and status = 'ok'")
+    (row, body), *_ = rows_of(folder, "select id, body from evidence where kind = 'estimate' and status = 'ok'")
     assert isinstance(body, bytes)
     stored = msgspec.msgpack.decode(body)
     stored["estimate"]["gap"] += 1e-12
@@ -121,7 +121,7 @@ def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(fol
 
 
 def test_one_window_is_enough(folder: Path) -> None:
-    name = asked(folder, "select key from messages where kind = 'window'")[2][0]
+    name = rows_of(folder, "select key from messages where kind = 'window'")[2][0]
     assert isinstance(name, str)
     code, output = replayed(folder, "--window", name)
     assert (code, output.splitlines()[0]) == (0, "servo axis: 1 window")

@@ -38,8 +38,9 @@ def test_an_edge_s_file_fits_its_schema_as_it_is_written() -> None:
     law = Controller(1377.7, 18907.6, -135.1, 0.1, sample_rate=1000.0)
     agent = AgentSettings("axis-1", UNBOOTED, 1000.0, controller=law)
     text = edge_toml(EdgeConfig(agent, "control", law, {"kind": "simulated", "address": "unix:s"}))
-    values = tomllib.loads(text.replace("= inf", "= 1e300"))
-    jsonschema_rs.validate(json.loads(texts()["schemas/edge.json"]), values)
+    schema, values = json.loads(texts()["schemas/edge.json"]), tomllib.loads(text.replace("= inf", "= 1e300"))
+    jsonschema_rs.validate(schema, values)
+    assert not jsonschema_rs.is_valid(schema, {**values, "unknown_key": 1})
 
 
 def test_a_twin_s_file_fits_its_schema() -> None:

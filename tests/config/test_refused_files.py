@@ -1,4 +1,4 @@
-"""A twin's or an edge's file that cannot work: one sentence, exit code 2, no traceback; each by the real process."""
+"""A twin's or an edge's file that cannot work: one sentence, exit code 2, no traceback; one each by the process."""
 
 import os
 import socket
@@ -14,6 +14,7 @@ from selfsigned import self_made
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.startup import check
 from servotwin.errors import InvalidInput
+from servotwin.twin_service import command
 
 MODELS = '[models.a]\nservo = "paper"\n[models.a.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "a"\n'
 EDGE = """
@@ -47,9 +48,9 @@ def ended(folder: Path, *arguments: str) -> str:
     return sentence
 
 
-def twin(folder: Path, service: str, models: str = MODELS) -> str:
-    (folder / "twin.toml").write_text(f"[service]\nport = 0\n{service}\n{models}")
-    return ended(folder, "servotwin", "twin")
+def twin_file(folder: Path, service: str) -> Path:
+    (folder / "twin.toml").write_text(f"[service]\n{service}\n{MODELS}")
+    return folder / "twin.toml"
 
 
 def nonsense(folder: Path) -> str:
@@ -78,14 +79,13 @@ def text_store(folder: Path) -> str:
     return ""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("service", "expected"),
     [
         ("prot = 1", "unknown key 'service.prot' (did you mean 'port'?)"),
         ("retention_days = -3", "service.retention_days = -3 is not allowed; give a positive number"),
         ('tokens = "none.toml"', "none.toml: there is no such file of tokens; `servotwin enroll` makes it"),
-        (world_readable, "has mode 0644, so that others may open it; make it 0600"),
+        (world_readable, "has mode 0644, so that others may open it; make it 0600: chmod 600 "),
         (nonsense, "are no certificate with its own key, in PEM and without a password"),
         (strangers, "KEY_VALUES_MISMATCH"),
         ('store = "sqlite:///no/such/folder/twin.db"', "cannot be made (No such file or directory)"),
@@ -94,18 +94,27 @@ def text_store(folder: Path) -> str:
     ],
 )
 def test_a_twin_with_an_invalid_file_names_the_fault_and_does_not_start(
-    tmp_path: Path, service: str | Callable[[Path], str], expected: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, service: str | Callable[[Path], str], expected: str
 ) -> None:
-    sentence = twin(tmp_path, service if isinstance(service, str) else service(tmp_path))
-    assert expected in sentence
-    assert "secret" not in sentence
+    """As the command does it; the process is tested below."""
+    monkeypatch.delenv("SERVOTWIN_STORE_PASSWORD", raising=False)
+    monkeypatch.chdir(tmp_path)
+    for name in ("configure_logging", "raise_descriptor_limit"):
+        monkeypatch.setattr(command, name, lambda *_: None)
+    monkeypatch.setattr(command, "HttpServer", lambda *_: pytest.fail("it serves"))
+    path = twin_file(tmp_path, "port = 0\n" + (service if isinstance(service, str) else service(tmp_path)))
+    with pytest.raises(InvalidInput) as refused:
+        command.run(path)
+    assert expected in str(refused.value)
+    assert "secret" not in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.slow
-def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
+def test_a_port_that_is_taken_is_named_by_the_process(tmp_path: Path) -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as taken:
         port = taken.getsockname()[1]
-        (tmp_path / "twin.toml").write_text(f"[service]\nport = {port}\n{MODELS}")
+        twin_file(tmp_path, f"port = {port}")
         assert f"port = {port}: cannot listen there (Address already in use)" in ended(tmp_path, "servotwin", "twin")
 
 

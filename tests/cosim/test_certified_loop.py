@@ -83,13 +83,13 @@ def test_the_same_scenario_gives_the_same_bytes():
 def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
     scenario = Scenario.preset("certified")
     alone = cosimulate(scenario.replace(duration=60.0, twin=scenario.twin.replace(enabled=False)))
-    proved = certified_policy(scenario.model, scenario.twin).fallback()
+    fallback_certificate = certified_policy(scenario.model, scenario.twin).fallback()
     assert not alone.fallbacks
     error = np.abs(alone.run.reference - alone.run.position)
     settled = slice(round(55.0 * alone.run.sample_rate), -1)
-    left = scenario.input_bias / proved.setting.controller.Kp
+    left = scenario.input_bias / fallback_certificate.setting.controller.Kp
     assert error[settled].max() == pytest.approx(left, rel=0.02)
-    assert left < proved.tail < proved.within
+    assert left < fallback_certificate.tail < fallback_certificate.within
 
 
 @pytest.mark.slow

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.cosim import Cosimulation
@@ -82,7 +83,7 @@ SEEDS = st.integers(0, 2**63)
 
 
 @pytest.mark.slow
-@settings(max_examples=300)
+@examples(60)
 @given(LINKS, LINKS, SEEDS, TWINS, st.sampled_from([0.0, 4.0]))
 def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, seed, twin, interval_s):
     loop = run(uplink, downlink, seed, twin, interval_s)

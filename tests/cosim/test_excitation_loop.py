@@ -124,18 +124,18 @@ WHILE_PROBING: list[tuple[float, SignalLike]] = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1000.0])
-@pytest.mark.parametrize(("time", "wanted"), WHILE_PROBING)
+@pytest.mark.parametrize(("time", "signal"), WHILE_PROBING)
 def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
-    time: float, wanted: SignalLike, rate: float | None
+    time: float, signal: SignalLike, rate: float | None
 ) -> None:
-    loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=wanted, duration=19.0))
+    loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=signal, duration=19.0))
     first, size = loop.answers[0].sample, loop.requests[0].ask.size  # type: ignore[union-attr]
     assert loop.answers[0].taken
-    moved = loop.run.reference - wanted.pieces(19.0).on(loop.run.time)  # type: ignore[union-attr]
+    moved = loop.run.reference - signal.pieces(19.0).on(loop.run.time)  # type: ignore[union-attr]
     assert np.array_equal(np.flatnonzero(np.abs(moved) > 1e-9), np.arange(first, round(5000.0 * time) + 1))
     assert moved[first] == pytest.approx(size)
     assert [window.reason for window in loop.windows] == ["reference"] * 3
-    assert loop.windows[2].reference_changes[-1][1] == pytest.approx(float(wanted.pieces(19.0).value(19.0)))  # type: ignore[union-attr]
+    assert loop.windows[2].reference_changes[-1][1] == pytest.approx(float(signal.pieces(19.0).value(19.0)))  # type: ignore[union-attr]
 
 
 @pytest.mark.slow

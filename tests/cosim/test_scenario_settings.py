@@ -85,7 +85,7 @@ def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("controller", "said"),
+    ("controller", "message"),
     [
         ("kp_v_per_m = 13777", "unstable"),
         ("ki_v_per_m_s = -100", "unstable"),
@@ -94,12 +94,12 @@ def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path,
         ("rate_limit_v_per_s = 100", "sample rate in Hz"),
     ],
 )
-def test_a_controller_that_cannot_run_is_refused(tmp_path, controller, said):
-    assert said in refusal(tmp_path, f"{SHORT}[controller]\n{controller}\n")
+def test_a_controller_that_cannot_run_is_refused(tmp_path, controller, message):
+    assert message in refusal(tmp_path, f"{SHORT}[controller]\n{controller}\n")
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (SHORT.replace("duration_s = 5.0", "duration_s = 1e12"), "duration = 1000000000000.0 s: has 5e+15 samples"),
         (f"{SHORT}[controller]\nsample_rate_hz = 1e12\n", "at most 1e+08"),
@@ -110,8 +110,8 @@ def test_a_controller_that_cannot_run_is_refused(tmp_path, controller, said):
         ),
     ],
 )
-def test_what_would_not_fit_into_memory_is_refused(tmp_path, text, said):
-    assert said in refusal(tmp_path, text)
+def test_what_would_not_fit_into_memory_is_refused(tmp_path, text, message):
+    assert message in refusal(tmp_path, text)
 
 
 EDGE = (

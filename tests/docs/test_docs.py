@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], key=str)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAME = re.compile(r"`(servotwin(?:\.\w+)+)`")
-FILE = re.compile(r"`((?:servotwin|tests|docs)/[\w./-]+\.\w+)(?:::(\w+))?`")
+NAME = re.compile(r"`((?:servotwin|benchmarks)(?:\.\w+)+)`")
+FILE = re.compile(r"`((?:servotwin|tests|docs|benchmarks)/[\w./-]+\.\w+)(?:::(\w+))?`")
 
 LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": edge_config_file.load, "models": read_twin}
 """By a key that only files of this sort have; any other is a scenario."""

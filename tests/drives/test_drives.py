@@ -93,7 +93,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
     same.advance(moved)
     same.set_reference(shifted(as_pieces(scenario.reference, 10.0), PiecewiseCubic.constant(2e-4)))
     run, blocks = whole(same), before + between + after
-    assert changed == 2345 + wire.MOST
+    assert changed == 2345 + wire.MAX_SAMPLES
     assert [block.version for block in blocks] == [0, 0] + [7] * (len(blocks) - 2)
     assert [block.first for block in blocks[1:]] == [block.last for block in blocks[:-1]]
     for values, name in zip(joined(blocks), CHANNELS, strict=True):
@@ -285,7 +285,7 @@ supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), 
         ({"listen": "unix:"}, "machine address 'unix:' is not allowed"),
         ({"speed": -1.0}, "speed = -1.0 is not allowed"),
         ({"scenario": "other.toml"}, "scenario = 'other.toml' is not allowed"),
-        ({"scenario": "fig15"}, "a machine needs one, in Hz"),
+        ({"scenario": "fig15"}, "scenario controller sample rate: must be a number in Hz"),
         ({"block_s": 10.0}, "block_s = 10.0 s: must hold 1 to 4096 samples"),
         ({"keep_s": 0.01}, "keep_s = 0.01 s: must be at least block_s"),
         ({"watchdog": 1.0}, "unknown key 'watchdog' (did you mean 'watchdog_s'?)"),

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.edge.agent import Agent, ScheduledMessage
@@ -193,7 +194,7 @@ def check_bytes(loop: Loop) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=1000, deadline=None)
+@examples(150, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES, st.booleans())
 def test_windows_and_parameters_are_consistent_over_any_link(
     link: LinkSettings, seed: int, capacity: int, lifetime_s: float, careless: bool
@@ -207,7 +208,7 @@ def test_windows_and_parameters_are_consistent_over_any_link(
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@examples(40, deadline=None)
 @given(LINKS, SEEDS)
 def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed: int) -> None:
     loop = Loop(link, seed, 100, twin := StubTwin(1e6))
@@ -222,7 +223,7 @@ def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed:
 
 
 @pytest.mark.slow
-@settings(max_examples=50, deadline=None)
+@examples(25, deadline=None)
 @given(LINKS, SEEDS, CAPACITIES, LIFETIMES)
 def test_equal_seeds_give_equal_bytes(link: LinkSettings, seed: int, capacity: int, lifetime_s: float) -> None:
     first, second = (Loop(link, seed, capacity, StubTwin(lifetime_s)) for _ in range(2))

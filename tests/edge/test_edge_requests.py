@@ -44,19 +44,19 @@ def request(serial: int = 1, ask: Any = MOVE, **changes: Any) -> Request:
     return msgspec.structs.replace(Request("axis-1", "b0", serial, ask, 60.0), **changes)
 
 
-def feed(agent: Agent, wanted: list[float]) -> list[Message]:
+def feed(agent: Agent, targets: list[float]) -> list[Message]:
     """As whoever ticks the law does: wanted position plus the agent's offset, one sample after the other."""
     sent = list[ScheduledMessage]()
-    for value in wanted:
+    for value in targets:
         k = float(agent.samples)
         sent += agent.absorb(value + agent.offset, 0.1 * k, 1e-3 * k, -k)
     return [out.message for out in sent]
 
 
 def answer(agent: Agent, message: Request) -> Answer:
-    (said,) = agent.receive(message)
-    assert isinstance(said.message, Answer)
-    return said.message
+    (reply,) = agent.receive(message)
+    assert isinstance(reply.message, Answer)
+    return reply.message
 
 
 def references(window: WindowMessage) -> list[float]:
@@ -193,13 +193,15 @@ def test_moves_keep_their_distance_and_the_same_request_may_come_again() -> None
 
 
 @given(
-    wanted=st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.3]), st.integers(1, 12)), min_size=1, max_size=8),
+    targets=st.lists(st.tuples(st.sampled_from([0.0, 0.1, 0.3]), st.integers(1, 12)), min_size=1, max_size=8),
     requests=st.dictionaries(st.integers(0, 60), st.sampled_from([MOVE, Probe(-3e-4, 0.3, 2), LongerWindow(1.1, 0.4)])),
     cuts=st.sets(st.integers(1, 96), max_size=9),
 )
-def test_blocks_equal_single_samples(wanted: list[tuple[float, int]], requests: dict[int, Any], cuts: set[int]) -> None:
+def test_blocks_equal_single_samples(
+    targets: list[tuple[float, int]], requests: dict[int, Any], cuts: set[int]
+) -> None:
     """Blocks end where requests come and, during a move, with the sample at which the wanted position changes."""
-    reference = [value for value, count in wanted for _ in range(count)]
+    reference = [value for value, count in targets for _ in range(count)]
     single, blocks = Agent(settings()), Agent(settings())
     one, other = list[ScheduledMessage](), list[ScheduledMessage]()
     serial, done = 0, 0

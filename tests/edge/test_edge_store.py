@@ -1,4 +1,4 @@
-"""The last proved parameters outlive a boot, whole or not at all."""
+"""The last parameters under which the loop kept its band outlive a boot, whole or not at all."""
 
 from pathlib import Path
 

@@ -23,7 +23,7 @@ from servotwin.simulation import Simulation
 from servotwin.twin.settings import TwinSettings
 
 QUICK = TwinSettings(demands=Demands(plants=8, screened=4, scales=(0.7, 1.0)))
-"""Settings proved on fewer machines than usual."""
+"""Settings verified on fewer machines than usual."""
 
 
 def drawn(own: Controller, draw: random.Random) -> Controller:

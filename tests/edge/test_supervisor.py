@@ -4,7 +4,8 @@ import math
 from array import array
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -146,7 +147,7 @@ STEPS = st.lists(st.tuples(st.integers(1, 400), st.sampled_from([0.0, 2e-5, 1.5e
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@examples(40)
 @given(steps=STEPS)
 def test_blocks_and_single_samples_decide_the_same(steps: list[tuple[int, float, bool]]) -> None:
     agents = [Agent(agent_settings(3.0, 0.5)) for _ in range(2)]

@@ -29,27 +29,27 @@ def at(seconds: float) -> Instant:
     return Instant("axis-1", "b0", round(seconds * 5000), 5000.0)
 
 
-def reasons(said: tuple[Any, ...]) -> list[tuple[int, Reason]]:
-    return [(receipt.version, receipt.reason) for receipt in said]
+def reasons(replies: tuple[Any, ...]) -> list[tuple[int, Reason]]:
+    return [(receipt.version, receipt.reason) for receipt in replies]
 
 
 @pytest.mark.parametrize("error", [0.0, 0.99e-4, -0.99e-4, 2.01e-4, -3e-4, None])
 def test_a_safe_instant_is_used_at_once(error: float | None) -> None:
-    state, said = offer(START, UPDATE, RULES, at(22.0), error)
-    assert reasons(said) == [(1, Reason.APPLIED)]
+    state, replies = offer(START, UPDATE, RULES, at(22.0), error)
+    assert reasons(replies) == [(1, Reason.APPLIED)]
     assert state == Switch(Parameters(1, Setting(2e-4, CALM, BAND), 20.0, ("b0", 0), 110_000, gap=0.1))
-    assert isinstance(said[0], Receipt)
-    assert said[0].sample == 110_000
+    assert isinstance(replies[0], Receipt)
+    assert replies[0].sample == 110_000
 
 
 @pytest.mark.parametrize("error", [1e-4, 1.5e-4, -2e-4])
 def test_an_update_waits_between_the_thresholds_and_its_receipt_names_the_sample(error: float) -> None:
-    state, said = offer(START, UPDATE, RULES, at(22.0), error)
-    assert (said, state.current) == ((), START.current)
+    state, replies = offer(START, UPDATE, RULES, at(22.0), error)
+    assert (replies, state.current) == ((), START.current)
     assert apply_pending(state, RULES, at(22.5), error) == (state, ())
-    state, said = apply_pending(state, RULES, at(22.6), 2.1e-4)
-    assert isinstance(said[0], Receipt)
-    assert (said[0].applied, said[0].sample) == (True, 113_000)
+    state, replies = apply_pending(state, RULES, at(22.6), 2.1e-4)
+    assert isinstance(replies[0], Receipt)
+    assert (replies[0].applied, replies[0].sample) == (True, 113_000)
     assert state.current.sample == 113_000
     assert state.pending is None
 
@@ -66,8 +66,8 @@ def test_without_patience_nothing_waits() -> None:
 
 def test_an_update_that_expires_while_it_waits_is_refused() -> None:
     state, _ = offer(START, replace(UPDATE, not_after=23.0), RULES, at(22.0), 1.5e-4)
-    state, said = apply_pending(state, RULES, at(23.0), 0.0)
-    assert reasons(said) == [(1, Reason.EXPIRED)]
+    state, replies = apply_pending(state, RULES, at(23.0), 0.0)
+    assert reasons(replies) == [(1, Reason.EXPIRED)]
     assert state == START
 
 
@@ -79,8 +79,8 @@ def test_a_copy_of_the_pending_update_gets_no_answer_yet() -> None:
 def test_a_newer_update_replaces_the_pending_one() -> None:
     state, _ = offer(START, UPDATE, RULES, at(22.0), 1.5e-4)
     newer = replace(UPDATE, version=2, window=("b0", 1), data_time=21.0)
-    state, said = offer(state, newer, RULES, at(22.5), 1.5e-4)
-    assert reasons(said) == [(1, Reason.SUPERSEDED)]
+    state, replies = offer(state, newer, RULES, at(22.5), 1.5e-4)
+    assert reasons(replies) == [(1, Reason.SUPERSEDED)]
     assert state.pending == PendingUpdate(newer, at(22.5).sample)
     older = replace(newer, version=3, data_time=20.5)
     assert reasons(offer(state, older, RULES, at(22.6), 0.0).messages) == [(3, Reason.OLD_DATA)]
@@ -129,9 +129,9 @@ def test_the_fallback_set_is_a_version_of_its_own() -> None:
     state = Switch(Parameters(4, Setting(1e-4, OWN), 20.0, ("b0", 0), 100_000))
     waiting = replace(UPDATE, version=6, base_version=4, data_time=21.0)
     state, _ = offer(state, waiting, RULES, at(22.0), 1.5e-4)
-    state, said = fall_back(state, SET, VERDICT, at(23.0))
-    assert reasons(said[:1]) == [(6, Reason.AFTER_FALLBACK)]
-    assert said[1] == Fallback("axis-1", "b0", 115_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 4, 7, Setting(0.0, CALM))
+    state, replies = fall_back(state, SET, VERDICT, at(23.0))
+    assert reasons(replies[:1]) == [(6, Reason.AFTER_FALLBACK)]
+    assert replies[1] == Fallback("axis-1", "b0", 115_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 4, 7, Setting(0.0, CALM))
     assert (state.current.version, state.current.setting.gains, state.current.setting.band) == (7, CALM, BAND)
     assert state.current.fallback
 
@@ -172,13 +172,13 @@ def test_every_update_is_answered_at_most_once_and_versions_only_rise(steps: lis
         before = state.current
         if kind == 0:
             update = replace(UPDATE, version=next(number), base_version=before.version, data_time=second - 0.05)
-            state, said = offer(state, update, RULES, at(second), error)
+            state, replies = offer(state, update, RULES, at(second), error)
         elif kind == 1:
-            state, said = fall_back(state, FallbackSet(Setting(0.0, CALM), refuse_s=0.0), VERDICT, at(second))
+            state, replies = fall_back(state, FallbackSet(Setting(0.0, CALM), refuse_s=0.0), VERDICT, at(second))
             number = count(state.current.version + 1)
         else:
-            state, said = apply_pending(state, RULES, at(second), error)
-        answered += [receipt.version for receipt in said if isinstance(receipt, Receipt)]
+            state, replies = apply_pending(state, RULES, at(second), error)
+        answered += [receipt.version for receipt in replies if isinstance(receipt, Receipt)]
         assert state.current.version > before.version or state.current is before
         assert state.current.data_time >= before.data_time
     assert len(answered) == len(set(answered))

@@ -18,7 +18,7 @@ from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.watch import WatchSettings
-from servotwin.edge_process.config import UNBOOTED, EdgeConfig, Keeping, SensorGuard, TwinLink, token_of
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig, SensorGuard, StoredFiles, TwinLink, token_of
 from servotwin.edge_process.config_file import edge_toml, load, read_config
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Setting
@@ -70,9 +70,9 @@ def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text:
         ProbeLimits(c, 20.0, 0.5),
     )  # fmt: skip
     twin = TwinLink("https://twin.example:8443/base", None, "TOKEN", "ca.pem", 3.0, 5.0)
-    keeping, sensor = Keeping("o.db", "p.json", "s.json", "b", 9, 2_500_000), SensorGuard(0.003, -0.5)
+    files, sensor = StoredFiles("o.db", "p.json", "s.json", "b", 9, 2_500_000), SensorGuard(0.003, -0.5)
     drive = {"kind": "opcua", "list": [1, 2.5], "flag": True, "map": {"text": text}}
-    config = EdgeConfig(agent, "supervise", LAW, drive, twin, keeping, sensor)
+    config = EdgeConfig(agent, "supervise", LAW, drive, twin, files, sensor)
     assert again(config) == config
 
 

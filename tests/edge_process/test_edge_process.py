@@ -201,7 +201,9 @@ def test_without_a_twin_an_edge_controls_and_stores_windows(edge: RunningEdge, m
 
 @pytest.mark.slow
 def test_a_terminal_that_is_closed_leaves_the_safe_voltage(edge: RunningEdge, machine: StubMachine) -> None:
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup the edge would ignore it, as it should
     edge.start()
+    signal.signal(signal.SIGHUP, inherited)
     until(lambda: edge.status().get("samples", 0) > 0)
     assert edge.process is not None
     os.killpg(edge.process.pid, signal.SIGHUP)
@@ -333,7 +335,7 @@ def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (second.returncode, second.stderr.count("\n")) == (2, 1)
     assert "another edge runs on its files" in second.stderr
-    other = replace(edge.config, keeping=replace(edge.config.keeping, parameters="other.json"))
+    other = replace(edge.config, files=replace(edge.config.files, parameters="other.json"))
     (edge.folder / "other.toml").write_text(edge_toml(other))
     third = subprocess.run([*command[:-1], str(edge.folder / "other.toml")], timeout=60, check=False)
     assert third.returncode == 2

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import random_cases
@@ -32,7 +33,7 @@ def moments(values: np.ndarray, per_sample: int = 1) -> np.ndarray:
     return np.array([middle.sum(), (2.0 * product + crossed).sum() / 6.0]) / per_sample
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60, deadline=None)
 @given(st.floats(0.05, 1.5), st.floats(-1.0, 1.0), st.integers(0, 10**6))
 def test_area_and_moment_are_those_of_the_fine_path(gap, place, seed):
     """To the cubic's error, not the line's."""
@@ -63,7 +64,7 @@ def test_a_crest_between_two_samples_stays():
     assert play(theta_m, 1.5, -5.0)[14] == pytest.approx(-0.75 - 0.0025)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60, deadline=None)
 @given(st.floats(0.05, 1.5), st.floats(-0.99, 0.99), st.integers(0, 10**6))
 def test_derivatives_are_those_of_the_area(gap, place, seed):
     theta_m = angle(np.arange(COUNT + 1.0), seed)

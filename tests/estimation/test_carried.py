@@ -118,9 +118,9 @@ def test_spreads_and_the_trend_hold_what_they_say():
 def test_a_window_with_two_contacts_never_uses_the_carried_offset():
     window = noisy(stretch(5.0, 2.0), 1)
     alone = estimate_gap(window, SERVO)
-    told = estimate_carrying(window, SERVO, None, SETTINGS, (3.0, 1e-6))
-    assert replace(told, offset=None) == alone
-    assert told.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
+    with_offset = estimate_carrying(window, SERVO, None, SETTINGS, (3.0, 1e-6))
+    assert replace(with_offset, offset=None) == alone
+    assert with_offset.offset.offset == pytest.approx(0.0, abs=0.02 * DEG)
 
 
 def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
@@ -159,10 +159,10 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     assert "read anew" in moved.reasons[0]
     assert moved.prior.offset == pytest.approx(-slip, abs=0.02 * DEG)
     window = noisy(stretch(5.0, 1.2), 6, slip)
-    told = estimate_carrying(window, SERVO, None, SETTINGS, carried(trend))
-    assert told.ok
-    assert abs(told.gap - GAP) > 5.0 * DEG
-    doubted = trend.update(replace(told, time=60.0))
+    with_offset = estimate_carrying(window, SERVO, None, SETTINGS, carried(trend))
+    assert with_offset.ok
+    assert abs(with_offset.gap - GAP) > 5.0 * DEG
+    doubted = trend.update(replace(with_offset, time=60.0))
     assert doubted.refused == 1
     assert doubted.gap == pytest.approx(GAP, abs=0.1 * DEG)
     assert "forgotten" in doubted.reasons[1]

@@ -42,9 +42,9 @@ def test_a_nuisance_takes_information_away():
     assert beside > 1.05 * alone
 
 
-@pytest.mark.parametrize("wanted", [np.zeros(N), OTHER, -3.0 * OTHER])
-def test_nothing_known_is_infinite(wanted):
-    assert standard_deviation(wanted, OTHER, np.random.default_rng(0).standard_normal(N)) == math.inf
+@pytest.mark.parametrize("sensitivity", [np.zeros(N), OTHER, -3.0 * OTHER])
+def test_nothing_known_is_infinite(sensitivity):
+    assert standard_deviation(sensitivity, OTHER, np.random.default_rng(0).standard_normal(N)) == math.inf
 
 
 def test_scales_like_the_residual_over_the_sensitivity():

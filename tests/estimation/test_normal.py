@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.estimation.core.least_squares import LeastSquares, independent_least_squares, least_squares
@@ -14,7 +15,7 @@ Fit = Callable[[np.ndarray, np.ndarray], LeastSquares]
 
 
 @pytest.mark.parametrize("fit", [least_squares, independent_least_squares])
-@settings(max_examples=30, deadline=None)
+@examples(30, deadline=None)
 @given(seed=st.integers(0, 1000), count=st.integers(1, 6))
 def test_coefficients_and_deviations_are_those_of_the_covariance(fit: Fit, seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from measured_windows import RATE, position_of
 from scipy.linalg import expm
@@ -91,7 +92,7 @@ def test_contacts_are_the_play_operator():
         assert np.array_equal(rows[SCREW], play(angles, gap, start))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60, deadline=None)
 @given(st.floats(0.05, 2.0), st.floats(-1.0, 1.0), st.integers(0, 10**6))
 def test_sensitivities_are_exact(gap, share, seed):
     """Piecewise affine: a small step changes the screw's angle by exactly its derivative."""

@@ -67,8 +67,8 @@ def test_modes_follow_the_roots_of_the_cubic(step: float) -> None:
     full = RISE * (b - a)
     expected = [(a, "fill"), (b, "drain"), (b + full / FALL, "empty"), (c, "fill")]
     assert [label for _, label in events(run)] == [label for _, label in expected]
-    for (time, _), (wanted, _) in zip(events(run), expected, strict=True):
-        assert time == pytest.approx(wanted, rel=1e-13)
+    for (time, _), (in_closed_form, _) in zip(events(run), expected, strict=True):
+        assert time == pytest.approx(in_closed_form, rel=1e-13)
     time = np.array([0.5, 1.7, b, 3.0, 8.0, 11.0])
     level = [0.0, RISE * (1.7 - a), full, full - FALL * (3.0 - b), 0.0, RISE * (11.0 - c)]
     assert np.abs(run.at(time, X) - level).max() < 1e-12

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from event_oracle import OracleGuard, OracleMode, follow
-from hypothesis import assume, given, settings
+from exploration import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -22,7 +23,7 @@ def random_flow(rng: np.random.Generator, size: int, fastest: float) -> Array:
     return flow - max(growth, 0.0) * np.eye(size)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(seeds, st.integers(1, 6), st.sampled_from([0.1, 3.0, 40.0]), st.sampled_from([1e-3, 0.0123, 0.25]))
 def test_dense_output_is_the_exponential(seed: int, size: int, fastest: float, step: float) -> None:
     rng = np.random.default_rng(seed)
@@ -77,7 +78,7 @@ def ours(flows: list[Array], rows: list[Array], reset: Array | None, step: float
 
 
 @pytest.mark.slow
-@settings(max_examples=12)
+@examples(12)
 @given(seeds)
 def test_random_relay_loops(seed: int) -> None:
     """Every switch of a random loop, with resets in half of them, and the state between."""
@@ -100,7 +101,7 @@ def test_random_relay_loops(seed: int) -> None:
     assert np.abs(run.at(places, rows[0]) - slow.at(places, rows[0])).max() < 1e-8 * scale
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(seeds)
 def test_the_sample_step_and_the_search_do_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)

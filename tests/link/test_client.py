@@ -5,7 +5,8 @@ from math import inf
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.link.client import Receiver, Sender
@@ -42,14 +43,14 @@ class Script:
         self.delivered: list[Parcel] = []
         self.faults: list[Exception | None] = []
         self.news: list[bytes] = []
-        self.asked: list[int] = []
+        self.polls: list[int] = []
 
     def deliver(self, parcel: Parcel) -> None:
         self._fail()
         self.delivered.append(parcel)
 
     def listen(self, after: int) -> list[bytes]:
-        self.asked.append(after)
+        self.polls.append(after)
         self._fail()
         return self.news
 
@@ -170,7 +171,7 @@ def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_withou
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@examples(40, deadline=None)
 @given(FAULTS)
 def test_every_window_is_delivered_once_or_counted(
     tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None]
@@ -204,7 +205,7 @@ def test_messages_of_the_twin_are_received_once_and_in_order(receiver: Receiver,
     assert [serial for serial, _ in receiver.step().messages] == [2, 3]
     script.news = [sealed(3), sealed(7)]
     assert [serial for serial, _ in receiver.step().messages] == [7]
-    assert script.asked == [0, 3]
+    assert script.polls == [0, 3]
     assert receiver.counts == {"received": 3, "repeated": 3}
 
 

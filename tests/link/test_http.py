@@ -147,11 +147,11 @@ def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"HTTPS://127.0.0.1:{listener.getsockname()[1]}"
         link = HttpTransport(url, "axis-1", "secret", timeout_s=1.0)
-        heard = []
+        received = []
 
         def hear() -> None:
             with listener.accept()[0] as line:
-                heard.append(line.recv(4096))
+                received.append(line.recv(4096))
 
         listening = threading.Thread(target=hear)
         listening.start()
@@ -159,8 +159,8 @@ def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
             link.deliver(parcel(0))
         listening.join(10.0)
         release(link)
-    assert heard[0][:1] == b"\x16"  # a TLS handshake
-    assert b"secret" not in heard[0]
+    assert received[0][:1] == b"\x16"  # a TLS handshake
+    assert b"secret" not in received[0]
 
 
 def test_a_missing_server_is_unreachable() -> None:

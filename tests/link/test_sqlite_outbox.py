@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
@@ -261,7 +262,7 @@ STEPS = st.lists(st.tuples(st.sampled_from("prdlt"), st.integers(0, 9), st.boole
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@examples(40, deadline=None)
 @given(steps=STEPS)
 def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPathFactory, steps: list) -> None:
     path = tmp_path_factory.mktemp("box") / "outbox.sqlite"

@@ -13,7 +13,8 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
@@ -168,7 +169,7 @@ _NUMBERS = st.floats(width=64) | st.sampled_from([0.0, 1e308, -1e308, 1e-320, ma
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@examples(60, deadline=None)
 @given(st.lists(st.tuples(_NUMBERS, _NUMBERS), min_size=1, max_size=40), st.integers(1, 300), st.integers(0, 3))
 def test_nothing_that_a_sensor_gives_stops_the_judge(steps: list[tuple[float, float]], hold: int, warm: int) -> None:
     theta_m, position = (np.repeat(np.array(values), hold) for values in zip(*steps, strict=True))

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
@@ -116,7 +117,7 @@ def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
 # --- measures
 
 
-@settings(max_examples=6)
+@examples(6)
 @given(seed=st.integers(0, 1000), share=st.sampled_from([0.0, 0.01, 0.05]))
 def test_measures_are_those_of_single_runs(seed: int, share: float) -> None:
     """The oracle: one `simulate` per member, and the measures by numpy."""
@@ -271,7 +272,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
 
 
 def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
-    """The fallback set is proved for an unknown bias, where no overshoot is asked."""
+    """The fallback set is verified for an unknown bias, without a bound on the overshoot."""
     strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))
     made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
     assert "none of" in made.reason

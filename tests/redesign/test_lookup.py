@@ -1,4 +1,4 @@
-"""Settings proved beforehand: what is looked up holds for the region that was asked, and foreign tables are refused."""
+"""Settings verified beforehand: a certificate holds for every region inside its cell; foreign tables are refused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.control.gains import gains_of
@@ -103,7 +104,7 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=25)
+@examples(25, deadline=None)
 @given(
     st.floats(0.0, 30.0),
     st.floats(0.0, 30.0),
@@ -114,23 +115,23 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
 def test_a_looked_up_setting_is_verified_for_the_region(one, other, fed, left, noise) -> None:
     """The invariant that everything stands on: another draw of machines, from the region alone, says the same."""
     low, high = sorted((one, other))
-    asked = region(low, high, fed, left, noise)
-    found = table().find(asked)
+    requested = region(low, high, fed, left, noise)
+    found = table().find(requested)
     if isinstance(found, NotVerified):
-        assert asked.largest_bias > GRID.biases[-1] * (1.0 - 1e-9)
+        assert requested.largest_bias > GRID.biases[-1] * (1.0 - 1e-9)
         return
-    assert found.gap[0] <= asked.gap[0]
-    assert asked.gap[1] <= found.gap[1]
-    assert found.input_bias[0] <= asked.input_bias[0] + 1e-12
-    assert asked.input_bias[1] <= found.input_bias[1] + 1e-12
+    assert found.gap[0] <= requested.gap[0]
+    assert requested.gap[1] <= found.gap[1]
+    assert found.input_bias[0] <= requested.input_bias[0] + 1e-12
+    assert requested.input_bias[1] <= found.input_bias[1] + 1e-12
     assert found.setting.controller.feedforward == fed
-    exact = POLICY.confirm(asked, found.setting)
+    exact = POLICY.confirm(requested, found.setting)
     assert isinstance(exact, Certificate), exact
-    assert exact.gap == asked.gap
+    assert exact.gap == requested.gap
 
 
 def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
-    """So that a cell, proved without one, holds for all."""
+    """A cell that is verified without a feedforward holds for all."""
     setting = table().fallback.setting
     fed = replace(setting, controller=setting.controller.replace(feedforward=0.07))
     plain = POLICY.confirm(region(left=5e-3), setting)
@@ -143,7 +144,7 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("requested", "why"),
     [
         (region(left=0.06), "60 mV of bias"),
         (region(high=31.0), "gaps of 9 to 31 deg"),
@@ -151,35 +152,35 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
         (region(feedforward=0.3), "a feedforward of 0.3 V"),
     ],
 )
-def test_a_region_that_no_cell_contains_is_not_covered(asked: Region, why: str) -> None:
-    found = table().find(asked)
+def test_a_region_that_no_cell_contains_is_not_covered(requested: Region, why: str) -> None:
+    found = table().find(requested)
     assert isinstance(found, NotVerified)
     assert why in found.reason
 
 
 def test_a_wider_cell_replaces_one_without_a_certificate() -> None:
-    asked = region(1.0, 2.0)
+    requested = region(1.0, 2.0)
     cells = dict(table().cells)
     narrow = [key for key in cells if key.level == 0]
-    wide = replace(table(), cells={**cells, **dict.fromkeys(narrow)}).find(asked)
+    wide = replace(table(), cells={**cells, **dict.fromkeys(narrow)}).find(requested)
     assert isinstance(wide, Certificate)
     assert wide.gap == POLICY.uncertainty.gap
-    none = replace(table(), cells=dict.fromkeys(cells)).find(asked)
+    none = replace(table(), cells=dict.fromkeys(cells)).find(requested)
     assert isinstance(none, NotVerified)
 
 
 def test_the_running_setting_stays_where_a_somewhat_wider_cell_verifies_it() -> None:
-    asked = region(1.0, 2.0, feedforward=0.03)
-    narrow = table().find(asked)
+    requested = region(1.0, 2.0, feedforward=0.03)
+    narrow = table().find(requested)
     other = Design(narrow.setting.controller.replace(Kp=1e3, feedforward=0.0), narrow.setting.tolerance)
     cells = {key: found if key.level == 0 else replace(found, setting=other) for key, found in table().cells.items()}
     changed = replace(table(), cells=cells)
-    kept = changed.find(asked, replace(other, controller=other.controller.replace(feedforward=-0.01)).setting())
+    kept = changed.find(requested, replace(other, controller=other.controller.replace(feedforward=-0.01)).setting())
     assert kept.setting.controller == other.controller.replace(feedforward=0.03)
     assert kept.gap == POLICY.uncertainty.gap
-    assert changed.find(asked).setting == narrow.setting
+    assert changed.find(requested).setting == narrow.setting
     integral = replace(other, controller=other.controller.replace(Ki=1.0))
-    assert changed.find(asked, integral.setting()).setting == narrow.setting
+    assert changed.find(requested, integral.setting()).setting == narrow.setting
 
 
 def test_the_running_setting_does_not_stay_for_a_much_wider_cell() -> None:
@@ -194,7 +195,7 @@ def test_the_running_setting_does_not_stay_for_a_much_wider_cell() -> None:
 
 
 def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
-    """Cells with more bias than is called known are proved without a bound on the overshoot."""
+    """Cells with more bias than is called known are verified without a bound on the overshoot."""
     cells = {key: found for key, found in table().cells.items() if key.bias == 1}
     assert isinstance(replace(table(), cells=cells).find(region(left=5e-3)), NotVerified)
     assert isinstance(replace(table(), cells=cells).find(region(left=2e-2)), Certificate)

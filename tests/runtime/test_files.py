@@ -47,12 +47,12 @@ def test_the_file_has_the_permissions_of_an_ordinary_one(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("run.xlsx", "'.xlsx'"), ("run", "''"), ("missing/run.csv", "no directory"), ("folder.csv", "is a directory")],
 )
-def test_a_path_that_cannot_be_written_is_refused(tmp_path, name, said):
+def test_a_path_that_cannot_be_written_is_refused(tmp_path, name, message):
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(InvalidInput, match=said) as error:
+    with pytest.raises(InvalidInput, match=message) as error:
         files.check_file(tmp_path / name, (".csv", ".npz"))
     assert name in str(error.value)
 

@@ -32,9 +32,11 @@ def test_a_lock_is_held_until_its_process_is_killed(tmp_path: Path) -> None:
 
 
 def test_a_lock_is_released_after_the_block(tmp_path: Path) -> None:
-    for _ in range(2):
-        with locked(tmp_path / "file-lock"):
-            pass
+    path = tmp_path / "file-lock"
+    with locked(path), pytest.raises(BlockingIOError), locked(path):
+        pass
+    with locked(path) as descriptor:
+        assert os.fstat(descriptor).st_ino == path.stat().st_ino
 
 
 def test_the_lock_lies_beside_the_file_that_a_link_leads_to(tmp_path: Path) -> None:

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -68,7 +69,7 @@ def test_the_linear_loop_agrees_with_expm() -> None:
     assert np.abs(run.voltage - voltage).max() < 1e-10 * np.abs(voltage).max()
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     bias=st.floats(-0.2, 0.2),
     degrees=st.floats(0.0, 15.0),

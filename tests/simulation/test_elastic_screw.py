@@ -4,7 +4,8 @@ import itertools
 import math
 
 import numpy as np
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.plant.servo import Servo
@@ -49,7 +50,7 @@ def test_at_rest_on_a_flank_the_motor_carries_part_of_the_load() -> None:
     assert found > 100
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(st.floats(4.5, 7.0), st.sampled_from([2, 3, 5]), st.floats(0.0, 20.0), st.booleans(), st.booleans())
 def test_no_elastic_screw_chatters(stiffness: float, masses: int, degrees: float, wearing: bool, zone: bool) -> None:
     servo = PAPER.replace(k_d=10.0**stiffness, n=masses)

@@ -129,8 +129,8 @@ def test_a_pace_catches_up_and_gives_up_what_is_beyond_its_slack() -> None:
     pace = Pace(rate=1000.0, speed=4.0, slack=0.5, now=10.0)
     assert pace.due(4000) == pytest.approx(11.0)
     assert pace.reached(10.99999) == 3999
-    assert pace.keep(4000, 10.9) == 0.0
-    assert pace.keep(4000, 11.25) == pytest.approx(1.0)
+    assert pace.catch_up(4000, 10.9) == 0.0
+    assert pace.catch_up(4000, 11.25) == pytest.approx(1.0)
     assert pace.due(4400) == pytest.approx(11.1)
-    assert pace.keep(4000, 14.0) == pytest.approx(2.0)
+    assert pace.catch_up(4000, 14.0) == pytest.approx(2.0)
     assert pace.due(4000) == pytest.approx(13.5)

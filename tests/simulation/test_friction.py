@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from exploration import examples
 from friction_oracle import FrictionOracle
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import brentq
@@ -26,7 +27,7 @@ RATES = [None, 1000.0]
 VOLT = PAPER.k_T / PAPER.R  # N m of a stalled motor at 1 V
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(speed=st.floats(0.1, 50.0), friction=st.floats(1e-3, 1.0), side=st.sampled_from([-1, 1]))
 def test_a_free_motor_stops_where_the_closed_form_says(speed: float, friction: float, side: int) -> None:
     """No voltage, no contact: current and speed are one exponential until the speed is zero; then nothing moves."""
@@ -165,7 +166,7 @@ def options_of(degrees: float, volts: float, ki: float, zone: float | None, rate
     }
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(**FRICTION_CASES)
 def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
     run = simulate(PAPER, 6.0, **options_of(**case))
@@ -185,7 +186,7 @@ def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@examples(10)
 @given(**(FRICTION_CASES | {"rate": st.just(None)}))
 @example(degrees=9.864783163098648, volts=0.001, ki=18907.6, zone=4.0, rate=None, wearing=False)
 def test_torque_and_work(**case: object) -> None:
@@ -211,7 +212,7 @@ def test_torque_and_work(**case: object) -> None:
     assert work - lost == pytest.approx(0.5 * PAPER.J * last**2, abs=1e-6 * (lost + np.abs(work)))
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(factor=st.sampled_from([0.25, 2.0, -1.0]), **FRICTION_CASES)
 def test_scaled_and_mirrored(factor: float, **case: object) -> None:
     """Friction is homogeneous with the rest: bit for bit for powers of two, and odd."""
@@ -236,7 +237,7 @@ def test_no_friction_is_the_frictionless_run() -> None:
     assert np.array_equal(simulate(PAPER, 6.0, **options).position, plain.position)
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(**(FRICTION_CASES | {"rate": st.just(None), "volts": st.just(0.0), "wearing": st.just(False)}))
 def test_a_member_of_an_ensemble_may_be_without_friction(**case: object) -> None:
     """The automaton with friction's modes and T_c = 0 gives the frictionless run, to what rounding grows to."""

@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
@@ -136,7 +137,7 @@ def test_powers_of_two_scale_bit_for_bit(power: int, wearing: bool) -> None:
         assert np.array_equal(wanted, scaled.channel(name, 0, scaled.index + 1)), name
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(st.floats(1e-3, 1e3), st.sampled_from(["paper", "table1"]), st.booleans())
 def test_other_factors_scale_within_rounding(scale: float, preset: str, wearing: bool) -> None:
     plain, scaled = homogeneous(1.0, preset, wearing), homogeneous(scale, preset, wearing)

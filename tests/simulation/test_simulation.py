@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
@@ -16,7 +17,7 @@ PAPER = Servo.preset("paper")
 SAMPLED = PAPER.controller.replace(sample_rate=5000.0)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(
     half=st.sampled_from([0.05, 0.07, 0.1, 0.14, 0.2, 0.3, 0.34]),
     cuts=st.lists(st.integers(1, 4999), max_size=6),

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
@@ -52,7 +53,7 @@ def pieces(signal: SignalLike) -> PiecewiseCubic:
     return PiecewiseCubic.constant(signal) if isinstance(signal, float) else signal.pieces(2.0)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40, deadline=None)
 @given(
     rate=st.sampled_from(RATES),
     signals=st.tuples(*[st.sampled_from(SIGNALS)] * 3),

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -42,7 +43,7 @@ def options_of(rate: float | None, **changes: object) -> dict:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@examples(40)
 @given(
     at=st.integers(1, 3999),
     rate=st.sampled_from(RATES),
@@ -85,7 +86,7 @@ def test_the_voltage_does_not_jump(
     assert abs(changed.voltage[at] - kept.voltage[at]) <= 1e-9
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     at=st.integers(1, 3999), rate=st.sampled_from(RATES), noisy=st.booleans(), friction=st.sampled_from([0.0, 0.003])
 )

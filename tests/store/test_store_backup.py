@@ -167,7 +167,7 @@ def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_upd
     assert pauses
     bodies = {n: store.window("a", "boot", n).body for n in range(10)}
     assert [n for n, body in bodies.items() if body] == [2, 8, 9]
-    assert len([link for link in store.audit("a") if link.found or link.steps]) == 8
+    assert len([link for link in store.audit("a") if link.evidence or link.steps]) == 8
     assert store.put([window(body=bytes(1000))]) == [PutResult.KNOWN]
     (rest,) = store.lease("me", 1, 30.0, 300.0)
     assert len(rest.messages) == 3

@@ -5,7 +5,7 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hypothesis import settings
+from exploration import examples
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, multiple, rule
 from store_cases import incoming
@@ -181,5 +181,5 @@ class Against(RuleBasedStateMachine):
         assert waiting.proofs == sum(len(self.undone(name, (MessageKind.VERIFICATION,))) for name in self.servos)
 
 
-Against.TestCase.settings = settings(max_examples=25, stateful_step_count=25)
+Against.TestCase.settings = examples(25, stateful_step_count=25)
 TestAgainst = Against.TestCase

@@ -23,7 +23,7 @@ AT_THE_END = "WHERE twins.lease_owner = ?"
 
 
 @pytest.fixture
-def asked(tmp_path: Path) -> tuple[Store, dict[str, Any]]:
+def traced_store(tmp_path: Path) -> tuple[Store, dict[str, Any]]:
     """A store, and every statement that it made."""
     store, statements = open_store(f"sqlite:///{tmp_path}/twin.db"), dict[str, Any]()
 
@@ -76,8 +76,8 @@ def plan(path: str, statement: str, parameters: Any) -> list[str]:
         return [row[3] for row in connection.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)]
 
 
-def test_no_statement_scans_a_whole_table(asked: tuple[Store, dict[str, Any]]) -> None:
-    store, statements = asked
+def test_no_statement_scans_a_whole_table(traced_store: tuple[Store, dict[str, Any]]) -> None:
+    store, statements = traced_store
     exercise(store)
     path = str(store.engines.writer.url.database)
     explained = {

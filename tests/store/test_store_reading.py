@@ -27,9 +27,9 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
 
 
 def test_an_edge_that_received_more_than_a_restored_store_posted_gets_the_next_message(store: Store) -> None:
-    for sequence, heard in ((1, 0), (2, 900), (3, 2**60)):
+    for sequence, last_serial in ((1, 0), (2, 900), (3, 2**60)):
         store.put([window(sequence=sequence), window("b", sequence)])
-        assert store.outgoing("a", heard) == []
+        assert store.outgoing("a", last_serial) == []
         store.commit([outcome(one, outgoing=(b"x%d" % sequence,)) for one in claim(store)], 201.0)
     assert store.outgoing("a", 900) == [OutgoingMessage(901, b"x2"), OutgoingMessage(902, b"x3")]
     assert [post.serial for post in store.outgoing("b", 0)] == [1, 2, 3]
@@ -117,7 +117,7 @@ def test_the_evidence_chain(store: Store) -> None:
     assert [link.window.sequence for link in links] == [4, 3, 2, 1]
     assert [len(link.steps) for link in links] == [0, 0, 1, 0]
     acted = links[2]
-    assert [one.kind for one in acted.found] == ["glance", "estimate"]
+    assert [one.kind for one in acted.evidence] == ["glance", "estimate"]
     (step,) = acted.steps
     assert (step.update.kind, step.update.version, step.update.body) == ("update", 1, b"u")
     assert [(one.kind, one.status) for one in step.answers] == [("receipt", "applied")]
@@ -132,7 +132,7 @@ def test_the_evidence_chain(store: Store) -> None:
 def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> None:
     store.put([window(), window("b")])
     (link,) = store.audit("a")
-    assert (link.window.sequence, link.window.done, link.found, link.steps) == (1, None, (), ())
+    assert (link.window.sequence, link.window.done, link.evidence, link.steps) == (1, None, (), ())
 
 
 def test_an_update_after_a_verification_belongs_to_its_window(store: Store) -> None:

@@ -134,8 +134,8 @@ def raw(server: Mosquitto, topic: str, payload: bytes) -> None:
         arrived.set()
 
     events = MqttCallbacks(message, lambda _: ready.set(), lambda _: None)
-    wanted = MqttSession("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
-    connection = Connection(Broker(server.url), wanted, events)
+    subscription = MqttSession("anybody", (topic.replace("servotwin/bad name/up", "servotwin/+/up"),), 0)
+    connection = Connection(Broker(server.url), subscription, events)
     try:
         assert ready.wait(PATIENCE)
         assert connection.publish(topic, payload, 60.0) is not None

@@ -206,10 +206,10 @@ def by_solve_ivp(case: Case, times: Array, rtol: float = 1e-12) -> tuple[Array, 
         zone, t = (zone_of(case, reference - x[loop.last]) if case.tolerance else 1), begin
         while t < end:
             (A, a, b), guards = loop.flow(side, zone), _guards(case, loop, side, zone, reference, t, x)
-            wanted = times[(times >= t) & (times <= end)]
+            within = times[(times >= t) & (times <= end)]
             solution = solve_ivp(
                 lambda t, x, A=A, c=a * reference, b=b: A @ x + c + b * case.gap_rate(t),
-                (t, end), x, "DOP853", t_eval=np.unique([*wanted, end]), events=[g for g, _ in guards],
+                (t, end), x, "DOP853", t_eval=np.unique([*within, end]), events=[g for g, _ in guards],
                 rtol=rtol, atol=1e-3 * rtol * scale,
             )  # fmt: skip
             kept = np.asarray(solution.t)

@@ -8,7 +8,7 @@ from servotwin.messages import decode
 from servotwin.store.records import EvidenceRecord, Lease, WorkResult
 from servotwin.twin_service import worker
 
-GIVEN_UP = 3
+ABANDON_AFTER = 3
 
 
 def work(claim: Lease, now: float) -> WorkResult:
@@ -16,15 +16,15 @@ def work(claim: Lease, now: float) -> WorkResult:
     messages = claim.messages[:1] if claim.attempts > 1 else claim.messages
     evidence = []
     for message in messages:
-        wanted = decode(message.body).reason
-        if claim.attempts >= GIVEN_UP:
+        behaviour = decode(message.body).reason
+        if claim.attempts >= ABANDON_AFTER:
             evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status="failed: given up"))
             continue
-        if wanted == "die":
+        if behaviour == "die":
             os._exit(9)
-        if wanted == "hang":
+        if behaviour == "hang":
             time.sleep(600.0)
-        if wanted == "raise":
+        if behaviour == "raise":
             raise ValueError("this one cannot be worked on")
         evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status=f"at {now:.0f}"))
     done = tuple(message.id for message in messages)

@@ -71,7 +71,7 @@ class StubMachine:
                     self._serve(connection)
 
     def _serve(self, connection: socket.socket) -> None:
-        wire.at_once(connection)
+        wire.disable_nagle(connection)
         connection.recv(wire.HELLO.size, socket.MSG_WAITALL)
         connection.sendall(wire.WELCOME.pack(wire.MAGIC, wire.VERSION, wire.CONTROL, b"machine0", self.rate))
         self.clients += 1
@@ -82,8 +82,8 @@ class StubMachine:
             self._tick(connection)
 
     def _tick(self, connection: socket.socket) -> None:
-        told = self.spoil(self.number, self.reference(self.number), 50.0 * self.position, self.position)
-        connection.sendall(wire.SAMPLE.pack(*told, 0.0))
+        sample = self.spoil(self.number, self.reference(self.number), 50.0 * self.position, self.position)
+        connection.sendall(wire.SAMPLE.pack(*sample, 0.0))
         data = connection.recv(wire.VOLTAGE.size, socket.MSG_WAITALL)
         if len(data) < wire.VOLTAGE.size:
             raise ConnectionError

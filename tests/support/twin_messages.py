@@ -42,10 +42,10 @@ class Rule:
     needs_estimate = True
 
     def __init__(self, rule):
-        self.rule, self.asked = rule, []
+        self.rule, self.consulted = rule, []
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        self.asked.append(evidence)
+        self.consulted.append(evidence)
         return self.rule(evidence)
 
 

@@ -39,7 +39,7 @@ def window(sequence=0, start=20.0):
     return messages.WindowMessage("axis", "boot-1", sequence, start, 100.0, channels, (), 0, "model", "test", crc)
 
 
-def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK):
+def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, observed=None, status=GapStatus.OK):
     """What the twin says to a window, and its reason."""
     low, high = map(math.radians, gap_deg)
     middle = 0.5 * (low + high) if math.isfinite(high) else low
@@ -49,7 +49,7 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, told=None, status=GapStatus.OK
 
     policy = policy_of(PAPER, settings)
     start = Setting(0.0, gains_of(PAPER.controller))
-    twin = twin_of(estimator, policy, settings, observer=lambda _window: told or disturbed(0.05), start=start)
+    twin = twin_of(estimator, policy, settings, observer=lambda _window: observed or disturbed(0.05), start=start)
     acknowledge, *sent = twin.receive(window(), 0.0)
     assert isinstance(acknowledge, Acknowledge)
     return sent, twin.log.redesigns["axis", "boot-1", 0]
@@ -89,15 +89,15 @@ def test_where_the_whole_range_cannot_be_proved_nothing_is_sent():
     assert redesign.reason.startswith("no fallback set for the servo's stated range: none of ")
 
 
-def test_where_nothing_is_proved_the_fallback_set_is_sent_and_it_is_said():
+def test_where_nothing_is_verified_the_fallback_set_is_sent_with_the_reason():
     """A bias beyond what may be fed forward leaves more error than the fallback set's band has room for."""
     settings = SETTINGS.replace(demands=replace(FEW, integral=(0.0,)))
-    (update,), redesign = answer(settings=settings, told=disturbed(0.4))
-    proved = certified_policy(PAPER, settings).fallback()
+    (update,), redesign = answer(settings=settings, observed=disturbed(0.4))
+    fallback_certificate = certified_policy(PAPER, settings).fallback()
     assert "is verified: the best is off by" in redesign.reason
     assert redesign.reason.endswith("; the fallback set is sent")
-    assert update.setting.gains == gains_of(proved.setting.controller.replace(feedforward=-0.1))
-    assert update.setting.band == band_of(proved)
+    assert update.setting.gains == gains_of(fallback_certificate.setting.controller.replace(feedforward=-0.1))
+    assert update.setting.band == band_of(fallback_certificate)
 
 
 def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window():
@@ -110,9 +110,9 @@ def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
     """Whatever the noise: a dead zone opens the loop inside the band only."""
     for gap in (2.0, 10.0, 40.0):
         noisy = disturbed(0.0, 2e-4)
-        sent, redesign = answer((gap - 0.1, gap + 0.1), told=noisy)
-        proved = certified_policy(PAPER, SETTINGS).fallback()
+        sent, redesign = answer((gap - 0.1, gap + 0.1), observed=noisy)
+        fallback_certificate = certified_policy(PAPER, SETTINGS).fallback()
         assert sent
         assert isinstance(sent[0].setting.gains, Gains)
-        assert redesign.certificate.tail <= proved.tail
-        assert sent[0].setting.tolerance * sent[0].setting.gains.leave <= band_of(proved).error
+        assert redesign.certificate.tail <= fallback_certificate.tail
+        assert sent[0].setting.tolerance * sent[0].setting.gains.leave <= band_of(fallback_certificate).error

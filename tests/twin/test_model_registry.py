@@ -55,8 +55,8 @@ def test_a_servo_that_nothing_names_has_no_model(servo):
 
 def test_models_carry_settings_controller_and_start():
     plain, calm = read().models
-    wanted = TwinSettings(policy="paper", initial_gap=math.radians(1.0))
-    assert plain.settings.replace(estimator=None) == wanted
+    expected = TwinSettings(policy="paper", initial_gap=math.radians(1.0))
+    assert plain.settings.replace(estimator=None) == expected
     assert plain.servo == Servo.preset("paper")
     assert plain.first_setting == Setting(
         plain.servo.tolerance_for(plain.settings.initial_gap), gains_of(plain.servo.controller)
@@ -103,13 +103,13 @@ def test_other_tables_are_left_to_others():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("ki_v_per_m_s", "ki", "twin.toml: unknown key 'models.calm.controller.ki'"),
         ('policy = "certified"', 'policy = "best"', "twin.toml: models.calm.twin.policy = 'best'"),
         ('"calm"\n"*-7"', '"clam"\n"*-7"', "servos.line-7 = 'clam': there is no such model (did you mean 'calm'?)"),
-        ('"line-7"', '"line 7"', "servos: 'line 7' names no servo"),
-        ("[models.calm]", '[models."c lm"]', "'c lm' is no model's name"),
+        ('"line-7"', '"line 7"', "servos: 'line 7' is not allowed"),
+        ("[models.calm]", '[models."c lm"]', "'c lm' is not a name of a model"),
         ('servo = "{servo}"', 'servo = "axis.toml"', "twin.toml: models.calm.servo = 'axis.toml'"),
         ('servo = "{servo}"', "", "twin.toml: key 'models.calm.servo' is missing"),
         ("ki_v_per_m_s = 0.0", "ki_v_per_m_s = 1e9", "is unstable on this servo even without a gap"),
@@ -122,10 +122,10 @@ def test_other_tables_are_left_to_others():
         ("[models.", "[mods.", "twin.toml: table [models] is missing"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(old, new, said):
+def test_what_is_wrong_is_said_in_one_sentence(old, new, message):
     with pytest.raises(InvalidInput) as caught:
         read(TEXT.replace(old, new))
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).startswith("twin.toml: ")
     assert "\n" not in str(caught.value)
 

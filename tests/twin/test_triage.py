@@ -213,9 +213,9 @@ def test_what_is_no_measurement_of_a_gap_is_left_to_the_estimator() -> None:
     ],
 )
 def test_what_is_estimated_whatever_it_shows(changes: dict, watch: dict, why: str) -> None:
-    said = due(message_of(cases(False)[0].window, **{"start": 0.0, **changes}), watch_of(0.1, **watch), SETTINGS)
-    assert why in said
-    assert bool(said) == bool(why)
+    explanation = due(message_of(cases(False)[0].window, **{"start": 0.0, **changes}), watch_of(0.1, **watch), SETTINGS)
+    assert why in explanation
+    assert bool(explanation) == bool(why)
 
 
 # --- a twin with triage

@@ -1,4 +1,4 @@
-"""The twin and its policy: what it is asked with, what becomes of its answer."""
+"""The twin and its policy: the evidence that it gets, and the use of its decision."""
 
 import math
 from dataclasses import replace
@@ -56,7 +56,7 @@ def test_a_policy_sees_the_evidence():
     rule = eq_21()
     twin, store = with_policy(rule)
     _, update = twin.receive(window_message(1, 10.0), 0.0)
-    evidence = rule.asked[0]
+    evidence = rule.consulted[0]
     assert evidence.estimate.gap == 0.1
     assert evidence.disturbance == DISTURBED == store.disturbances["axis", "boot-1", 1]
     assert TrendState.of(evidence.trend) == TrendState.of(twin.trend)
@@ -64,7 +64,7 @@ def test_a_policy_sees_the_evidence():
     assert evidence.tuned_for is None
     twin.receive(receipt(update), 1.0)
     twin.receive(window_message(2, 20.0, version=1), 2.0)
-    evidence = rule.asked[1]
+    evidence = rule.consulted[1]
     assert (evidence.setting.tolerance, evidence.tuned_for) == (PITCH * 0.1, 0.1)
     assert evidence.gains == gains_of(OWN)
 
@@ -77,16 +77,16 @@ def test_a_whole_controller_is_sent_and_known_to_be_in_force_once_it_is():
     assert messages.decode(messages.encode(update)) == update
     assert (update.setting.gains.Ki, update.setting.gains.feedforward, update.setting.band.effort) == (0.0, -0.02, 1.0)
     twin.receive(window_message(2, 20.0), 1.0)
-    assert rule.asked[1].gains.Ki == OWN.Ki
+    assert rule.consulted[1].gains.Ki == OWN.Ki
     twin.receive(window_message(3, 30.0, version=1), 2.0)
-    assert rule.asked[2].gains == gains_of(OWN.replace(Ki=0.0, feedforward=-0.02))
+    assert rule.consulted[2].gains == gains_of(OWN.replace(Ki=0.0, feedforward=-0.02))
 
 
 def test_what_somebody_else_set_is_not_known():
     rule = eq_21()
     twin, _ = with_policy(rule)
     twin.receive(window_message(1, 10.0, version=17), 0.0)
-    assert rule.asked[0].setting is None
+    assert rule.consulted[0].setting is None
 
 
 def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
@@ -101,7 +101,7 @@ def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
     assert twin.next_wake() is None
     assert store.fallbacks == [fallback]
     _, again = twin.receive(window_message(3, 30.0, version=3), 4.0)
-    evidence = rule.asked[-1]
+    evidence = rule.consulted[-1]
     assert (evidence.gains.Ki, evidence.setting.tolerance, evidence.tuned_for) == (0.0, 2e-4, None)
     assert (again.version, again.base_version) == (4, 3)
 

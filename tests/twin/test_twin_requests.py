@@ -1,4 +1,4 @@
-"""The twin's half of asking: one request at a time, repeated, numbered anew when it forgot, given up."""
+"""The twin's half of requests: one at a time, repeated, renumbered after a lost state, abandoned."""
 
 import math
 
@@ -52,8 +52,8 @@ LATE = gains_of(LAW.replace(leave=1.5))
 
 def make(says: Says | None = None, runs: Setting | None = START, **settings) -> tuple[Twin, EvidenceLog]:
     excitation = ExcitationSettings(probe=1e-2, interval=15.0)
-    told = TwinSettings(policy="paper", excitation=excitation, retry=2.0, attempts=3, **settings)
-    twin = Twin("axis", TwinModel.of(SERVO, told, runs, says or Says()))
+    twin_settings = TwinSettings(policy="paper", excitation=excitation, retry=2.0, attempts=3, **settings)
+    twin = Twin("axis", TwinModel.of(SERVO, twin_settings, runs, says or Says()))
     return twin, twin.log
 
 
@@ -61,7 +61,7 @@ def requests(sent) -> list[messages.Request]:
     return [message for message in sent if isinstance(message, messages.Request)]
 
 
-def asked(twin: Twin, *windows) -> list[messages.Request]:
+def requests_after(twin: Twin, *windows) -> list[messages.Request]:
     return requests([message for each in windows for message in twin.receive(each, each.start + 3.0)])
 
 
@@ -71,7 +71,7 @@ def answer(request, outcome=RequestOutcome.TAKEN, newest=None) -> Answer:
 
 def test_a_request_says_what_and_why_and_is_stored_before_it_is_sent() -> None:
     twin, store = make()
-    (request,) = asked(twin, window(0), window(1))
+    (request,) = requests_after(twin, window(0), window(1))
     assert (request.servo, request.boot, request.serial, request.ask) == ("axis", "b0", 1, LongerWindow(2.0, 0.3))
     assert request.not_after == 15.0 + 60.0
     assert request.reason == store.excitations["axis", "b0", 1].reason
@@ -80,7 +80,7 @@ def test_a_request_says_what_and_why_and_is_stored_before_it_is_sent() -> None:
 
 def test_it_is_repeated_until_answered() -> None:
     twin, store = make()
-    (request,) = asked(twin, window(0), window(1))
+    (request,) = requests_after(twin, window(0), window(1))
     assert twin.next_wake() == 20.0
     assert twin.wake(19.9) == []
     assert twin.wake(20.0) == [request]
@@ -91,10 +91,10 @@ def test_it_is_repeated_until_answered() -> None:
 
 def test_it_is_given_up_and_made_again_after_more_windows() -> None:
     twin, store = make()
-    (request,) = asked(twin, window(0), window(1))
+    (request,) = requests_after(twin, window(0), window(1))
     assert twin.wake(20.0) + twin.wake(22.0) + twin.wake(24.0) == [request] * 2
     assert twin.next_wake() is None
-    (again,) = asked(twin, window(2), window(3))
+    (again,) = requests_after(twin, window(2), window(3))
     assert (again.serial, again.ask) == (2, request.ask)
     assert len(store.requests) == 2
 
@@ -102,7 +102,7 @@ def test_it_is_given_up_and_made_again_after_more_windows() -> None:
 @pytest.mark.parametrize("outcome", [RequestOutcome.BUSY, RequestOutcome.TOO_SOON])
 def test_a_bad_moment_is_no_answer(outcome: RequestOutcome) -> None:
     twin, _ = make()
-    (request,) = asked(twin, long(0), long(1))
+    (request,) = requests_after(twin, long(0), long(1))
     assert isinstance(request.ask, Probe)
     assert twin.receive(answer(request, outcome, 0), 19.0) == []
     assert twin.wake(20.0) == [request]
@@ -110,7 +110,7 @@ def test_a_bad_moment_is_no_answer(outcome: RequestOutcome) -> None:
 
 def test_a_twin_that_forgot_its_numbers_goes_on_from_the_edges() -> None:
     twin, store = make()
-    (request,) = asked(twin, window(0), window(1))
+    (request,) = requests_after(twin, window(0), window(1))
     (renumbered,) = requests(twin.receive(answer(request, RequestOutcome.DUPLICATE, newest=7), 19.0))
     assert (renumbered.serial, renumbered.ask) == (8, request.ask)
     assert store.requests == [request, renumbered]
@@ -119,17 +119,17 @@ def test_a_twin_that_forgot_its_numbers_goes_on_from_the_edges() -> None:
 
 def test_a_probe_that_is_not_needed_any_more_is_not_repeated() -> None:
     twin, _ = make(Says(GapStatus.UNIDENTIFIABLE, GapStatus.UNIDENTIFIABLE, GapStatus.OK))
-    assert len(asked(twin, long(0), long(1))) == 1
+    assert len(requests_after(twin, long(0), long(1))) == 1
     twin.receive(long(2), 19.0)
     assert requests(twin.wake(100.0)) == []
 
 
 def test_a_new_boot_begins_anew() -> None:
     twin, _ = make()
-    (request,) = asked(twin, window(0), window(1))
-    assert asked(twin, window(0, boot="b1")) == []
+    (request,) = requests_after(twin, window(0), window(1))
+    assert requests_after(twin, window(0, boot="b1")) == []
     assert requests(twin.wake(100.0)) == []
-    (again,) = asked(twin, window(1, boot="b1"))
+    (again,) = requests_after(twin, window(1, boot="b1"))
     assert (again.boot, again.serial, again.ask) == ("b1", 1, request.ask)
 
 
@@ -150,23 +150,23 @@ def test_the_size_comes_from_the_stated_range_and_the_dead_zone(
     status: GapStatus, runs: Setting | None, size: float | None
 ) -> None:
     twin, store = make(Says(status), runs)
-    found = asked(twin, long(0), long(1))
+    found = requests_after(twin, long(0), long(1))
     assert [request.ask.size for request in found] == pytest.approx([] if size is None else [size])
     assert size is not None or "bounded" in store.excitations["axis", "b0", 1].reason
 
 
 def test_the_size_comes_from_the_trend_once_there_is_one() -> None:
     twin, _ = make(Says(GapStatus.OK), Setting(0.0, gains_of(LAW)))
-    (request,) = asked(twin, long(0), long(1), long(2))
+    (request,) = requests_after(twin, long(0), long(1), long(2))
     assert request.ask.size < 2.0 * SERVO.p * (0.1 + math.radians(5.0))
     assert request.ask.size > SERVO.p * (0.1 + math.radians(5.0))
 
 
 def test_the_window_of_a_probe_counts_as_long() -> None:
     twin, _ = make()
-    (first,) = asked(twin, long(0), long(1))
+    (first,) = requests_after(twin, long(0), long(1))
     twin.receive(answer(first), 19.0)
-    (second,) = asked(twin, window(2, length=170, reason="probe"), long(3))
+    (second,) = requests_after(twin, window(2, length=170, reason="probe"), long(3))
     assert isinstance(second.ask, Probe)
 
 
@@ -174,14 +174,14 @@ def test_what_no_estimator_takes_is_no_reason_to_move_the_machine() -> None:
     twin, store = make(Says())
     channels = (pack_channel("position", "deg", [0.0] * 100),)
     broken = [msgspec.structs.replace(window(k), channels=channels, crc=messages.checksum(channels)) for k in range(4)]
-    assert asked(twin, *broken) == []
+    assert requests_after(twin, *broken) == []
     assert store.excitations == {}
 
 
 def test_without_settings_answers_are_kept_and_nothing_is_asked() -> None:
     twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), START, Says()))
     store = twin.log
-    assert asked(twin, window(0), window(1), window(2)) == []
+    assert requests_after(twin, window(0), window(1), window(2)) == []
     late = Answer("axis", "b0", 1, 0, RequestOutcome.TAKEN, 1)
     assert twin.receive(late, 50.0) == []
     assert store.answers == [late]

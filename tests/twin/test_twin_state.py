@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from twin_messages import known_gap, make, window_message
 
@@ -189,7 +190,7 @@ def test_a_trend_keeps_every_bit(trend):
         max_size=15,
     )
 )
-@settings(max_examples=60)
+@examples(60)
 def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
     """Boots that come back, old windows, receipts for nothing, a clock that jumps."""
     lives, dies = make()[0], make()[0]
@@ -200,8 +201,8 @@ def test_whatever_comes_a_restored_twin_goes_on_the_same(events):
             "receipt": Receipt("axis", version, True, 3, Reason.APPLIED, version, boot),
             "fallback": Fallback("axis", boot, 5, Cause.ERROR, 1.0, 0.5, version, version + 1, Setting(2e-5)),
         }.get(kind)
-        said = [twin.wake(now) if message is None else twin.receive(message, now) for twin in (lives, dies)]
-        assert said[0] == said[1]
+        replies = [twin.wake(now) if message is None else twin.receive(message, now) for twin in (lives, dies)]
+        assert replies[0] == replies[1]
         state = dies.state()
         assert state == lives.state()
         fresh = Twin("axis", dies.model, dies.log, state)
@@ -236,7 +237,7 @@ def test_a_later_schema_and_another_servos_state_are_refused():
     with pytest.raises(InvalidInput, match="not understood"):
         twin.restore(later)
     other = Twin("other", twin.model)
-    with pytest.raises(InvalidInput, match=r"the state of servo 'other' is that of 'axis'"):
+    with pytest.raises(InvalidInput, match=r"the state of servo 'other' belongs to 'axis'"):
         other.restore(twin.state())
 
 
@@ -324,15 +325,15 @@ def test_what_runs_is_remembered_however_many_updates_follow():
     assert decode_state("axis", twin.state()).known[3] == Setting(1e-5)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_hello_tells_what_a_new_boot_runs(told):
-    """After a restart from what was proved last, under a version of which this twin never heard."""
+@pytest.mark.parametrize("with_gains", [True, False])
+def test_a_hello_tells_what_a_new_boot_runs(with_gains):
+    """After a restart from the last verified setting, under a version that this twin does not know."""
     twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), estimator=known_gap))
     law = SERVO.controller.replace(Kp=1234.0)
-    hello = Hello("axis", "boot-2", 0.0, 100.0, 17, Setting(3e-5, gains_of(law) if told else None), "m")
+    hello = Hello("axis", "boot-2", 0.0, 100.0, 17, Setting(3e-5, gains_of(law) if with_gains else None), "m")
     assert twin.receive(hello, 5.0) == []
     assert twin.log.hellos == [hello]
-    assert decode_state("axis", twin.state()).known[17] == Setting(3e-5, gains_of(law) if told else None)
+    assert decode_state("axis", twin.state()).known[17] == Setting(3e-5, gains_of(law) if with_gains else None)
 
 
 def test_a_hello_of_an_earlier_boot_tells_nothing():

@@ -97,20 +97,20 @@ def failing(monkeypatch) -> None:
 
 
 def begun(fleet: ModelRegistry) -> tuple[Queue, Update, Incoming]:
-    """After the first window: what was sent, and what is to be proved."""
+    """After the first window: what was sent, and the verification that is queued."""
     queue = Queue(fleet)
     outcome = queue.window(0)
     update = sent(outcome)
     queue.applied(update)
-    (asked,) = outcome.enqueue
-    return queue, update, asked
+    (queued,) = outcome.enqueue
+    return queue, update, queued
 
 
 @pytest.mark.slow
 def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: ModelRegistry) -> None:
-    _, update, asked = begun(fleet)
-    question = decode_request(asked.body)
-    assert (asked.servo, asked.kind, asked.encoding) == ("axis", MessageKind.VERIFICATION, "")
+    _, update, queued = begun(fleet)
+    question = decode_request(queued.body)
+    assert (queued.servo, queued.kind, queued.encoding) == ("axis", MessageKind.VERIFICATION, "")
     assert (question.version, question.window) == (update.version, update.window)
     assert gains_of(question.setting.controller) == update.setting.gains
     assert question.region.gap[0] < 12.0 * DEG < question.region.gap[1]
@@ -118,14 +118,14 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: M
 
 
 def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: ModelRegistry) -> None:
-    queue, update, asked = begun(fleet)
+    queue, update, queued = begun(fleet)
     before = queue.state
-    outcome = queue.give(asked)
+    outcome = queue.give(queued)
     assert kinds(outcome) == ["proof"]
     (row,) = outcome.evidence
     assert (row.version, row.status, row.window) == (update.version, "", "{}/{}".format(*update.window))
     body = msgspec.msgpack.decode(row.body)
-    assert body["certificate"]["gap"] == list(decode_request(asked.body).region.gap)
+    assert body["certificate"]["gap"] == list(decode_request(queued.body).region.gap)
     assert body["certificate"]["settled"] >= 0.99
     assert queue.state == before
     assert not outcome.outgoing
@@ -138,33 +138,33 @@ def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: 
 
 
 def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: ModelRegistry, monkeypatch) -> None:
-    queue, update, asked = begun(fleet)
+    queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
-        outcome = queue.give(asked)
+        outcome = queue.give(queued)
     assert kinds(outcome) == ["proof", "withdrawn"]
     assert "settles on 3.0 %" in outcome.evidence[0].status
     assert f"the verification of version {update.version} failed" in outcome.evidence[1].status
     assert not outcome.outgoing  # the edge takes nothing that stands on no newer window
     following = queue.window(1, update.version)
     back = sent(following)
-    proved = certified_policy(SERVO, fleet.models[0].settings).fallback()
+    fallback_certificate = certified_policy(SERVO, fleet.models[0].settings).fallback()
     assert back.base_version == update.version
     assert back.data_time > update.data_time
-    law = proved.setting.controller.replace(feedforward=back.setting.gains.feedforward)
+    law = fallback_certificate.setting.controller.replace(feedforward=back.setting.gains.feedforward)
     assert back.setting.gains == gains_of(law)
     assert not following.enqueue
-    said = {row.kind: row.status for row in following.evidence}
-    assert "the verification of version" in said["glance"]
-    assert said["redesign"].endswith("are asked; the fallback set is sent")
+    statuses = {row.kind: row.status for row in following.evidence}
+    assert "the verification of version" in statuses["glance"]
+    assert statuses["redesign"].endswith("are asked; the fallback set is sent")
 
 
 @pytest.mark.slow
 def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelRegistry, monkeypatch) -> None:
-    queue, update, asked = begun(fleet)
+    queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
-        queue.give(asked)
+        queue.give(queued)
     back = sent(queue.window(1, update.version))
     queue.applied(back)
     looked_up, made = [], []
@@ -178,13 +178,13 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelR
 
 
 def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry, monkeypatch) -> None:
-    queue, _, asked = begun(fleet)
-    question = decode_request(asked.body)
+    queue, _, queued = begun(fleet)
+    question = decode_request(queued.body)
     law = question.setting.controller.replace(Kp=2.0 * question.setting.controller.Kp)
     other = msgspec.structs.replace(question, setting=replace(question.setting, controller=law))
     failing(monkeypatch)
     before = queue.state
-    outcome = queue.give(asked._replace(body=msgspec.msgpack.encode(other)))
+    outcome = queue.give(queued._replace(body=msgspec.msgpack.encode(other)))
     assert kinds(outcome) == ["proof"]
     assert outcome.evidence[0].status == "not verified: another setting is in force by now"
     assert queue.state == before
@@ -194,10 +194,10 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegist
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
     assert kinds(quiet) == ["glance"]
-    told = Fallback(
+    notice = Fallback(
         "axis", update.window[0], 1000, Cause.ERROR, 1.0, 0.5, update.version, update.version + 1, Setting(0.0)
     )
-    queue.give(told)
+    queue.give(notice)
     outcome = queue.window(2, update.version + 1)
     assert "estimate" in kinds(outcome)
     assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
@@ -214,24 +214,24 @@ def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Mod
 
 
 def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
-    queue, _, asked = begun(fleet)
+    queue, _, queued = begun(fleet)
     before = queue.state
-    outcome = queue.give(asked._replace(body=b"\x93"))
+    outcome = queue.give(queued._replace(body=b"\x93"))
     assert outcome.evidence[0].status.startswith("failed: InvalidInput: the verification request is not understood")
     assert queue.state == before
 
 
 def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
-    queue, _, asked = begun(fleet)
+    queue, _, queued = begun(fleet)
     model = replace(fleet.models[0], settings=SETTINGS)
     queue.fleet = replace(fleet, models=(model,))
-    assert "no table is used any more" in queue.give(asked).evidence[0].status
+    assert "the twin uses no table any more" in queue.give(queued).evidence[0].status
 
 
 def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:
-    _, _, asked = begun(fleet)
-    question = decode_request(asked.body)
+    _, _, queued = begun(fleet)
+    question = decode_request(queued.body)
     assert isinstance(question, VerificationRequest)
-    assert msgspec.msgpack.encode(question) == asked.body
+    assert msgspec.msgpack.encode(question) == queued.body
     policy = certified_policy(SERVO, fleet.models[0].settings)
     assert isinstance(policy.confirm(question.region, question.setting), Certificate)

@@ -7,11 +7,13 @@ import sys
 import zlib
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from exploration import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin import messages
@@ -27,7 +29,7 @@ from servotwin.twin.estimating import DecodedWindow, TrendState
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.work import GIVEN_UP, ONE_BY_ONE, work
+from servotwin.twin.work import ABANDON_AFTER, ONE_BY_ONE, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=65.0, name="axis")
 START = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
@@ -120,7 +122,7 @@ def test_and_in_another_process():
         "said = o.state, o.outgoing, [row._replace(context='') for row in o.evidence]\n"
         "print(hashlib.sha256(repr(said).encode()).hexdigest())"
     )
-    paths = os.pathsep.join((".", "tests", "tests/twin"))
+    paths = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
     seen = {
         subprocess.run(
             [sys.executable, "-c", script],
@@ -172,17 +174,17 @@ SPOILT = {
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", SPOILT)
 def test_what_cannot_be_used_is_evidence_and_the_rest_goes_on(kind):
-    spoilt, said = SPOILT[kind]
+    spoilt, error_name = SPOILT[kind]
     outcome = work(fleet(), claim(windows()[0], spoilt, windows()[1]), 0.0)
     assert outcome.done == (1, 2, 3)
-    assert statuses(outcome)[1].startswith(f"failed: {said}: ")
+    assert statuses(outcome)[1].startswith(f"failed: {error_name}: ")
     assert kinds(outcome, 2) == ["estimate"]
     without = work(fleet(), claim(windows()[0], windows()[1]), 0.0)
     assert (outcome.outgoing, statuses(outcome)[::2]) == (without.outgoing, statuses(without))
 
 
 @given(st.binary(max_size=300), st.sampled_from(["", DEFLATE, ZSTD, "gzip"]))
-@settings(max_examples=200)
+@examples(200)
 def test_no_bytes_make_it_fail(body, encoding):
     outcome = work(fleet(), claim((body, encoding)), 0.0)
     assert outcome.done == (1,)
@@ -206,7 +208,7 @@ def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkey
     assert (outcome.state, outcome.outgoing) == (right.state, right.outgoing)
 
 
-def test_an_overdue_update_is_sent_again_then_given_up():
+def test_an_overdue_update_is_sent_again_then_abandoned():
     first = work(fleet(), claim(windows()[1]), 100.0)
     state, sent = first.state, first.outgoing
     for now, expected, wake in ((104.9, (), 105.0), (105.0, sent, 110.0), (110.0, sent, 115.0), (115.0, (), None)):
@@ -291,7 +293,7 @@ def test_a_servo_without_a_model_fails_without_a_word_to_it():
     outcome = work(lost, claim(windows()[0], state=b"kept", serial=3), 0.0)
     assert (outcome.state, outcome.serial, outcome.done, outcome.wake) == (b"kept", 3, (1,), None)
     assert statuses(outcome) == [
-        "failed: servo 'axis' has no model: [servos] names it neither by itself nor by a pattern"
+        "failed: servo 'axis' has no model: [servos] has neither its name nor a pattern that fits"
     ]
 
 
@@ -301,17 +303,20 @@ def test_a_twin_that_is_switched_off_leaves_windows_as_they_are():
     assert outcome.done == tuple(range(1, len(windows()) + 1))
 
 
-def test_what_kills_its_workers_is_found_and_given_up():
+def test_what_kills_its_workers_is_found_and_abandoned():
     sent = windows()[:2]
     assert work(fleet(), claim(*sent, attempts=ONE_BY_ONE - 1), 0.0).done == (1, 2)
     alone = work(fleet(), claim(*sent, attempts=ONE_BY_ONE), 0.0)
     assert (alone.done, statuses(alone)) == ((1,), ["ok"])
-    given_up = work(fleet(), claim(*sent, attempts=GIVEN_UP), 0.0)
-    assert (given_up.done, statuses(given_up)) == ((1,), [f"failed: given up, as {GIVEN_UP - 1} workers died of it"])
+    abandoned = work(fleet(), claim(*sent, attempts=ABANDON_AFTER), 0.0)
+    assert (abandoned.done, statuses(abandoned)) == (
+        (1,),
+        [f"failed: abandoned, because {ABANDON_AFTER - 1} workers died while they processed it"],
+    )
     pending = work(fleet(), claim(windows()[1]), 0.0)
-    kept = work(fleet(), claim(windows()[2], state=pending.state, attempts=GIVEN_UP), 1.0)
+    kept = work(fleet(), claim(windows()[2], state=pending.state, attempts=ABANDON_AFTER), 1.0)
     assert (kept.state, kept.wake) == (pending.state, 5.0)
-    quiet = work(fleet(), claim(state=pending.state, attempts=GIVEN_UP), 100.0)
+    quiet = work(fleet(), claim(state=pending.state, attempts=ABANDON_AFTER), 100.0)
     assert (quiet.state, quiet.wake, quiet.outgoing) == (pending.state, None, ())
 
 

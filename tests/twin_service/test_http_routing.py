@@ -6,7 +6,8 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
+from exploration import examples
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from service_system import OPERATOR, OTHER, TOKEN, served, twin_file, window
 
@@ -68,7 +69,7 @@ async def answered(app: Any, scope: dict[str, Any], parts: list[bytes]) -> tuple
 
 @pytest.mark.slow
 @given(st.lists(requests(), min_size=1, max_size=40))
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@examples(15, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory, requested):
     async def body() -> None:
         async with served(twin_file(tmp_path_factory.mktemp("twin"))) as (service, _):

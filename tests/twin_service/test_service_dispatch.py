@@ -63,7 +63,7 @@ def done(system, servo="ax-1"):
 def statuses(system, servo="ax-1"):
     """Of each window by its sequence: what was found of it."""
     links = system.store.audit(servo, limit=1000)
-    return {link.window.sequence: [result.status[:8] for result in link.found] for link in links}
+    return {link.window.sequence: [result.status[:8] for result in link.evidence] for link in links}
 
 
 @pytest.mark.slow

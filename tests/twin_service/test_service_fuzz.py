@@ -6,7 +6,8 @@ import zlib
 import httpx
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, example, given, settings
+from exploration import examples
+from hypothesis import HealthCheck, example, given
 from hypothesis import strategies as st
 from schemathesis.checks import not_a_server_error
 from service_system import SERVO, bearer, hello, place, process, served, twin_file, window
@@ -43,7 +44,7 @@ def raw(_context, value):
 
 @pytest.mark.slow
 @given(st.data())
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@examples(120, deadline=None, suppress_health_check=list(HealthCheck))
 def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
     case = data.draw(st.one_of([result.ok().as_strategy() for result in described.get_all_operations()]))
@@ -81,7 +82,7 @@ def bodies(draw):
     ),
 )
 @example(body=zlib.compress(bytes(40_000_000)), sent="", declared="deflate", path=place(window(0)))
-@settings(max_examples=200, deadline=None)
+@examples(60, deadline=None)
 def test_bodies_and_encodings(url, body, sent, declared, path):
     headers = {"content-encoding": declared} if declared else {}
     method = "PUT" if "windows" in path else "POST"
@@ -110,7 +111,7 @@ def test_decompression_gives_no_more_than_is_allowed(data, encoding, whole):
 
 @pytest.mark.slow
 @given(st.text(max_size=100), st.text(max_size=40))
-@settings(max_examples=25, deadline=None)
+@examples(25, deadline=None)
 def test_headers_and_queries(tmp_path_factory, header, query):
     """In this process, with tokens: nothing gets in, nothing breaks."""
     path = tmp_path_factory.mktemp("twin")

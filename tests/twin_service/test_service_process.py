@@ -34,6 +34,7 @@ from service_system import (
     window,
 )
 
+from servotwin.errors import InvalidInput
 from servotwin.messages import encode
 from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
@@ -219,39 +220,39 @@ def test_tls_with_a_self_made_certificate(tmp_path):
             client.get("/healthz")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("service", "tokens", "expected"),
+    ("more", "tokens", "expected"),
     [
         ('bind = "0.0.0.0"', False, "this requires tokens"),
         ('bind = "0.0.0.0"', True, "behind_proxy"),
         ('bind = "elsewhere"', True, "IP address"),
         ('store = "postgresql://me:secret@host/twin"', True, "store_password_file"),
         ('tls_key = "no.key"', True, "no.key"),
-        ("prot = 3", True, "did you mean 'port'"),
         ("queue = 0", True, "at least 1"),
     ],
 )
-def test_a_file_that_is_not_allowed_is_one_sentence_and_2(tmp_path, service, tokens, expected):
-    path = twin_file(tmp_path, service, tokens)
-    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert expected in result.stderr
-    assert "secret" not in result.stderr
-    assert result.stderr.count("\n") == 1
+def test_a_file_that_is_not_allowed_is_refused_before_a_store_is_made(tmp_path, monkeypatch, more, tokens, expected):
+    path = twin_file(tmp_path, more, tokens)
+    for name in ("configure_logging", "raise_descriptor_limit"):
+        monkeypatch.setattr(service, name, lambda *_: None)
+    monkeypatch.setattr(service, "HttpServer", lambda *_: pytest.fail("it serves"))
+    with pytest.raises(InvalidInput, match=expected) as refused:
+        service.run(path)
+    assert "secret" not in str(refused.value)
+    assert "\n" not in str(refused.value)
     assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
 @pytest.mark.slow
-def test_tokens_that_others_may_read_are_refused(tmp_path):
-    path = twin_file(tmp_path)
-    (tmp_path / "tokens.toml").chmod(0o644)
+def test_a_file_with_an_unknown_key_is_one_sentence_and_2(tmp_path):
+    path = twin_file(tmp_path, "prot = 3")
     command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert result.returncode == 2
-    assert "chmod 600" in result.stderr
+    assert result.stdout == ""
+    assert "did you mean 'port'" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
 @pytest.mark.slow

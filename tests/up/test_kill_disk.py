@@ -31,11 +31,16 @@ def fault(kind: str, disk: Disk, process: Process) -> Iterator[None]:
         disk.remount("rw")
 
 
-def finish(fleet: Fleet) -> None:
+def delivered(fleet: Fleet) -> bool:
+    """True once no window waits; a twin that gave up on a read-only disk, at once or only now, is started again."""
     if not fleet.twin.running:
         fleet.twin.start()
+    return pending(fleet) == 0
+
+
+def finish(fleet: Fleet) -> None:
     fleet.stop_machines()
-    until(lambda: pending(fleet) == 0, lambda: logs(fleet))
+    until(lambda: delivered(fleet), lambda: logs(fleet))
     assert set(end_all(fleet.edges.values())) == {0}
     assert fleet.twin.end() == 0
 

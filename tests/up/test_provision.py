@@ -189,7 +189,7 @@ def test_an_operator_s_token_replaces_no_file_that_is_there(tmp_path):
     before = twin.read_text()
     refused = run("enroll", "boss", "--operator", twin, "--twin", twin)
     assert refused.exit_code == 2
-    assert "is there already" in refused.stderr
+    assert "exists already" in refused.stderr
     assert twin.read_text() == before
 
 

@@ -41,7 +41,7 @@ def started(path: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
             os.kill(pid, signal.SIGKILL)
 
 
-def told(process: subprocess.Popen[str], what: str) -> list[str]:
+def lines_until(process: subprocess.Popen[str], what: str) -> list[str]:
     """The lines up to the one that says it."""
     assert process.stdout is not None
     lines = []
@@ -92,7 +92,7 @@ def stored(path: Path) -> dict[str, set[str]]:
 def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path: Path) -> None:
     path = tmp_path / "up"
     with started(path, "--for", "5", "--speed", "10") as first:
-        lines = told(first, "all processes have ended")
+        lines = lines_until(first, "all processes have ended")
         assert first.wait(PATIENCE_S) == 0
     assert "made: " in lines[0]
     [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
@@ -105,7 +105,7 @@ def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path
     assert {file.stat().st_mode & 0o777 for file in secrets} == {0o600}
 
     with started(path, "--speed", "10") as second:
-        lines = told(second, RUNNING)
+        lines = lines_until(second, RUNNING)
         assert sum(line.startswith("continuing with") for line in lines) == len(SERVOS)
         refused = subprocess.run(
             [sys.executable, "-m", "servotwin", "up", "--folder", str(path)],
@@ -118,9 +118,9 @@ def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path
         second.kill()
         second.wait()
         with started(path, "--speed", "10") as third:
-            told(third, RUNNING)
+            lines_until(third, RUNNING)
             third.send_signal(signal.SIGINT)
-            assert "all processes have ended" in told(third, "all processes have ended")[-1]
+            assert "all processes have ended" in lines_until(third, "all processes have ended")[-1]
             assert third.wait(PATIENCE_S) == 0
     assert eventually(lambda: not left_behind(path))
     assert all(after > former + 5.0 for former, after in zip(before, times(path), strict=True))

@@ -171,7 +171,7 @@ def test_a_signal_from_a_time_on_is_the_same_later(begin: float, time: float) ->
 @pytest.mark.parametrize("text", ["", "{}", '{"schema": "other"}', "\xff", '{"time_s": -1}'])
 def test_an_invalid_state_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "state.json").write_text(text, encoding="latin-1")
-    with pytest.raises(InvalidInput, match=r"state\.json: is no state of a machine"):
+    with pytest.raises(InvalidInput, match=r"state\.json: holds no machine state"):
         read_state(tmp_path / "state.json")
 
 
@@ -273,5 +273,5 @@ def test_a_truth_outside_of_the_interval_is_marked() -> None:
 
 
 def test_files_of_a_machine_belong_to_one_that_runs_on(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="run on"):
+    with pytest.raises(InvalidInput, match="allowed only with speed > 0"):
         replace(machine(tmp_path), speed=0.0)

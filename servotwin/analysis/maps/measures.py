@@ -20,6 +20,7 @@ from servotwin.hybrid.ensemble import run_ensemble
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.simulation.continuous import controller_constants
+from servotwin.simulation.ensemble import start_modes
 
 # Half-width about the final position, per reference step: the usual five per cent.
 SETTLING_BAND = 0.05
@@ -81,7 +82,7 @@ def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Arr
     """Position (m) and voltage (V), each (cells, members, samples)."""
     loop = automaton(settings)
     states = starts(settings, loop, cells, chunk).reshape(-1, len(loop.automaton.names))
-    modes, rows = _modes(settings, loop, states), np.array([loop.rows["position"], loop.rows["voltage"]])
+    modes, rows = start_modes(loop, states, settings.law.enter), np.array([loop.rows["position"], loop.rows["voltage"]])
     try:
         traces, _ = run_ensemble(
             loop.automaton, states, modes, 1.0 / settings.sample_rate, settings.samples, rows, threads=1
@@ -129,13 +130,6 @@ def _draws(settings: MapSettings, cell: int) -> Array:
     draws[0] = 0.0
     draws[1::2, 1:] = 0.0
     return draws
-
-
-def _modes(settings: MapSettings, loop: ServoAutomaton, states: Array) -> NDArray[np.int64]:
-    """(K,) modes at time 0: closed, unless the error is already small enough to open the loop."""
-    error = states @ loop.rows["error"][0]
-    inside = np.abs(error) <= settings.law.enter * states[:, loop.automaton.index("tolerance")]
-    return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))
 
 
 def _reduced(settings: MapSettings, step: Array, position: Array, voltage: Array) -> Measures:

@@ -212,7 +212,7 @@ def _curves(result: StabilityMap, across: _PictureAxis) -> Figure:
     axes[3, 0].set(ylabel="voltage\n(V rms)", xlabel=across.label)
     if across.logarithmic:
         axes[3, 0].set_xscale("log")
-    style.letter(axes[:, 0].tolist())
+    style.label_panels(axes[:, 0].tolist())
     return figure
 
 

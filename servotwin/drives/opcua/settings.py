@@ -24,10 +24,10 @@ class OpcUaSettings:
     user, password : str, optional
         Both or neither; without certificates on this machine only, since the password would be read on its way.
     certificate, private_key, server_certificate : Path, optional
-        All or none, PEM or DER: what is said is signed and encrypted (Basic256Sha256), and the server must hold the
+        All or none, PEM or DER: messages are signed and encrypted (Basic256Sha256), and the server must hold the
         private key of its certificate.
     poll_s : float
-        s from one look at the samples to the next; the rings must hold several times as much.
+        Interval between two readings of the samples, s; the rings must hold several times as much.
     silence_s : float
         s without an answer, or a new sample, after which the drive counts as lost.
     """

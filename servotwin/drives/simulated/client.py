@@ -1,4 +1,4 @@
-"""The client of a simulated machine, in both roles; standard library only."""
+"""Clients of a simulated machine, one for each role; standard library only."""
 
 import socket
 import sys
@@ -39,7 +39,7 @@ class _MachineConnection:
     """
 
     def __init__(self, address: str, role: str, silence: float) -> None:
-        self._address, self._role, self._silence = wire.address_of(address), role, silence
+        self._address, self._role, self._silence = wire.parse_address(address), role, silence
         self._socket: socket.socket | None = None
         self.welcome = _Welcome(0.0, "")
 
@@ -47,10 +47,10 @@ class _MachineConnection:
         """Connect to the machine, at first or again."""
         self.close()
         self._socket = wire.new_socket(self._address)
-        wire.patient(self._socket, self._silence)
-        wire.at_once(self._socket)
+        wire.set_timeout(self._socket, self._silence)
+        wire.disable_nagle(self._socket)
         try:
-            self._socket.connect(wire.place(self._address))
+            self._socket.connect(wire.socket_address(self._address))
             self._socket.sendall(wire.HELLO.pack(wire.MAGIC, wire.VERSION, wire.ROLES[self._role]))
             answer = wire.receive(self._socket, wire.WELCOME.size)
         except OSError as error:
@@ -87,7 +87,7 @@ class _MachineConnection:
         return self._socket
 
     def lost(self, error: OSError) -> DriveLost:
-        """Close the connection, and make the error to raise."""
+        """Close the connection, and return the error to raise."""
         self.close()
         reason = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
         return DriveLost(f"machine {self._address}: {reason}")
@@ -117,17 +117,17 @@ class SimulatedControl:
 
     @property
     def rate(self) -> float:
-        """Hz."""
+        """Samples per second of machine time, Hz."""
         return self._connection.welcome.rate
 
     @property
     def machine(self) -> str:
-        """The machine's present run."""
+        """Name of the machine's present run."""
         return self._connection.welcome.machine
 
     @property
     def lag(self) -> float:
-        """s behind its pace."""
+        """Time by which the machine is behind its pace, s."""
         return self._lag
 
     def connect(self) -> None:
@@ -136,7 +136,7 @@ class SimulatedControl:
         self._voltage_due = False
 
     def read(self) -> DriveSample | None:
-        """Return the next sample; where the last one was not answered the voltage holds."""
+        """Wait for the next sample; if the last one was not answered, the voltage holds."""
         if self._voltage_due:
             self.write(nan)
         number, reference, theta_m, position, self._lag = wire.SAMPLE.unpack(self._connection.receive(wire.SAMPLE.size))
@@ -152,14 +152,14 @@ class SimulatedControl:
             self._connection.send(wire.VOLTAGE.pack(voltage))
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection; the machine runs on."""
         self._connection.close()
 
 
 class SimulatedSupervised:
     """`edge.drive.SupervisedDrive` of a simulated machine; parameters as of `SimulatedControl`.
 
-    Reconnected to the same run of the machine it goes on with the sample that is due, as long as the machine has it.
+    After a reconnection to the same run it continues with the next sample, if the machine still has it.
     """
 
     can_move, patient = True, False
@@ -171,21 +171,21 @@ class SimulatedSupervised:
 
     @property
     def rate(self) -> float:
-        """Hz."""
+        """Samples per second of machine time, Hz."""
         return self._connection.welcome.rate
 
     @property
     def machine(self) -> str:
-        """The machine's present run."""
+        """Name of the machine's present run."""
         return self._connection.welcome.machine
 
     @property
     def lag(self) -> float:
-        """s behind its pace."""
+        """Time by which the machine is behind its pace, s."""
         return self._lag
 
     def connect(self) -> None:
-        """Connect to the machine; in a new run of it reading begins with the present sample."""
+        """Connect to the machine; where it was restarted, reading begins with the present sample."""
         before = self.machine
         self._connection.connect()
         if self.machine != before:
@@ -219,7 +219,7 @@ class SimulatedSupervised:
         self._request(wire.MOVE, 0, (offset, *_NO_GAINS))
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection; the machine runs on."""
         self._connection.close()
 
     def _request(

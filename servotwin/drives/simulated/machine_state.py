@@ -1,4 +1,4 @@
-"""Files of a simulated machine: its state (time and gap) and the speed that it is asked for."""
+"""Files of a simulated machine: its state (time and gap) and the speed that it is set to."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import msgspec
 from servotwin.errors import InvalidInput
 from servotwin.runtime.files import replace_file
 
-MOST_SPEED = 1e4
-_LONGEST = 64
+MAX_SPEED = 1e4
+_MAX_BYTES = 64
+"""Of a speed file: a longer one holds no number, and is not read whole."""
 
 
 class MachineState(msgspec.Struct, frozen=True, tag="servotwin-machine/1", tag_field="schema", kw_only=True):
@@ -25,7 +26,7 @@ class MachineState(msgspec.Struct, frozen=True, tag="servotwin-machine/1", tag_f
     gap_deg : float
         Total gap.
     speed : float
-        Seconds of machine time per second that it is told to keep.
+        Seconds of machine time per second that it is set to.
     begun_s : float
         Machine time at the beginning of this run: its sample 0.
     written : float
@@ -40,38 +41,38 @@ class MachineState(msgspec.Struct, frozen=True, tag="servotwin-machine/1", tag_f
 
 
 def read_state(path: str | os.PathLike[str]) -> MachineState | None:
-    """Read the state file; None: there is none.
+    """Read the state file; None where it does not exist.
 
     Raises
     ------
     InvalidInput
-        There is a file, and it is no machine's.
+        The file cannot be read, or holds no state of a machine.
     """
     try:
         state = msgspec.json.decode(Path(path).read_bytes(), type=MachineState)
     except FileNotFoundError:
         return None
     except (OSError, msgspec.MsgspecError) as error:
-        raise InvalidInput(f"{path}: is no state of a machine ({error}); without this file it begins anew") from None
+        raise InvalidInput(f"{path}: holds no machine state ({error}); delete it to begin anew") from None
     if not (0.0 <= state.time_s < math.inf):
         raise InvalidInput(f"{path}: time_s = {state.time_s!r} s: must be finite and 0 or more")
     return state
 
 
 def write_state(path: Path, state: MachineState) -> None:
-    """Replace the state file, whole or not at all; raises OSError."""
+    """Replace the state file atomically; raises OSError."""
     replace_file(path, msgspec.json.format(msgspec.json.encode(state)) + b"\n")
 
 
 def read_speed(path: Path) -> float | None:
-    """Read the speed asked for; None: the file holds none, and the present speed stays."""
+    """Read the speed file; None where it holds no allowed speed, so that the present one stays."""
     try:
-        speed = float(path.read_bytes()[:_LONGEST])
+        speed = float(path.read_bytes()[:_MAX_BYTES])
     except (OSError, ValueError):
         return None
-    return speed if 0.0 < speed <= MOST_SPEED else None
+    return speed if 0.0 < speed <= MAX_SPEED else None
 
 
 def write_speed(path: Path, speed: float) -> None:
-    """Ask a machine for a speed; raises OSError."""
+    """Set the speed of a machine through its speed file; raises OSError."""
     replace_file(path, f"{speed!r}\n".encode())

@@ -21,27 +21,28 @@ class Pace:
 
     def __init__(self, rate: float, speed: float, slack: float, now: float, first: int = 0) -> None:
         self._rate, self._slack = rate, slack
-        self._every, self._speed = 1.0 / (rate * speed), speed
-        self._zero = now - first * self._every
+        self._interval, self._speed = 1.0 / (rate * speed), speed
+        self._origin = now - first * self._interval
 
     def change(self, speed: float, now: float) -> None:
         """Change the speed from now on."""
-        passed = (now - self._zero) / self._every
-        self._every, self._speed = 1.0 / (self._rate * speed), speed
-        self._zero = now - passed * self._every
+        # The origin moves with the speed, so that the sample that is due now is due now at the new speed too.
+        elapsed = (now - self._origin) / self._interval
+        self._interval, self._speed = 1.0 / (self._rate * speed), speed
+        self._origin = now - elapsed * self._interval
 
     def due(self, number: int) -> float:
         """Time at which a sample is due, s."""
-        return self._zero + number * self._every
+        return self._origin + number * self._interval
 
     def reached(self, now: float) -> int:
         """Number of the last sample that is due."""
-        return math.floor((now - self._zero) / self._every)
+        return math.floor((now - self._origin) / self._interval)
 
-    def keep(self, number: int, now: float) -> float:
+    def catch_up(self, number: int, now: float) -> float:
         """Shift the schedule by a delay beyond the slack; return the delay of a sample taken now, s of machine time."""
         late = now - self.due(number)
         if late > self._slack:
-            self._zero += late - self._slack
+            self._origin += late - self._slack
             late = self._slack
         return max(late, 0.0) * self._speed

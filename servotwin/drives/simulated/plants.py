@@ -1,4 +1,4 @@
-"""The machine behind the drive, without its sockets and clocks."""
+"""Plants of a simulated machine, one for each role, without sockets and clocks."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from servotwin.hybrid.automaton import Array
 from servotwin.messages import Gains
 from servotwin.simulation.endless import OpenLoopPlant
 
-KEPT = 1024
-"""Samples that a machine without a controller remembers: nobody asks for them."""
+_HISTORY = 1024
+"""Samples that the plant in the role control remembers; no reader needs older ones."""
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
 
 
 class ControlledPlant:
-    """A plant that waits for its voltage, sample by sample.
+    """A plant whose voltage a client sets, sample by sample.
 
     Parameters
     ----------
@@ -33,38 +33,38 @@ class ControlledPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._held = OpenLoopPlant(machine.endless(settings.present, KEPT))
-        self._end, self._patience = settings.end, settings.watchdog * settings.rate
-        self._voltage, self._unattended = 0.0, 0
-        self.sample: Callable[[], tuple[float, float, float]] = self._held.sample
+        self._plant = OpenLoopPlant(machine.endless(settings.present, _HISTORY))
+        self._end, self._watchdog = settings.end, settings.watchdog * settings.rate  # both in samples
+        self._voltage, self._without_voltage = 0.0, 0
+        self.sample: Callable[[], tuple[float, float, float]] = self._plant.sample
 
     @property
     def index(self) -> int:
-        """The present sample."""
-        return self._held.index
+        """Number of the present sample."""
+        return self._plant.index
 
     @property
     def over(self) -> bool:
-        """The run has ended."""
-        return self._end is not None and self._held.index >= self._end
+        """True once the run has ended."""
+        return self._end is not None and self._plant.index >= self._end
 
     def tick(self, voltage: float) -> None:
-        """To the next sample under a voltage (V); one that is not finite lets the last one hold."""
+        """Advance to the next sample under a voltage (V); where it is not finite the last one holds."""
         if isfinite(voltage):
             self._voltage = voltage
-        self._unattended = 0
-        self._held.hold(self._voltage)
+        self._without_voltage = 0
+        self._plant.hold(self._voltage)
 
     def run_alone(self) -> None:
-        """To the next sample without the edge: the voltage holds until the watchdog takes it away."""
-        self._unattended += 1
-        if self._unattended > self._patience:
+        """Advance to the next sample without the edge: the last voltage holds until the watchdog sets 0 V."""
+        self._without_voltage += 1
+        if self._without_voltage > self._watchdog:
             self._voltage = 0.0
-        self._held.hold(self._voltage)
+        self._plant.hold(self._voltage)
 
 
 class SampleBlock(NamedTuple):
-    """Samples from `first` on, (4, n), under one version of the parameters."""
+    """Samples from number `first` on, shape (4, n), all under one version of the parameters."""
 
     first: int
     version: int
@@ -72,17 +72,17 @@ class SampleBlock(NamedTuple):
 
     @property
     def last(self) -> int:
-        """The sample after it."""
+        """Number of the sample after the block."""
         return self.first + self.values.shape[1]
 
     def part(self, first: int, most: int) -> SampleBlock:
-        """At most so many samples from one of its own on."""
+        """Return at most `most` samples from number `first` on, which is in the block."""
         begin = first - self.first
         return SampleBlock(first, self.version, self.values[:, begin : begin + most])
 
 
 class SupervisedPlant:
-    """A plant with its own controller, which keeps its samples until they are read or too old.
+    """A plant with its own controller; its samples stay readable until they are older than `retention`.
 
     Parameters
     ----------
@@ -90,48 +90,48 @@ class SupervisedPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._machine = machine.endless(settings.present, wire.MOST)
+        self._machine = machine.endless(settings.present, wire.MAX_SAMPLES)
         self._law, self._end = settings.scenario.law, settings.end
-        self._kept = round(settings.kept * settings.rate)
+        self._retained = round(settings.retention * settings.rate)
         self._blocks: deque[SampleBlock] = deque()
         self.block, self.version = settings.block_samples, 0
 
     @property
     def index(self) -> int:
-        """The present sample."""
+        """Number of the present sample."""
         return self._machine.index
 
     @property
     def over(self) -> bool:
-        """The run has ended."""
+        """True once the run has ended."""
         return self._end is not None and self.index >= self._end
 
     def advance(self, samples: int) -> None:
-        """So many samples on, at most `wire.MOST`, as far as there are any."""
+        """Advance by `samples`, at most `wire.MAX_SAMPLES`, or to the end of the run."""
         first = self.index
         stop = first + samples if self._end is None else min(first + samples, self._end)
         self._machine.advance(stop)
         values = np.array([self._machine.measured(name, first, stop) for name in CHANNELS])
         self._blocks.append(SampleBlock(first, self.version, values))
-        while self._blocks and self._blocks[0].last <= self.index - self._kept:
+        while self._blocks and self._blocks[0].last <= self.index - self._retained:
             self._blocks.popleft()
 
     def read(self, first: int, most: int) -> SampleBlock | None:
-        """Samples from one on, or from the oldest kept; None: there are none yet."""
-        found = None
-        for stretch in reversed(self._blocks):
-            if stretch.last <= first:
+        """Samples from number `first` on, or from the oldest one retained; None where none is there yet."""
+        block = None
+        for earlier in reversed(self._blocks):
+            if earlier.last <= first:
                 break
-            found = stretch
-        return None if found is None else found.part(max(first, found.first), most)
+            block = earlier
+        return None if block is None else block.part(max(first, block.first), most)
 
     def write(self, version: int, tolerance: float, gains: Gains | None) -> None:
-        """Run on these from the present sample on.
+        """Put parameters in force from the present sample on.
 
         Raises
         ------
         InvalidInput
-            They are no parameters of a controller.
+            The controller does not allow them.
         """
         if gains is None:
             self._machine.set_tolerance(tolerance)
@@ -140,7 +140,7 @@ class SupervisedPlant:
         self.version = version
 
     def move(self, offset: float) -> None:
-        """Add this (m) to the reference from the present sample on."""
+        """Add `offset` (m) to the reference from the present sample on."""
         if not isfinite(offset):
             raise InvalidInput(f"offset = {offset!r} m: must be finite")
         self._machine.move(offset)

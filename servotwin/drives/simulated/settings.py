@@ -1,4 +1,4 @@
-"""A simulated machine's TOML: a scenario, and how its drive behaves."""
+"""Settings of a simulated machine, from its TOML file: a scenario, and the behaviour of its drive."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class MachineSettings:
         float,
         key(
             minimum=0.0,
-            help="Seconds of machine time per second; 0: in lock-step, no further than the edge asks for.",
+            help="Seconds of machine time per second; 0: lock-step, the machine advances on request of the edge.",
         ),
     ] = 1.0
-    endless: Annotated[bool, key(help="Run on after the scenario's duration_s, with its gap as it then is.")] = True
+    endless: Annotated[bool, key(help="Run on after the scenario's duration_s with the gap at its end.")] = True
     watchdog: Annotated[
         float,
         key("watchdog_s", minimum=0.0, help="Machine time without a voltage after which it is 0 V; control only."),
@@ -58,28 +58,28 @@ class MachineSettings:
         key(
             "slack_s",
             above=0.0,
-            help="Time by the clock by which the machine may be late, or wait for the edge, and catch up; beyond, the "
-            "edge's tick counts as missed, the machine's time as lost.",
+            help="Longest delay (by the clock) that is caught up. A longer one of the edge is a missed tick, one of "
+            "the machine is lost machine time.",
         ),
     ] = 0.25
     block: Annotated[
         float,
-        key("block_s", above=0.0, help="Machine time in one block where the reader does not say; supervise only."),
+        key("block_s", above=0.0, help="Default length of a block of samples, in machine time; supervise only."),
     ] = 0.05
-    kept: Annotated[
+    retention: Annotated[
         float,
-        key("keep_s", above=0.0, help="Machine time for which samples wait to be read; supervise only."),
+        key("keep_s", above=0.0, help="Machine time for which samples stay readable; supervise only."),
     ] = 10.0
     state_file: Annotated[
         Path | None,
         key(
-            help="File that keeps how long the machine has run; a start goes on wearing from there, from rest and with "
-            "its reference anew."
+            help="File that stores the machine time. A restart continues the wear from there; the machine starts at "
+            "rest, and its reference begins anew."
         ),
     ] = None
     speed_file: Annotated[
         Path | None,
-        key(help="File with a number that goes before speed, at the start and whenever it becomes another."),
+        key(help="File with a number that replaces speed, at the start and whenever the file changes."),
     ] = None
     begin: float = 0.0
 
@@ -87,19 +87,21 @@ class MachineSettings:
         check(self)
         rate, law = self.rate, self.scenario.law.sample_rate
         if law is None:
-            raise InvalidInput("scenario controller sample rate: a machine needs one, in Hz; it has none")
+            raise InvalidInput(
+                "scenario controller sample rate: must be a number in Hz, but the controller is continuous"
+            )
         if self.role == "control" and law != rate:
             raise InvalidInput(f"scenario controller sample rate = {law!r} Hz: must be the recording's, {rate!r} Hz")
-        if not 1 <= self.block_samples <= wire.MOST:
-            raise InvalidInput(f"block_s = {self.block!r} s: must hold 1 to {wire.MOST} samples at {rate!r} Hz")
-        if self.kept < self.block:
-            raise InvalidInput(f"keep_s = {self.kept!r} s: must be at least block_s = {self.block!r} s")
+        if not 1 <= self.block_samples <= wire.MAX_SAMPLES:
+            raise InvalidInput(f"block_s = {self.block!r} s: must hold 1 to {wire.MAX_SAMPLES} samples at {rate!r} Hz")
+        if self.retention < self.block:
+            raise InvalidInput(f"keep_s = {self.retention!r} s: must be at least block_s = {self.block!r} s")
         if (self.state_file or self.speed_file) and not (self.speed > 0.0 and self.endless):
-            raise InvalidInput("state_file and speed_file are for machines that run on: speed > 0 and endless = true")
+            raise InvalidInput("state_file and speed_file are allowed only with speed > 0 and endless = true")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> MachineSettings:
-        """From a TOML file; paths in it are relative to it.
+        """Load from a TOML file; paths in the file are relative to its folder.
 
         Raises
         ------
@@ -114,12 +116,12 @@ class MachineSettings:
             return machine.resumed()
 
     def resumed(self) -> MachineSettings:
-        """As its files say: from where it was, at the speed that is asked for.
+        """Continue from the state file, at the speed of the speed file.
 
         Raises
         ------
         InvalidInput
-            What should be its state is none.
+            The state file holds no state of a machine.
         """
         state = None if self.state_file is None else read_state(self.state_file)
         speed = None if self.speed_file is None else read_speed(self.speed_file)
@@ -127,7 +129,7 @@ class MachineSettings:
 
     @property
     def present(self) -> Scenario:
-        """The scenario from `begin` on, its noise not the same again."""
+        """The scenario from `begin` on, with another seed, so that a restart does not repeat the noise."""
         scenario = self.scenario
         if self.begin == 0.0:
             return scenario
@@ -139,7 +141,7 @@ class MachineSettings:
         return self.gap_when(self.begin + sample / self.rate)
 
     def gap_when(self, time: float) -> float:
-        """Total gap (rad) at a machine time (s), all its runs together."""
+        """Total gap (rad) at a machine time (s), which counts all runs."""
         return float(as_pieces(self.scenario.gap, self.scenario.duration).value(time))
 
     @property
@@ -154,12 +156,12 @@ class MachineSettings:
 
     @property
     def end(self) -> int | None:
-        """Samples in all, the scenario's last instant not included; None: no end."""
+        """Number of samples of the run, without the scenario's last instant; None: endless."""
         return None if self.endless else self.scenario.samples - 1
 
 
 def _scenario(table: Table, folder: Path) -> Scenario:
-    """A preset's name, a file, or a table."""
+    """Read the scenario: a preset's name, a file, or a table."""
     if isinstance(table.values.get("scenario"), dict):
         return Scenario.from_table(table.table("scenario"), folder)
     name = table.text("scenario")
@@ -173,5 +175,5 @@ def _scenario(table: Table, folder: Path) -> Scenario:
 
 def _address(table: Table, folder: Path) -> wire.Address:
     with named(table):
-        address = wire.address_of(table.text("listen"))
+        address = wire.parse_address(table.text("listen"))
     return address if address.path is None else address._replace(path=str(folder / address.path))

@@ -1,4 +1,4 @@
-"""Recording of a simulated machine's state on disk while it runs, between two samples."""
+"""Recorder of a simulated machine's state: between two samples it writes the state file and reads the speed file."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
 
 PERIOD_S = 0.5
-"""Time from one update to the next, by the clock."""
+"""Interval between updates, s by the clock."""
 
 
 class StateRecorder:
-    """Writes a machine's state and reads its speed while it runs; a disk that fails does not stop the machine.
+    """Writes a machine's state and reads its speed while it runs; a failing disk does not stop the machine.
 
     Parameters
     ----------
     settings : MachineSettings
-        Paced by the clock.
+        Of a machine with speed > 0.
     pace : Pace
     now : float
-        By the clock, s.
+        Present time by the clock, s.
     """
 
     def __init__(self, settings: MachineSettings, pace: Pace, now: float) -> None:
@@ -32,7 +32,7 @@ class StateRecorder:
         self._due = now
 
     def update(self, sample: int, now: float) -> None:
-        """Write the state and read the speed, when that is due."""
+        """Write the state and read the speed if `PERIOD_S` has passed since the last time."""
         if now < self._due:
             return
         self._due = now + PERIOD_S
@@ -40,7 +40,7 @@ class StateRecorder:
         self.write(sample)
 
     def write(self, sample: int) -> None:
-        """Write the state, where there is a file for it."""
+        """Write the state if a state file is configured."""
         settings = self._settings
         if settings.state_file is None:
             return

@@ -1,8 +1,9 @@
 """Protocol between a simulated machine and its client: messages of fixed sizes, little-endian.
 
-Client: HELLO, once; machine: WELCOME, once. Then in control the machine sends a SAMPLE at each sample instant and the
-client answers each with a VOLTAGE. In supervise the client sends a REQUEST at a time and the machine answers each with
-a REPLY, which `count` samples follow (signal after signal, doubles) or, where it refuses, `count` bytes of text.
+The client sends HELLO once, and the machine answers WELCOME once. In the role control the machine then sends a SAMPLE
+at each sample instant, and the client answers each with a VOLTAGE. In the role supervise the client sends one REQUEST
+at a time, and the machine answers each with a REPLY; `count` samples follow it (signal after signal, doubles) or, after
+a refusal, `count` bytes of text.
 """
 
 import socket
@@ -17,16 +18,16 @@ ROLES = {"control": CONTROL, "supervise": SUPERVISE}
 HELLO = struct.Struct("<4sHBx")  # magic, version, role
 WELCOME = struct.Struct("<4sHB x8sd")  # magic, version, role; the machine's run, rate in Hz
 SAMPLE = struct.Struct("<qdddd")  # number, reference, theta_m, position, lag in s
-VOLTAGE = struct.Struct("<d")  # V; one that is not finite lets the last one hold
+VOLTAGE = struct.Struct("<d")  # V; where it is not finite the last one holds
 REQUEST = struct.Struct("<BB2xIq8d")  # kind, with gains, most; number or version; tolerance or offset, gains
 REPLY = struct.Struct("<B3xIqqd")  # kind, count; first, version, lag in s
 READ, WRITE, MOVE = 1, 2, 3
 DONE, REFUSED, OVER = 0, 1, 2
 NOW, LAST = -1, -1
-"""Reads from the present sample on; the number of a sample that is none, since the run is over."""
+"""READ with number NOW begins at the present sample; a SAMPLE with number LAST ends the run."""
 
-MOST = 4096
-"""Samples in one block."""
+MAX_SAMPLES = 4096
+"""Largest number of samples in one block: 128 KiB."""
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -42,13 +43,13 @@ class Address(NamedTuple):
         return f"unix:{self.path}" if self.path is not None else f"{self.host}:{self.port}"
 
 
-def address_of(text: str) -> Address:
-    """From "unix:PATH" or "127.0.0.1:PORT".
+def parse_address(text: str) -> Address:
+    """Parse "unix:PATH" or "127.0.0.1:PORT".
 
     Raises
     ------
     InvalidInput
-        It is neither: this protocol knows no password, so it does not leave the machine.
+        It is neither: the protocol has no authentication, so it is limited to this computer.
     """
     kind, _, rest = text.partition(":")
     if kind == "unix" and rest:
@@ -60,38 +61,39 @@ def address_of(text: str) -> Address:
 
 
 def new_socket(address: Address) -> socket.socket:
-    """A socket of the address's family."""
+    """Create a stream socket of the address's family."""
     family = socket.AF_UNIX if address.path is not None else socket.AF_INET6 if ":" in address.host else socket.AF_INET
     return socket.socket(family, socket.SOCK_STREAM)
 
 
-def place(address: Address) -> str | tuple[str, int]:
-    """As `socket` wants it."""
+def socket_address(address: Address) -> str | tuple[str, int]:
+    """Address in the form that `socket` takes."""
     return address.path if address.path is not None else (address.host, address.port)
 
 
-def at_once(connection: socket.socket) -> None:
-    """Send without waiting for more."""
+def disable_nagle(connection: socket.socket) -> None:
+    """Send each message at once: Nagle's algorithm would delay a small one until the last one is acknowledged."""
     if connection.family != socket.AF_UNIX:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-def patient(connection: socket.socket, seconds: float) -> None:
-    """Let receiving and sending give up after a time; 0: never. One system call each, unlike `settimeout`."""
+def set_timeout(connection: socket.socket, seconds: float) -> None:
+    """Limit the time that one send or receive may take, s; 0: no limit."""
+    # Not `settimeout`, which polls before each call: these options keep a tick at one system call each way.
     limit = struct.pack("ll", int(seconds), int(seconds % 1.0 * 1e6))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
 
 
 def receive(connection: socket.socket, size: int) -> bytes:
-    """So many bytes.
+    """Receive `size` bytes.
 
     Raises
     ------
     BlockingIOError
-        Nothing came in time.
+        They did not arrive within the time limit.
     ConnectionError
-        The other end is gone, or stopped within a message.
+        The other end closed the connection, perhaps within a message.
     """
     data = connection.recv(size, socket.MSG_WAITALL)
     if len(data) != size:

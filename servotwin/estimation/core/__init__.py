@@ -1,1 +1,1 @@
-"""Parts that the estimators share: contacts, the structure's response, projection, noise."""
+"""Parts common to the estimators: contacts, response of the structure, projection, noise."""

@@ -62,7 +62,7 @@ class Family:
         return Family(tuple(names), self.system, tuple(self.by[self.names.index(name)] for name in names))
 
     def sampled(self, sample_rate: float, hold: InputHold = InputHold.LINEAR) -> Sampled:
-        """At a sample rate in Hz."""
+        """Discretise at a sample rate (Hz)."""
         interval = 1.0 / sample_rate
         parts = [_discretised(self.system, one, interval, hold) for one in (self.system, *self.by)]
         steps = [parts[0][0], *(derivative for _, derivative in parts[1:])]
@@ -157,6 +157,7 @@ def _exponential(flow: Array, change: Array, step: Array) -> None:
         step[0] += term
         step[1] += slope
     for _ in range(halvings):
+        # The derivative of a square, before the square itself replaces its factor.
         step[1] = multiplied(step[0], step[1]) + multiplied(step[1], step[0])
         step[0] = multiplied(step[0], step[0])
 

@@ -56,6 +56,7 @@ def least_squares(columns: Array, target: Array) -> LeastSquares:
     size = np.sqrt(np.sum(columns * columns, axis=1))
     size[size == 0.0] = 1.0
     scaled = columns / size[:, None]
+    # Columns of length one: the test for dependence must not depend on their units.
     values, vectors = np.linalg.eigh(scaled @ scaled.T)
     good = values > _DEPENDENT_EIGENVALUE * values[-1]
     root = (vectors[:, good] / np.sqrt(values[good])).T

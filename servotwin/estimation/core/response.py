@@ -98,6 +98,7 @@ def response(servo: Servo, sample_rate: float) -> Response:
     drive = np.linalg.solve(shapes, servo.p * (chain.A @ chain.B_velocity + chain.B_position))
     row = chain.C_last
     weight = (row @ shapes) * drive
+    # One of each conjugate pair, with twice its weight: the real part of the sum is the same.
     upper = poles.imag >= 0.0
     poles, weight = poles[upper], weight[upper] * np.where(poles[upper].imag > 0.0, 2.0, 1.0)
     direct = servo.p * float(row @ chain.B_velocity + chain.D[-1])
@@ -115,6 +116,7 @@ def response(servo: Servo, sample_rate: float) -> Response:
 def _modes(matrix: Array) -> tuple[Complex, Complex]:
     """Eigenvalues and eigenvectors; where two modes coincide (critical damping) they are split by a relative 1e-9."""
     poles, shapes = np.linalg.eig(matrix)
+    # Coinciding modes have no complete set of eigenvectors.
     if np.linalg.cond(shapes) > _DEFECTIVE:
         pattern = np.linspace(-_SPLIT, _SPLIT, matrix.size).reshape(matrix.shape)
         poles, shapes = np.linalg.eig(matrix * (1.0 + pattern))
@@ -134,6 +136,7 @@ def _hold(poles: Complex, interval: float) -> tuple[Complex, Complex]:
     series = np.zeros_like(x)
     for order in range(_TERMS, 1, -1):
         series = (1.0 + x * series) / order
+    # exp(x) - 1 - x loses its digits for small x; the 1.0 only avoids a division by zero there.
     far = np.where(np.abs(x) < _SMALL, 1.0, x)
     after = np.where(np.abs(x) < _SMALL, series, (np.exp(far) - 1.0 - far) / far**2)
     return np.asarray(interval * (1.0 + x * after - after)), np.asarray(interval * after)

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from servotwin.hybrid.compiled import bare, compiled, inlined, summed
 from servotwin.plant.signals import Array
@@ -60,6 +59,9 @@ class Autoregression:
         The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
         """
         poles = self.predictors[-1]
+        # Here, because scipy.signal takes most of a second to import and many commands never estimate.
+        from scipy.signal import lfilter
+
         return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])
 
 
@@ -69,6 +71,7 @@ def burg(series: Array, most: int) -> Autoregression:
     The order is at most `most`, and chosen as if there were one series: the others add no information, they only state
     what is not known of it.
     """
+    # One recursion gives the predictors and powers of all orders, so the choice of the order costs nothing more.
     predictors, power = recursion(series, most)
     best = min(range(most + 1), key=lambda order: _criterion(float(power[order]), order, series.shape[1]))
     return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
@@ -98,6 +101,7 @@ def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float =
 def _criterion(power: float, order: int, size: int) -> float:
     """AICc of a Gaussian autoregression; the power itself is one more parameter."""
     count = order + 1
+    # The bound keeps the logarithm finite for a residual that is exactly zero.
     return size * math.log(max(power, 1e-300)) + 2.0 * count * size / max(1, size - count - 1)
 
 
@@ -127,7 +131,7 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
     predictors, power = np.zeros((most + 1, most + 1)), np.zeros(most + 1)
     predictors[0, 0] = 1.0
     power[0] = np.sum(series * series) / (count * size)
-    # A backward error stands where the series begins that it was predicted from: beside its forward error.
+    # A backward error is stored at the first sample of its series: beside the forward error of the same stage.
     forward, backward = series.copy(), series.copy()
     for order in range(1, most + 1):
         across = square = 0.0
@@ -135,6 +139,7 @@ def recursion(series: Array, most: int) -> tuple[Array, Array]:
             one, two = correlation(forward[k, order:], backward[k, : size - order])
             across += one
             square += two
+        # Over all series together; its size is at most 1, so that the predictor is stable.
         reflection = -2.0 * across / square if square > 0.0 else 0.0
         for k in range(count):
             reflect(forward[k, order:], backward[k, : size - order], reflection)

@@ -1,1 +1,1 @@
-"""The gap together with the model's own numbers, and what of the motor can be known at all."""
+"""Joint estimation of gap and model parameters, and the identifiability of the motor's parameters."""

@@ -104,7 +104,10 @@ def descend(evaluate: Evaluate, start: Array, known: ParameterPrior, tolerance: 
 def _step(here: FitPoint, known: ParameterPrior, damping: float) -> Array:
     """The damped Gauss-Newton step of the parameters that are not held by their bounds."""
     downhill = -here.jacobian @ here.residual
+    # A parameter at its bound whose step would leave it is fixed for this step; otherwise it would pull the others
+    # along.
     blocked = ((here.point <= known.lowest) & (downhill < 0.0)) | ((here.point >= known.highest) & (downhill > 0.0))
+    # Scaled columns: the parameters have units of their own, and the damping must treat them alike.
     size = np.linalg.norm(here.jacobian, axis=1)
     free = np.flatnonzero(~blocked & (size > 0.0))
     step = np.zeros_like(here.point)
@@ -139,6 +142,8 @@ def _known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Pa
         rows["current0"] = (-4.0 * current, 4.0 * current, 0.0, current)
         for index in model.jumps:
             area = 0.5 * abs(float(np.diff(model.window.voltage)[index])) / model.rate
+            # The time of the jump is anywhere in the interval: a uniform distribution, whose deviation is the half
+            # width over sqrt(3).
             rows[f"{JUMP}{index}"] = (-area, area, 0.0, area / math.sqrt(3.0))
     return ParameterPrior(*(np.array(column) for column in zip(*(rows[name] for name in model.names), strict=True)))
 

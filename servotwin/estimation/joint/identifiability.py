@@ -191,14 +191,14 @@ def _fitted(theta_m: Array, forced: Array, free: Array) -> Array:
 
 
 def _unknown_input(motor: Sampled, driven: Array, noise: float) -> Identifiability:
-    """Every sample of the voltage is one more unknown, and each is worth a sample of the angle."""
+    """Case with an unknown voltage: each of its samples is an unknown and cancels a sample of the angle."""
     size = min(_SHORT, driven.shape[1])
     pulses = motor.plain(np.eye(size))
     return identifiability(MOTOR, driven[:, :size], np.vstack([motor.free(size), pulses]), noise)
 
 
 def _coasting(motor: Sampled, theta_m: Array, rate: float, noise: float) -> Identifiability:
-    """The motor runs out from the window's greatest speed, its state at the beginning unknown."""
+    """Case of a motor that runs out from the window's largest speed, with an unknown initial state."""
     speed = float(np.abs(np.diff(theta_m)).max()) * rate
     runs = motor.respond(np.zeros(theta_m.size), np.array([0.0, speed, 0.0]))[1:]
     return identifiability(MOTOR, runs, motor.free(theta_m.size), noise)
@@ -207,7 +207,7 @@ def _coasting(motor: Sampled, theta_m: Array, rate: float, noise: float) -> Iden
 def _from_position(
     theta_m: Array, servo: Servo, at: Gap, rate: float, motor: tuple[Array, Array], noise: float
 ) -> tuple[MotorCase, ...]:
-    """Through the gap and the structure: gap, first screw angle and initial states are unknown too."""
+    """Cases with the position, where gap, first screw angle and initial states are unknown as well."""
     structure, screw = structure_family(servo).sampled(rate), contacts(theta_m, at)
     position = structure.respond(screw[SCREW])
     driven, free = (through_gap(columns, theta_m, at) for columns in motor)

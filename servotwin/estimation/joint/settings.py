@@ -25,7 +25,7 @@ class JointSettings:
     Parameters
     ----------
     spreads : mapping
-        What is known of each free parameter beforehand: standard deviation, of the logarithm for "k/m", "c/m", "pitch"
+        Prior standard deviation of each free parameter, of the logarithm for "k/m", "c/m", "pitch"
         and "k_B" (0.1: about 10 %), in rad/s for "gap rate". A parameter may move by four of them.
     hold : InputHold, optional
         Course of the voltage between samples, where the angle is computed from it. By default it is held when the
@@ -37,25 +37,25 @@ class JointSettings:
         float,
         value(
             minimum=0.0,
-            help="Position and angle (or voltage) may be out of step by up to this; 0: they are known to be in step.",
+            help="Largest delay between position and angle (or voltage); 0: they are synchronous.",
         ),
     ] = 2e-3
-    largest_gap_rad: Annotated[float, value(minimum=0.0, help="End of the search.")] = math.radians(60.0)
+    largest_gap_rad: Annotated[float, value(minimum=0.0, help="Largest gap of the search.")] = math.radians(60.0)
     hold: InputHold | None = None
     contact_travel_rad: Annotated[
         float, value(minimum=0.0, help="Least travel of the fitted screw in each contact.")
     ] = math.radians(0.5)
     largest_std_rad: Annotated[
-        float, value(minimum=0.0, help="Estimates with a larger statistical spread are refused.")
+        float, value(minimum=0.0, help="Largest statistical standard deviation of an estimate that is accepted.")
     ] = math.radians(0.25)
     model_error_rad: Annotated[
-        float, value(minimum=0.0, help="Standard deviation for what the model leaves out, in std_total.")
+        float, value(minimum=0.0, help="Standard deviation of unmodelled effects, part of std_total.")
     ] = math.radians(0.02)
     numeric_error_rad: Annotated[
         float,
         value(
             minimum=0.0,
-            help="What sampling and rounding leave, in std already: it counts where there is next to no noise.",
+            help="Error of sampling and rounding, part of std; it matters only where the noise is very small.",
         ),
     ] = math.radians(2e-4)
     unexplained: Annotated[
@@ -72,7 +72,7 @@ class JointSettings:
             help="Factor on standard deviations: the noise's own model is estimated from the same window.",
         ),
     ] = 1.2
-    noise_order: Annotated[int, value(minimum=0, help="Most coefficients of the autoregression that whitens.")] = 30
+    noise_order: Annotated[int, value(minimum=0, help="Largest order of the whitening autoregression.")] = 30
     whitenings: Annotated[int, value(minimum=0, help="Rounds of estimating noise and parameters in turn.")] = 3
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class JointSettings:
             if name not in SPREADS:
                 raise InvalidInput(f"joint spreads {name!r}: allowed are {', '.join(SPREADS)}")
             if isinstance(spread, bool) or not isinstance(spread, int | float) or not 0.0 < spread < math.inf:
-                allowed = "must be a positive number, finite; leave out of `free` what is known"
+                allowed = "must be finite and positive; leave known parameters out of `free`"
                 raise InvalidInput(f"joint spreads {name!r} = {spread!r}: {allowed}")
 
     def spread(self, name: str) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import correlate
 
 from servotwin.estimation.paper.observer import LagFilter, Observer
 from servotwin.hybrid.compiled import compiled
@@ -38,6 +37,9 @@ def standard_deviation(sensitivity: Array, nuisance: Array, residual: Array) -> 
     information = float(left @ left)
     if math.sqrt(information) <= _SINGULAR * math.sqrt(float(sensitivity @ sensitivity)):
         return math.inf
+    # Here, because scipy.signal takes most of a second to import and many commands never fit.
+    from scipy.signal import correlate
+
     shifted = correlate(residual, left, method="fft")
     return math.sqrt(float(shifted @ shifted) / residual.size) / information
 
@@ -103,6 +105,7 @@ class PlayResidual:
         if gap >= 0.0:
             self.screw.subtract_play(self.theta_m, 0.5 * gap, start, residual)
             return residual
+        # The play of a negative gap: the mirror of the screw's motion at the motor's, computed with the positive one.
         mirrored = 2.0 * float(self.theta_m[0]) - start
         self.screw.subtract_play(self.theta_m, -0.5 * gap, mirrored, residual)
         return 2.0 * self._no_gap - residual

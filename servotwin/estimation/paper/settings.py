@@ -22,12 +22,13 @@ class PaperSettings:
     machine works; with "first" the bias nearly vanishes (tests/estimation/test_paper_loop.py).
 
     Even `padding` of one period of the cut-off (250 samples at 5 kHz) lowers the scatter in the paper's noise from 0.2
-    to 0.05 deg (tests/estimation/test_paper_loop.py). `reversals` and `rest_speed` are names of ours (erratum E14).
+    to 0.05 deg (tests/estimation/test_paper_loop.py). The paper does not name `reversals` and
+    `rest_speed` (erratum E14).
     """
 
     alpha: Annotated[float, key("alpha_rad_per_s", above=0.0, help="Poles of the observer are at minus this.")] = 40.0
     settle_s: Annotated[
-        float, key(minimum=0.0, help="What the cost leaves out at the start of a window, k_s T_s in the paper.")
+        float, key(minimum=0.0, help="Start of a window that the cost ignores, k_s T_s in the paper.")
     ] = 0.25
     lowpass_hz: Annotated[
         float | None,
@@ -51,13 +52,16 @@ class PaperSettings:
     ] = "odd"
     padding_samples: Annotated[
         int | None,
-        key(minimum=0, help="Samples of that extension; where absent three times the order, as MATLAB's filtfilt."),
+        key(
+            minimum=0,
+            help="Length of that extension in samples; where absent three times the order, as in MATLAB's filtfilt.",
+        ),
     ] = None
-    iterations: Annotated[int, key(minimum=1, help="Most iterations of the search.")] = 100
-    origin: Annotated[
-        str, key(choices=_ORIGINS, help="Where angles and lengths are counted from: zero, or the first sample.")
-    ] = "absolute"
-    reversals: Annotated[int, key(minimum=0, help="Least number of times that the motor changes direction.")] = 1
+    iterations: Annotated[int, key(minimum=1, help="Largest number of iterations of the search.")] = 100
+    origin: Annotated[str, key(choices=_ORIGINS, help="Origin of angles and positions: zero, or the first sample.")] = (
+        "absolute"
+    )
+    reversals: Annotated[int, key(minimum=0, help="Smallest number of reversals of the motor.")] = 1
     rest_speed: Annotated[
         float, key("rest_speed_rad_per_s", minimum=0.0, help="Speed of the motor below which it counts as at rest.")
     ] = 0.1
@@ -73,7 +77,12 @@ class PaperSettings:
         ),
     ] = math.radians(0.5)
     largest_std: Annotated[
-        float, key("largest_std_deg", minimum=0.0, help="Estimates with a larger statistical spread are refused.")
+        float,
+        key(
+            "largest_std_deg",
+            minimum=0.0,
+            help="Largest statistical standard deviation of an estimate that is accepted.",
+        ),
     ] = math.radians(2.0)
     unexplained: Annotated[
         float,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from servotwin.plant.signals import Array
 
@@ -39,6 +38,9 @@ class ZeroPhase:
 
     def respond(self, signal: Array) -> Array:
         """(n,) filtered signal (n,)."""
+        # Here, because scipy.signal takes most of a second to import and many commands never filter.
+        from scipy.signal import sosfiltfilt
+
         sections = _butterworth(self.order, self.cutoff, self.sample_rate)
         kind = self.padding if self.padding_samples else None
         return np.asarray(sosfiltfilt(sections, signal, padtype=kind, padlen=self.padding_samples))
@@ -46,4 +48,6 @@ class ZeroPhase:
 
 @lru_cache(maxsize=16)
 def _butterworth(order: int, cutoff: float, sample_rate: float) -> Array:
+    from scipy.signal import butter
+
     return np.asarray(butter(order, cutoff, fs=sample_rate, output="sos"))

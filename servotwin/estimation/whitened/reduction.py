@@ -166,6 +166,7 @@ class Reduction:
         reduce = decimation(factor_for(model, theta_m.size))
         rows = reduce.rows(np.asarray(position - position[0])[None])
         largest = max(float(np.abs(position).max()), abs(model.static_gain) * float(np.abs(theta_m).max()))
+        # From the positions as measured: far from the origin their rounding is larger than the motion suggests.
         rounding = _ROUNDING * largest
         return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew, rounding=rounding)
 
@@ -190,6 +191,8 @@ class Reduction:
         columns = [noise.whiten(rows)]
         for row, prior in known.items():
             column = np.zeros((len(rows), 1))
+            # One sample that says: nuisance times 1 / std equals mean / std, with a deviation of 1, as whitened noise
+            # has.
             column[0], column[row] = prior.mean / prior.std, 1.0 / prior.std
             columns.append(column)
         return np.hstack(columns) if known else columns[0]

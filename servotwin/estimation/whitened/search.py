@@ -64,6 +64,7 @@ def descend(
             return SearchResult(point, here, count, True)
         ahead = misfit.slopes(trial)
         if ahead.cost < here.cost:
+            # Levenberg-Marquardt: closer to Gauss-Newton after a success, shorter and steeper steps after a failure.
             point, here, damping = trial, ahead, max(0.1 * damping, 1e-9)
         else:
             damping = 8.0 * damping
@@ -80,6 +81,7 @@ def _step(here: MisfitSlopes, point: Point, damping: float, largest: float, free
     gap_free = free.gap and not ((point.gap <= 0.0 and g < 0.0) or (point.gap >= largest and g > 0.0))
     place_free = free.place and not ((point.place <= -1.0 and h < 0.0) or (point.place >= 1.0 and h > 0.0)) and c > 0.0
     a, c = a * (1.0 + damping), c * (1.0 + damping)
+    # Where gap and place act alike the determinant is rounding: each then steps by itself.
     if gap_free and place_free and a * c - b * b > _FLOOR * a * c:
         determinant = a * c - b * b
         return (c * g - b * h) / determinant, (a * h - b * g) / determinant

@@ -20,17 +20,22 @@ class WhitenedSettings:
     the gap, counts in `std`, and the estimate is that of the gap in the middle of the window.
     """
 
-    passes: Annotated[int, key(minimum=1, help="Fits, each in the noise that the one before left.")] = 4
+    passes: Annotated[
+        int, key(minimum=1, help="Number of fits; each uses the noise model from the residual of the previous one.")
+    ] = 4
     order: Annotated[
         int, key(minimum=1, help="Largest order of the noise's autoregression, at the decimated rate.")
     ] = 60
-    starts: Annotated[int, key(minimum=1, help="Gaps of the first search, from zero to the motor's range.")] = 13
+    starts: Annotated[
+        int, key(minimum=1, help="Number of gaps of the first search, from zero to the motor's range.")
+    ] = 13
     kept: Annotated[
-        int, key(minimum=1, help="Minima of the first search, at a low rate, that are followed at the full rate.")
+        int,
+        key(minimum=1, help="Number of minima of the first search, at a low rate, that are refined at the full rate."),
     ] = 4
     skew: Annotated[bool, key(help="Estimate a delay between the channels.")] = True
     largest_skew: Annotated[
-        float, key("largest_skew_s", minimum=0.0, help="A larger delay between the channels is a fault.")
+        float, key("largest_skew_s", minimum=0.0, help="Largest delay between the channels that is accepted.")
     ] = 5e-3
     gap_rate: Annotated[
         float,
@@ -60,7 +65,10 @@ class WhitenedSettings:
         float, key("contact_travel_deg", minimum=0.0, help="Least travel of the fitted screw in each contact.")
     ] = math.radians(0.5)
     largest_std: Annotated[
-        float, key("largest_std_deg", above=0.0, help="Estimates with a larger statistical spread are refused.")
+        float,
+        key(
+            "largest_std_deg", above=0.0, help="Largest statistical standard deviation of an estimate that is accepted."
+        ),
     ] = math.radians(0.05)
     largest_shift: Annotated[
         float,
@@ -73,7 +81,7 @@ class WhitenedSettings:
     ] = math.radians(0.05)
     model_error: Annotated[
         float,
-        key("model_error_deg", minimum=0.0, help="Standard deviation for what the model leaves out, in std_total."),
+        key("model_error_deg", minimum=0.0, help="Standard deviation of unmodelled effects, part of std_total."),
     ] = math.radians(0.02)
     calibration: Annotated[
         float,

@@ -156,7 +156,7 @@ class CertifiedTable:
 
 
 def cells_of(grid: Grid, stated: Range) -> Iterator[CellIndex]:
-    """All cells, the widest first."""
+    """List all cells, the widest first."""
     widths = grid.levels(stated)
     for level in reversed(range(len(widths))):
         count = 1 if level == len(widths) - 1 else 2 * round((stated[1] - stated[0]) / widths[level]) - 1

@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
@@ -175,6 +174,9 @@ def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """(count, dimensions) in 0 .. 1."""
+    # Here, because scipy.stats takes most of a second to import and many commands never draw machines.
+    from scipy.stats import qmc
+
     # Sobol points are balanced in powers of two only: draw one and keep the first `count`.
     return np.asarray(qmc.Sobol(dimensions, seed=seed).random(2 ** math.ceil(math.log2(max(count, 1))))[:count])
 

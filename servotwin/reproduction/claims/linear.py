@@ -73,7 +73,7 @@ def loop_filter(runs: Runs) -> Finding:
 
 @measures("pidtune")
 def pidtune(runs: Runs) -> Finding:
-    """Without MATLAB only the zeros of the printed gains can be shown."""
+    """Zeros of the printed gains; the rest of the claim needs MATLAB."""
     law = runs.servo.controller
     zeros = np.roots([law.Kp * law.Tf + law.Kd, law.Kp + law.Ki * law.Tf, law.Ki])
     margins = runs.servo.margins()

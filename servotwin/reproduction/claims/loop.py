@@ -127,7 +127,7 @@ def good_enough(runs: Runs, square: Square) -> Finding:
 
 @measures("update-delay")
 def update_delay(runs: Runs) -> Finding:
-    """From each reference change to the tick that takes the update."""
+    """Measure the delay from each reference change to the tick that applies the update."""
     delays = [applied - begin for applied, begin in fig15(runs).applied]
     why = f"{len(delays)} updates took effect {min(delays):.4f} to {max(delays):.4f} s after their reference change"
     reproduced = len(delays) > 0 and all(abs(delay - 3.0) < 0.01 for delay in delays)
@@ -162,7 +162,7 @@ def transmission(runs: Runs) -> Finding:
 
 @measures("router-microseconds")
 def router(_runs: Runs) -> Finding:
-    """No router is simulated."""
+    """Delay of a router, which is not simulated."""
     why = "a simulated link has the delay it is given; a router would have to be measured"
     return Finding(Verdict.CANNOT_BE_CHECKED, why, listed())
 

@@ -53,7 +53,7 @@ def _fig7_plot(d: PlayMotion) -> Figure:
     against.set(xlabel="Motor angle $θ_m$ (deg)", ylabel="Screw angle $θ_d$ (deg)", aspect="equal")
     for axis in (waves.yaxis, against.xaxis, against.yaxis):
         axis.set_major_locator(MultipleLocator(30.0))
-    style.letter((waves, against))
+    style.label_panels((waves, against))
     return figure
 
 
@@ -76,7 +76,7 @@ def _plot_by_gap(d: TraceByGap) -> Figure:
         _angles(row[1], trace)
     style.legend(axes[0, 0])
     style.legend(axes[0, 1])
-    style.letter(axes[0])
+    style.label_panels(axes[0])
     for last in axes[-1]:
         last.set(xlabel="Time (s)", xlim=(0.0, _GAPS_SPAN))
     return figure

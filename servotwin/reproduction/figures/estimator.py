@@ -163,7 +163,7 @@ def plot(windows: Sequence[WindowPanel]) -> Figure:
     figure.colorbar(meshes[0], ax=axes[2, :].tolist(), label="Misfit (µm rms)", location="bottom", aspect=50, pad=0.03)
     axes[0, 1].legend(loc="lower left")
     axes[1, 1].legend(loc="lower left")
-    style.letter(axes[0])
+    style.label_panels(axes[0])
     return figure
 
 

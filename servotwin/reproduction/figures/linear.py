@@ -49,7 +49,7 @@ def _fig4_plot(d: PlantResponses) -> Figure:
     ):
         style.bode(axes[0, column], axes[1, column], d.omega, response, color, f"Magnitude (dB re 1 {unit})")
         axes[0, column].set_title(name)
-    style.letter(axes[0])
+    style.label_panels(axes[0])
     return figure
 
 
@@ -79,7 +79,7 @@ def _fig5_plot(d: ClosedLoopResponses) -> Figure:
         magnitude.axvline(omega, color=style.ORANGE, linewidth=1.0, linestyle=":")
     magnitude.plot([], [], color=style.ORANGE, linestyle=":", label="gain crossovers of the loop")
     style.legend(magnitude)
-    style.letter((step, magnitude))
+    style.label_panels((step, magnitude))
     return figure
 
 

@@ -61,7 +61,7 @@ def _plot(d: ObserverOutputs) -> Figure:
     lower.set(ylabel="Position (mm)", xlabel="Time (s)", xlim=(0.0, SPAN))
     style.legend(upper)
     style.legend(lower)
-    style.letter((upper, lower))
+    style.label_panels((upper, lower))
     return figure
 
 

@@ -97,7 +97,7 @@ def plot(d: PolicyComparison) -> Figure:
     _widen(feedforward, 10.0)
     panels[-1].set(xlabel="Time (s)", xlim=(0.0, float(d.time[-1])))
     panels[-1].xaxis.set_major_locator(MultipleLocator(20.0))
-    style.letter(panels)
+    style.label_panels(panels)
     figure.align_ylabels(panels)
     return figure
 

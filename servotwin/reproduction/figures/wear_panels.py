@@ -22,7 +22,7 @@ def sheet(rows: int) -> tuple[Figure, list[Axes]]:
     panels = list(axes[:, 0])
     panels[-1].set(xlabel="Time (s)", xlim=(0.0, DURATION), ylabel="Total gap (deg)")
     panels[-1].set_xticks(range(0, round(DURATION) + 1, 20))
-    style.letter(panels)
+    style.label_panels(panels)
     figure.align_ylabels(panels)
     return figure, panels
 
