@@ -23,6 +23,8 @@ FINE = 8
 COARSE = 16
 """Intervals of the coarse scale."""
 BLOCK = FINE * COARSE
+# Rounding of a product with a row, of the sum of its terms' sizes, in units of `SIGNIFICANT`.
+_ROUNDING = 0.01
 
 
 class LiftedTables(NamedTuple):
@@ -35,8 +37,7 @@ class LiftedTables(NamedTuple):
     coarse: Array  # S * N * padded(W * (3 * 16 + 1 + N))
     jump_fine: Array  # S * 8 * N * N, transposed: M**j - I
     jump_coarse: Array  # S * 16 * N * N, transposed: M**(8 j) - I
-    sizes: Array  # S * W * N: abs(value rows)
-    changes: Array  # S * N * N, transposed: abs(M - I)
+    sizes: Array  # S * W * N: a watch below this part of abs(z) times `SIGNIFICANT` is rounding
 
 
 class LiftedWorkspace(NamedTuple):
@@ -46,6 +47,7 @@ class LiftedWorkspace(NamedTuple):
     values: Array  # W * N: rows of the watches at a tick
     starts: Array  # W * N: thirds of their slopes over a tick, at its beginning
     ends: Array  # W * N: and at its end, of the state there
+    sizes: Array  # W * N: sizes of all terms that enter a watch
     discrete: Array  # W: 1.0 where the watch counts at ticks only
     inside: Array  # W * N * N: squares of the deviation from the cubic within one tick
     powers: Array  # (8 + 16) * N * N
@@ -65,7 +67,6 @@ def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
         FINE * n2,
         COARSE * n2,
         watches * states,
-        n2,
     )
     return LiftedTables(states, watches, *(aligned(np.zeros(slots * size)) for size in sizes))
 
@@ -73,7 +74,21 @@ def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
 def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:
     """Working memory to fill slots."""
     n, n2 = states, states * states
-    sizes = (n2, watches * n, watches * n, watches * n, watches, watches * n2, 24 * n2, 27 * n, n, n2, n2, n)
+    sizes = (
+        n2,
+        watches * n,
+        watches * n,
+        watches * n,
+        watches * n,
+        watches,
+        watches * n2,
+        24 * n2,
+        27 * n,
+        n,
+        n2,
+        n2,
+        n,
+    )
     return LiftedWorkspace(*(aligned(np.zeros(size)) for size in sizes))
 
 
@@ -143,8 +158,6 @@ def _fill_powers(t: LiftedTables, slot: int, w: LiftedWorkspace) -> None:
         _transpose(n, w.powers, j * n2, t.jump_fine, (slot * FINE + j) * n2)
     for j in range(COARSE):
         _transpose(n, w.powers, first + j * n2, t.jump_coarse, (slot * COARSE + j) * n2)
-    for i in range(n2):
-        t.changes[slot * n2 + i] = abs(t.jump_fine[slot * FINE * n2 + i])
 
 
 @bare
@@ -183,6 +196,8 @@ def _fill_level(t: LiftedTables, table: Array, slot: int, watch: int, intervals:
         for j in range(n):
             column = at + j * stride
             table[column + i] = w.rows[j]
+            size = (slot * t.watches + watch) * n + j
+            t.sizes[size] = max(t.sizes[size], _ROUNDING * abs(w.rows[j]))
             if i < intervals:
                 table[column + intervals + 1 + i] = w.rows[9 * n + j]
             if i > 0:
@@ -239,7 +254,7 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
     _fill_powers(t, slot, w)
     for watch in range(watches):
         for i in range(n):
-            t.sizes[(slot * t.watches + watch) * n + i] = abs(w.values[watch * n + i])
+            t.sizes[(slot * t.watches + watch) * n + i] = w.sizes[watch * n + i]
         for i in range(n2):
             w.sums[i] = w.inside[watch * n2 + i]
         _double(n, 0, w)
@@ -309,19 +324,3 @@ def advance_ticks(
         else:
             advance(t.jump_coarse, (slot * COARSE + clean - 1) * n2, z, change)
     return clean
-
-
-@inlined
-def is_at_rest(t: LiftedTables, slot: int, z: Array, change: Array, sizes: Array) -> bool:
-    """True where a tick changes nothing but rounding."""
-    n2, n = t.states * t.states, np.uint64(t.states)
-    product(t.jump_fine, slot * FINE * n2, t.states, t.states, z, change)
-    for i in range(n):
-        sizes[i] = 0.0
-    for j in range(n):
-        for i in range(n):
-            sizes[i] += t.changes[np.uint64(slot * n2) + j * n + i] * abs(z[j])
-    moving = 0
-    for i in range(n):
-        moving += abs(change[i]) > SIGNIFICANT * sizes[i]
-    return moving == 0

@@ -25,9 +25,8 @@ from servotwin.hybrid.lifted import (
     LiftedWorkspace,
     advance_ticks,
     fill_slot,
-    is_at_rest,
 )
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables
 
 tick = verbatim(law.tick)
 
@@ -36,10 +35,6 @@ KINDS = 3
 """Branches of the limits: neither acts, the voltage limit does, the rate limit does."""
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
-# A segment at rest in slot s is stored as AT_REST - s.
-AT_REST = -2
-# Clean coarse blocks between two questions whether the loop has come to rest.
-_REST_EVERY = 4
 # Search steps per tick from which on blocks of them are quicker than one after the other.
 _MANY_SEARCHES = 6
 
@@ -104,8 +99,8 @@ class LiftedMemory(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a run is: ``at = [tick, mode, active, kind, side of the error, ticks since a switch, blocks since rest was
-    asked for]``; `sign` of the limit that acts."""
+    """Where a run is: ``at = [tick, mode, active, kind, side of the error, ticks since a switch]``; `sign` of the limit
+    that acts."""
 
     at: NDArray[np.int64]
     sign: Array
@@ -323,6 +318,9 @@ def _plant_watch(t: Tables, loop: Loop, places: Places, mode: int, guard: int, m
     for i in range(plant):
         w.values[to + i], w.ends[to + i] = value[i], searches * slope[i]
     _after_tick(places, memory, slope, searches, w.starts[to : to + n])
+    _clear(w.sizes[to : to + n])
+    for i in range(plant):
+        w.sizes[to + i] = t.sizes[(mode * t.guards + guard) * TERMS * plant + i]
     base = guard * n * n
     for i in range(n * n):
         w.inside[base + i] = 0.0
@@ -388,7 +386,7 @@ def fill(t: Tables, loop: Loop, places: Places, mode: int, active: bool, kind: i
         product(w.map, 0, n, n, row, rise)
         for i in range(n):
             rise[i] /= 3.0
-            w.ends[watch * n + i] = rise[i]
+            w.ends[watch * n + i], w.sizes[watch * n + i] = rise[i], abs(row[i])
         for i in range(n * n):
             w.inside[watch * n * n + i] = 0.0
     for i in range(n):
@@ -490,10 +488,6 @@ def advance_block(
             k += clean * FINE
             place.at[5] += clean * FINE
             if clean == wanted:
-                place.at[6] += 1
-                if place.at[6] % _REST_EVERY == 0 and is_at_rest(lifted, slot, z, memory.change, memory.sizes):
-                    note(segments, k, AT_REST - slot, z)
-                    k = end
                 continue
             if clean == 0:
                 segments.size[0] -= 1
@@ -557,8 +551,6 @@ def run_lifted(
         # Another branch may hold for one tick only: blocks begin after two alike.
         alike = at[1] == mode and at[2] == active and at[4] == side and at[3] == kind and place.sign[0] == sign
         at[5] = at[5] + 1 if alike else 0
-        if not alike:
-            at[6] = 0
         at[0] += 1
     return DONE
 
@@ -614,8 +606,6 @@ def sample_lifted(
         if slot == TICKED:
             out[first] = dot(row, 0, z)
             continue
-        resting = slot <= AT_REST
-        slot = AT_REST - slot if resting else slot
         base = slot * BLOCK * n
         if filled[slot] == 0:
             whole = memory.change
@@ -625,13 +615,7 @@ def sample_lifted(
                 whole[j] += row[places.voltage] * memory.voltage_rows[slot * n + j]
             _fill_output(memory.lifted, slot, whole, stride == 1, table[base : base + BLOCK * n])
             filled[slot] = 1
-        if resting:
-            value = 0.0
-            for j in range(n):
-                value += table[base + _at(0, j, n, stride == 1)] * z[j]
-            for sample in range(first, last):
-                out[sample] = value
-        elif stride == 1:
+        if stride == 1:
             product(table, base, BLOCK, last - first, z, out[first:last])
         else:
             for sample in range(first, last):

@@ -153,7 +153,7 @@ class LiftedEngine:
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)
         self.scratch = new_scratch(self.tables)
-        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
+        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0], dtype=np.int64), np.zeros(1))
 
     def advance(self, index: int) -> None:
         """Run from the start to the last sample; `index` must be that one."""
@@ -269,7 +269,7 @@ class LiftedEngine:
                 self.record = grown(self.record)
             elif status == ZENO:
                 self._grow(ZENO)
-        self.place.at[0], self.place.at[1], self.place.at[5], self.place.at[6] = tick + 1, at[1], 0, 0
+        self.place.at[0], self.place.at[1], self.place.at[5] = tick + 1, at[1], 0
 
     def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1, of all samples."""
