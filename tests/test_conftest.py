@@ -39,4 +39,4 @@ def test_clean():
 def test_a_leak_fails_the_test_that_leaks(pytester, request, body, errors):
     pytester.makeconftest((request.path.parent / "conftest.py").read_text())
     pytester.makepyfile(body)
-    pytester.runpytest_subprocess("-p", "no:xdist").assert_outcomes(passed=1, errors=errors)
+    pytester.runpytest_subprocess("-p", "no:xdist", "-p", "no:schemathesis").assert_outcomes(passed=1, errors=errors)

@@ -17,7 +17,7 @@ from servotwin.drives.table import SUPERVISED
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.settings_file import setting_table, start_table
+from servotwin.edge.settings_file import gains_stay_table, setting_table, start_table
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import update_gains_table
 from servotwin.estimation.gap import METHODS
@@ -26,7 +26,7 @@ from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.servo import Servo
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin_service.config import ServiceConfig, mqtt_table
+from servotwin.twin_service.config import ServiceConfig, mqtt_table, store_password_table
 
 HEAD = """# Configuration reference
 
@@ -40,12 +40,6 @@ def _servo(servo: Annotated[str, key(help="A preset, or the path of a servo's TO
     """Servo of a file."""
 
 
-def _gains_stay(
-    gains_stay: Annotated[bool | None, key(help="Leave the gains as they are; true where updates set none.")] = None,
-) -> None:
-    """Switch of a table with gains."""
-
-
 def _machine(
     scenario: Annotated[
         object, key(help="A packaged scenario, the path of one relative to this file, or a table with its keys.")
@@ -55,28 +49,27 @@ def _machine(
     """Keys of a simulated machine."""
 
 
-def _password(
-    store_password_file: Annotated[str | None, key(help="File of mode 0600 with the store's password.")] = None,
-) -> None:
-    """Secret of a store."""
-
-
 _GAINS = Gains.__struct_fields__
 _CHANGED = TableSpec((Controller,), "Changes of the servo's own controller.", partial=True)
-_FALLBACK = TableSpec(
-    (setting_table, FallbackSet, Controller, _gains_stay),
-    "Setting that the edge falls back to; gains that are left out are those of the controller.",
-    only=("tolerance", "band", "silence_s", "refuse_s", "gains_stay", *_GAINS),
+_FALLBACK_HELP = "Setting that the edge falls back to; gains that are left out are those of the controller."
+_FALLBACK_KEYS = ("tolerance", "band", "silence_s", "refuse_s", *_GAINS)
+_SCENARIO_FALLBACK = TableSpec(
+    (setting_table, FallbackSet, Controller), _FALLBACK_HELP, only=_FALLBACK_KEYS, partial=True
+)
+_EDGE_FALLBACK = TableSpec(
+    (setting_table, FallbackSet, Controller, gains_stay_table),
+    _FALLBACK_HELP,
+    only=("gains_stay", *_FALLBACK_KEYS),
     partial=True,
 )
 _START = TableSpec(
-    (setting_table, start_table, Controller, _gains_stay),
+    (setting_table, start_table, Controller),
     "Parameters before the first update.",
-    only=("tolerance", "band", "fallback", "gains_stay", *_GAINS),
+    only=("tolerance", "band", "fallback", *_GAINS),
     partial=True,
 )
 _OWN = TableSpec(
-    (Controller, _gains_stay),
+    (Controller, gains_stay_table),
     "Gains in the middle of the box that updates must stay in; the controller's where absent.",
     only=("gains_stay", *_GAINS),
     partial=True,
@@ -101,7 +94,7 @@ FILES = {
                     (Supervision,),
                     "Supervision by the edge; with this table updates may also set gains.",
                     {
-                        "fallback": _FALLBACK,
+                        "fallback": _SCENARIO_FALLBACK,
                         "probe": TableSpec((ProbeLimits,), "Probing moves of the reference that the twin may request."),
                     },
                 ),
@@ -129,7 +122,7 @@ FILES = {
                 "controller": TableSpec((Controller,), "Controller; needed to control and where updates set gains."),
                 "own": _OWN,
                 "start": _START,
-                "supervision": TableSpec((Supervision,), "Supervision of the loop.", {"fallback": _FALLBACK}),
+                "supervision": TableSpec((Supervision,), "Supervision of the loop.", {"fallback": _EDGE_FALLBACK}),
                 "novelty": TableSpec(
                     (NoveltySettings,), "Filter that selects the windows to send; where absent the edge sends all."
                 ),
@@ -141,7 +134,7 @@ FILES = {
         TableSpec(
             tables={
                 "service": TableSpec(
-                    (ServiceConfig, _password),
+                    (ServiceConfig, store_password_table),
                     "The service.",
                     {"mqtt": TableSpec((mqtt_table,), "Broker over which edges may reach the service as well.")},
                 ),

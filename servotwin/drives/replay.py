@@ -59,7 +59,7 @@ class Replay:
     block_s : float
         Length of a block where the reader gives none, s of the log.
     clock, sleep : callable
-        Returns monotonic seconds; waits for so many seconds.
+        Returns monotonic seconds; waits for a number of seconds.
     """
 
     can_move = False

@@ -117,7 +117,7 @@ class Limits:
         return self.minimum <= tolerance <= self.maximum
 
     def allows_tolerance_step(self, old: float, new: float, since: float) -> bool:
-        """True where the tolerance (m) may change so far, `since` seconds after the last change."""
+        """True where the tolerance (m) may change from old to new, `since` seconds after the last change."""
         return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
 
     def allows_gains(self, gains: Gains, own: Gains) -> bool:
@@ -126,7 +126,7 @@ class Limits:
         return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
-        """True where gains may change so far, `since` seconds after the last change."""
+        """True where gains may change from old to new, `since` seconds after the last change."""
         factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
         if factor == inf:
             return True

@@ -47,6 +47,13 @@ def setting_table(
     return Setting(tolerance, gains, band)
 
 
+def gains_stay_table(
+    gains_stay: Annotated[bool | None, key(help="Leave the gains as they are; true where updates set none.")] = None,
+) -> bool | None:
+    """Return True where a table leaves the gains as they are; None: it does not say."""
+    return gains_stay
+
+
 def start_table(
     setting: Setting,
     fallback: Annotated[bool, key(help="This is the fallback set.")] = False,

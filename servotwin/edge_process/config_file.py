@@ -14,7 +14,13 @@ from servotwin.config.toml import Values, changes, dumps, part, read, values_of
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_given, read_gains, written_gains
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.settings_file import read_start, read_supervision, start_values, supervision_values
+from servotwin.edge.settings_file import (
+    gains_stay_table,
+    read_start,
+    read_supervision,
+    start_values,
+    supervision_values,
+)
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltySettings
@@ -64,7 +70,7 @@ def _agent(table: Table, controller: Controller | None) -> AgentSettings:
     settable = controller if read(table, update_gains_table) else None
 
     def gains(inner: Table) -> Gains | None:
-        stay = inner.boolean("gains_stay", settable is None)
+        stay = read(inner, gains_stay_table)
         return None if stay or settable is None else read_gains(inner, settable)
 
     def start_gains(inner: Table) -> Gains | None:

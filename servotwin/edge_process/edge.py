@@ -60,7 +60,7 @@ class EdgeRuntime:
     first : Parameters, optional
         Parameters stored by an earlier start.
     clock, pause : callable
-        Returns monotonic seconds; waits for so many seconds.
+        Returns monotonic seconds; waits for a number of seconds.
 
     Attributes
     ----------

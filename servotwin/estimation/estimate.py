@@ -48,6 +48,22 @@ class CarriedOffset:
     slope: float
 
 
+@dataclass(frozen=True)
+class MachineReading:
+    """The machine's numbers over the model's after one window, what was known before included.
+
+    Attributes
+    ----------
+    factors : tuple of 3 float
+        Logarithms of the factors on k/m, c/m and pitch.
+    covariance : tuple of 9 float
+        Of these, row by row.
+    """
+
+    factors: tuple[float, ...]
+    covariance: tuple[float, ...]
+
+
 @dataclass(frozen=True, repr=False)
 class GapEstimate:
     """Total gap estimated from one window.
@@ -78,6 +94,8 @@ class GapEstimate:
         Evaluations of the cost.
     offset : OffsetReading or CarriedOffset, optional
         The encoder's offset, read from this window or carried from earlier ones; None: not used.
+    machine : MachineReading, optional
+        The machine's own numbers; None: the model was taken as it is.
     """
 
     gap: float
@@ -93,6 +111,7 @@ class GapEstimate:
     rms: float = math.nan
     evaluations: int = 0
     offset: OffsetReading | CarriedOffset | None = None
+    machine: MachineReading | None = None
 
     def __post_init__(self) -> None:
         # Estimates go into messages and logs, which take plain floats only, not numpy scalars.

@@ -20,6 +20,7 @@ from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -36,6 +37,7 @@ def estimate_carrying(
     prior: float | GapEstimate | None,
     settings: whitened.WhitenedSettings,
     carried: tuple[float, float] | None,
+    machine: FactorPrior | None = None,
 ) -> GapEstimate:
     """Estimate the gap from the window alone, or, where that shows too little, with the offset from earlier windows.
 
@@ -52,20 +54,23 @@ def estimate_carrying(
         With an `offset` of its own, none is carried and none is read.
     carried : (float, float), optional
         Mean and standard deviation of the offset, rad.
+    machine : FactorPrior, optional
+        What is known of the machine's numbers; None: the model is exact.
     """
-    fitted = whitened.fit(window, servo, prior, settings)
+    fitted = whitened.fit(window, servo, prior, settings, machine)
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
     # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
     alone = None if known and fitted.one_sided() else fitted.concluded()
     if alone is not None:
         if settings.offset is None and alone.ok:
-            return replace(alone, offset=read_offset(window, servo, alone, settings))
+            return replace(alone, offset=read_offset(window, fitted.servo, alone, settings))
         if not known or alone.status is GapStatus.MODEL_MISMATCH:
             return alone
     assert carried is not None
-    helped = whitened.estimate(window, servo, prior, replace(settings, offset=carried))
+    aided = whitened.fit(window, servo, prior, replace(settings, offset=carried), machine)
+    helped = aided.concluded()
     if helped.ok and not helped.rms > _WORSE * fitted.rms():
-        slope = _slope(_columns(window, servo, helped, settings))
+        slope = _slope(_columns(window, aided.servo, helped, settings))
         return replace(helped, offset=CarriedOffset(*carried, slope))
     return _refused(alone or fitted.concluded(), helped)
 

@@ -3,7 +3,7 @@ outputs and reduce these to figures."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,9 +108,10 @@ def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
 @bare
 def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Array) -> None:
     """Every output of the run just recorded."""
+    zero: Any = np.int64(0)  # as in run_members
     for o in range(len(traces)):
         sample_segments(
-            0,
+            zero,
             record.size[0],
             record.step,
             record.fraction,
@@ -118,7 +119,7 @@ def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Arr
             record.state,
             output(memory, o),
             stride,
-            0,
+            zero,
             memory.scratch.change,
             traces[o],
         )
@@ -163,6 +164,8 @@ def run_members(
     """Run members at places first .. last - 1 of the order; return the status and the place it concerns. `tail` is the
     number of samples at the end that have figures of their own."""
     t = memory.tables
+    # A literal 0 is a type of its own to numba: all that it is given to would be compiled once more.
+    begin: Any = np.int64(0)
     for place in range(first, last):
         k = starts.order[place]
         a = starts.automaton[k]
@@ -174,10 +177,10 @@ def run_members(
         traces = results.traces[k if len(results.traces) > 1 else 0]
         steps = (traces.shape[1] - 1) * family.stride[a]
         record.size[0] = record.size[1] = 0
-        mode = follow_guards(t, starts.mode[k], memory.state, 0, 0.0, True, record, memory.scratch)
+        mode = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, True, record, memory.scratch)
         if mode < 0:
             return ZENO, place
-        status, _, _, mode = flow_until(t, memory.state, mode, 0, 0.0, steps, 0.0, record, memory.scratch)
+        status, _, _, mode = flow_until(t, memory.state, mode, begin, 0.0, steps, 0.0, record, memory.scratch)
         if status != DONE:
             return status, place
         results.events[k] = record.size[1]

@@ -121,9 +121,7 @@ def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: Output
 def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
     """The output ``rows[m] @ x``, `rows` being (M, n), at every `stride`-th step."""
     outputs = empty_outputs(tables)
-    fill_output(
-        tables, np.ascontiguousarray(rows, dtype=float).ravel(), stride, outputs, new_output_workspace(tables.states)
-    )
+    fill_output(tables, np.array(rows, dtype=float).ravel(), stride, outputs, new_output_workspace(tables.states))
     return outputs
 
 

@@ -210,7 +210,8 @@ class Trajectory:
         r, size = self.record, int(self.record.size[0])
         starts = r.step[:size] + r.fraction[:size]
         segments = np.maximum(np.searchsorted(starts, places, side="right") - 1, 0)
-        rows = np.broadcast_to(np.asarray(rows, dtype=float), (len(self.automaton.modes), len(self.state)))
+        # A writable copy: for read-only or strided rows the function would be compiled once more.
+        rows = np.array(np.broadcast_to(rows, (len(self.automaton.modes), len(self.state))), dtype=float, order="C")
         result = np.empty(len(places))
         evaluate(
             self.tables,

@@ -101,7 +101,7 @@ class ChildProcess:
                     self._process.kill()
 
     def wait(self, seconds: float) -> int:
-        """Wait until it has ended, kill it after so many seconds, and return its exit code."""
+        """Wait until it has ended, kill it after `seconds`, and return its exit code."""
         try:
             return self._process.wait(seconds)
         except subprocess.TimeoutExpired:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
+import msgspec.structs
 import numpy as np
 from msgspec import Meta, Struct
 
@@ -16,13 +17,17 @@ from servotwin.estimation import whitened
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import estimate_gap, settings_of
+from servotwin.estimation.machine import Machine, MachineSettings, nameplate, updated
 from servotwin.estimation.offset import estimate_carrying
 from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED
 from servotwin.twin.settings import TwinSettings
+
+NOT_LEARNING = MachineSettings(learn=False)
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,13 @@ class Expectation:
         rad: the last accepted gap, or the initial gap.
     trend : Trend or None
         The wear as predicted for the middle of the window; None before the first accepted estimate.
+    machine : FactorPrior or None
+        What earlier windows told of the machine's numbers; None: nothing.
     """
 
     previous: float
     trend: Trend | None = None
+    machine: FactorPrior | None = None
 
     @property
     def prior(self) -> float | GapEstimate:
@@ -124,26 +132,47 @@ class Wear(Struct, frozen=True):
         Boot and arrival (s, on the twin's clock) of the last window that changed the trend.
     state : TrendState or None
         None before the first estimate.
+    machine : Machine or None
+        None before a window told of the machine's numbers.
     """
 
     previous: float
     boot: str = ""
     arrived: float = 0.0
     state: TrendState | None = None
+    machine: Machine | None = None
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
         return None if self.state is None else self.state.trend(settings)
 
-    def expect(self, settings: TrendSettings, boot: str, time: float, now: float) -> Expectation:
+    def expect(
+        self, settings: TrendSettings, boot: str, time: float, now: float, learning: MachineSettings = NOT_LEARNING
+    ) -> Expectation:
         """Expectation of a window of `boot` with its middle at `time` (s) that arrived at `now`.
 
         For a window older than the trend it is the present trend, not predicted.
         """
         trend = self._on_clock(settings, boot, time, now)
-        return Expectation(self.previous, trend and trend.predict(max(time, trend.time)))
+        known = self.machine.prior(learning, now) if learning.learn and self.machine is not None else None
+        return Expectation(self.previous, trend and trend.predict(max(time, trend.time)), known)
 
-    def update(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
+    def update(
+        self,
+        settings: TrendSettings,
+        boot: str,
+        estimate: GapEstimate,
+        now: float,
+        learning: MachineSettings = NOT_LEARNING,
+    ) -> tuple[Wear, str]:
+        """Return trend and machine after an estimate, and the reason for which no update may follow; empty: it may."""
+        wear, rejection = self._update_trend(settings, boot, estimate, now)
+        if not learning.learn:
+            return wear, rejection
+        machine = updated(self.machine, learning, estimate, counts=not rejection, now=now)
+        return msgspec.structs.replace(wear, machine=machine), rejection
+
+    def _update_trend(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
         """Return the wear after an estimate, and the reason for which no update may follow from it; empty: it may.
 
         An estimate that is not OK, or older than the trend, changes nothing. An outlier leaves the prediction, with the
@@ -158,7 +187,7 @@ class Wear(Struct, frozen=True):
         counts = after.refused == 0
         previous = float(estimate.gap) if counts else self.previous
         rejection = "" if counts else "; ".join(after.reasons) or "the window is older than the trend"
-        return Wear(previous, boot, now, TrendState.of(after)), rejection
+        return Wear(previous, boot, now, TrendState.of(after), self.machine), rejection
 
     def _on_clock(self, settings: TrendSettings, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
@@ -186,13 +215,22 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     The published estimator starts from the previous gap, as printed. The default one gets the trend's prediction, the
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
-    options = settings_of(settings.method, settings.estimator)
+    options, known = settings_of(settings.method, settings.estimator), settings.uncertainty
+    learns = settings.machine.learn and servo.rigid
+    new = nameplate(settings.machine, known.k, known.c, known.m) if learns else None
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
         if not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
-        drift = options.gap_rate or expected.gap_rate(settings.trend)
-        return estimate_carrying(window, servo, expected.prior, replace(options, gap_rate=drift), expected.offset)
+        growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
+        if new is None or expected.machine is None:
+            return estimate_carrying(window, servo, expected.prior, growing, expected.offset, new)
+        made = estimate_carrying(window, servo, expected.prior, growing, expected.offset, expected.machine)
+        if made.status is not GapStatus.MODEL_MISMATCH:
+            return made
+        # The machine may have been exchanged: its new numbers are then worth knowing, and nothing else yet.
+        other = estimate_carrying(window, servo, None, growing, None, new)
+        return replace(made, machine=other.machine) if other.ok else made
 
     return estimate
 

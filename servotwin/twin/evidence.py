@@ -14,8 +14,9 @@ import numpy as np
 from msgspec import Struct
 
 from servotwin.estimation.disturbance import Disturbance
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -181,15 +182,25 @@ class StoredExpectation(Struct, frozen=True):
 
     previous: float
     trend: TrendState | None
+    machine: MachineReading | None = None
 
     @classmethod
     def of(cls, expected: Expectation) -> StoredExpectation:
         """The numbers of an expectation."""
-        return cls(float(expected.previous), None if expected.trend is None else TrendState.of(expected.trend))
+        trend = None if expected.trend is None else TrendState.of(expected.trend)
+        known = expected.machine
+        if known is None:
+            return cls(float(expected.previous), trend)
+        numbers = MachineReading(tuple(known.mean.tolist()), tuple(known.covariance.ravel().tolist()))
+        return cls(float(expected.previous), trend, numbers)
 
     def expectation(self, settings: TrendSettings) -> Expectation:
         """Make the expectation again, bit for bit."""
-        return Expectation(self.previous, None if self.trend is None else self.trend.trend(settings))
+        trend, numbers = None if self.trend is None else self.trend.trend(settings), self.machine
+        if numbers is None:
+            return Expectation(self.previous, trend)
+        known = FactorPrior(np.array(numbers.factors), np.array(numbers.covariance).reshape(3, 3))
+        return Expectation(self.previous, trend, known)
 
 
 class StoredEstimate(Struct, frozen=True):

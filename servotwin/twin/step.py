@@ -138,6 +138,7 @@ def next_wake(model: TwinModel, state: TwinState) -> float | None:
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
     """Process a window: estimate, redesign, and request."""
     message, arrived, trends = event.window, event.time, model.settings.trend
+    learning = model.settings.machine
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records = DecodedWindow.of(message), list[Record]()
     if model.triage is not None and state.triage is not None and decoded.window is not None:
@@ -149,7 +150,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
             records.append(GlanceRecord(message, glance, decoded.tail))
             if not glance.moved:
                 return StepResult(state, (), tuple(records))
-    expected = state.wear.expect(trends, message.boot, message.middle, arrived)
+    expected = state.wear.expect(trends, message.boot, message.middle, arrived, learning)
     estimate = decoded.estimate(model.estimator, expected)
     disturbed = decoded.disturbance(model.observer)
     records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
@@ -157,7 +158,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
-        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived)
+        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning)
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records.append(TrendRecord(message, trend))

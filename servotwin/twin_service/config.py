@@ -191,10 +191,17 @@ def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os
     return service
 
 
+def store_password_table(
+    store_password_file: Annotated[Path | None, key(help="File of mode 0600 with the store's password.")] = None,
+) -> Path | None:
+    """Return the file with the store's password."""
+    return store_password_file
+
+
 def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[str, str | None]:
     """URL and password of the store; a relative path of SQLite lies in `folder`."""
     url = table.text("store", ServiceConfig.store)
-    file = table.text("store_password_file", None)
+    file = read(table, store_password_table, folder)
     if "://" not in url:
         raise table.invalid("store", "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
     head = url.split("://", 1)[1].split("/", 1)[0]
@@ -203,7 +210,7 @@ def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[
             f"{table.source}: {table.path('store')} holds a password; give it in store_password_file or in the "
             f"environment variable {PASSWORD}"
         )
-    password = environment.get(PASSWORD) if file is None else read_secret(folder / file)
+    password = environment.get(PASSWORD) if file is None else read_secret(file)
     return _sqlite_in(url, folder), password
 
 

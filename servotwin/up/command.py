@@ -42,7 +42,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     speed : float, optional
         Machine time per time; None: as fast as the processor's share allows.
     seconds : float, optional
-        End after so many s; None: when a signal comes.
+        Time after which it ends, s; None: when a signal comes.
     console : Console, optional
 
     Raises

@@ -151,7 +151,7 @@ def test_start_runs_in_processes_of_their_own():
     assert len(catalogue.start(catalogue.Options(slow=True)).contestants) == len(others) + 2
 
 
-def test_slow_contestants_are_asked_for():
+def test_slow_contestants_run_on_request():
     names = [contestant.name for contestant in catalogue.w1(catalogue.Options(quick=True, slow=True)).contestants]
     assert solver.NAME in names
     assert solver.NAME not in [contestant.name for contestant in catalogue.w1(QUICK).contestants]

@@ -56,7 +56,7 @@ def test_a_missed_instant_is_a_missing_number(monkeypatch: pytest.MonkeyPatch) -
     assert (first.number, second.number, drive.missed, drive.overruns) == (0, 3, 2, 1)
 
 
-def test_what_is_longer_than_the_bins_is_told_as_the_longest() -> None:
+def test_a_time_beyond_the_bins_is_reported_as_the_longest() -> None:
     counts = TickHistogram()
     for _ in range(10):
         counts.add(2 * BINS * 1e-6)

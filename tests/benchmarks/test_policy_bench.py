@@ -93,6 +93,6 @@ def test_settled_is_a_share() -> None:
     assert row.settled == 0.5
 
 
-def test_a_file_that_cannot_be_written_is_told_before_anything_runs(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_reported_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="json"):
         policies("", tmp_path / "out.csv", 2, console=Console(quiet=True))

@@ -54,7 +54,7 @@ def test_help_loads_no_numbers_library():
 
 @pytest.mark.slow
 def test_what_only_starts_a_process_imports_no_slow_part_of_scipy():
-    """A second of every start: of each command, each worker and each simulated machine."""
+    """A quarter of the start of each command, each worker and each simulated machine."""
     parts = "{'scipy.stats', 'scipy.signal'}"
     code = f"import sys, servotwin.cli.audit, servotwin.drives.simulated.server; print(*{parts} & set(sys.modules))"
     completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

@@ -80,6 +80,7 @@ def test_the_table_agrees_with_the_cells(finished):
     assert f"{100.0 * np.mean(settled):.1f}" in (finished / "map.txt").read_text()
 
 
+@pytest.mark.slow
 def test_an_interrupted_map_goes_on_to_the_same_bytes(finished, tmp_path, monkeypatch):
     out, kept = tmp_path / "out", []
 

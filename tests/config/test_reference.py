@@ -8,6 +8,7 @@ import jsonschema_rs
 import pytest
 
 from servotwin.cli.configuration import texts
+from servotwin.errors import InvalidInput
 
 ROOT = Path(__file__).parents[2]
 PACKAGED = [
@@ -41,6 +42,30 @@ def test_an_edge_s_file_fits_its_schema_as_it_is_written() -> None:
     schema, values = json.loads(texts()["schemas/edge.json"]), tomllib.loads(text.replace("= inf", "= 1e300"))
     jsonschema_rs.validate(schema, values)
     assert not jsonschema_rs.is_valid(schema, {**values, "unknown_key": 1})
+
+
+def test_gains_stay_is_listed_only_where_it_is_read(tmp_path: Path) -> None:
+    """In [own] and [supervision.fallback] of an edge's file; [start] and a scenario's [edge.fallback] refuse it."""
+    from servotwin.edge_process.config_file import load
+
+    tables = json.loads(texts()["schemas/edge.json"])["properties"]
+    listed = {
+        "own": tables["own"]["properties"],
+        "start": tables["start"]["properties"],
+        "supervision.fallback": tables["supervision"]["properties"]["fallback"]["properties"],
+    }
+    head = (
+        'servo = "axis"\nrole = "supervise"\nsample_rate_hz = 1000.0\n[drive]\nkind = "simulated"\naddress = "unix:s"\n'
+    )
+    for table, keys in listed.items():
+        (tmp_path / "edge.toml").write_text(f"{head}[{table}]\ngains_stay = true\n")
+        if "gains_stay" in keys:
+            load(tmp_path / "edge.toml")
+        else:
+            with pytest.raises(InvalidInput, match=f"unknown key '{table}.gains_stay'"):
+                load(tmp_path / "edge.toml")
+    edge = json.loads(texts()["schemas/scenario.json"])["properties"]["edge"]["properties"]
+    assert "gains_stay" not in edge["fallback"]["properties"]
 
 
 def test_a_twin_s_file_fits_its_schema() -> None:

@@ -54,7 +54,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
     assert found.interval[0] < 10.0 * DEG < found.interval[1]
 
 
-def test_an_edge_that_sends_no_longer_windows_says_so_and_is_not_asked_again() -> None:
+def test_an_edge_that_refuses_longer_windows_gets_no_second_request() -> None:
     short = Recording(window=1.0, pre_trigger=0.0)
     loop = cosimulate(calm(ExcitationSettings(), recording=short, reference=SquareWave(1e-3, 20.0), duration=50.0))
     assert [answer.outcome for answer in loop.answers] == [RequestOutcome.TOO_LARGE]
@@ -111,7 +111,7 @@ def test_where_it_is_not_allowed_nothing_moves_and_the_reason_is_kept(
     assert set(np.round(np.abs(loop.run.reference), 12)) == {2e-5}
 
 
-def test_nothing_is_asked_for_unless_configured() -> None:
+def test_nothing_is_requested_unless_configured() -> None:
     loop = cosimulate(calm(None, recording=PROBED, reference=SMALL))
     assert (loop.requests, loop.answers, loop.excitations) == ((), (), ())
 

@@ -51,7 +51,7 @@ def test_answers_survive_the_bytes(
     assert decode_json(encode_json(answer)) == answer
 
 
-def test_the_two_kinds_are_told_apart() -> None:
+def test_the_two_kinds_are_distinguished() -> None:
     window, probe = (msgspec.structs.replace(REQUEST, ask=ask) for ask in (LongerWindow(2.0, 0.3), Probe(1e-4, 0.85)))
     assert isinstance(decode(encode(window)).ask, LongerWindow)  # type: ignore[union-attr]
     assert isinstance(decode(encode(probe)).ask, Probe)  # type: ignore[union-attr]

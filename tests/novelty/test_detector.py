@@ -102,7 +102,7 @@ def test_an_accepted_update_ends_the_unconditional_windows_and_keeps_the_news_ou
     assert novelty.state.update_gap == math.radians(12.0)
 
 
-def test_an_update_that_stands_on_a_window_not_judged_moves_the_baseline() -> None:
+def test_an_update_from_a_window_without_a_score_moves_the_baseline() -> None:
     novelty = NoveltyDetector(SETTINGS)
     reasons(novelty, [updated(cut(k), 1, 10.0, 1) for k in range(5)])
     assert reasons(novelty, [updated(cut(k, 12.0), 2, 12.0, 99) for k in range(5, 9)]) == [""] * 4

@@ -312,6 +312,7 @@ def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -
     assert first.certificate.friction == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     rule = MarginPolicy(SERVO, step=(1e-4, 1e-3))
     wide = rule.redesign(Evidence(estimated(10.0)))

@@ -143,6 +143,7 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
     assert other.cost == pytest.approx(plain.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("requested", "why"),
     [

@@ -68,6 +68,7 @@ def test_each_policy_gets_what_is_set_of_it():
     )
 
 
+@pytest.mark.slow
 def test_certified_designs_for_the_controller_that_runs():
     """Loop filter and limits count, the sample rate stays; no more is fed forward than may be needed."""
     scenario = Scenario.preset("fig16").replace(twin=TwinSettings())
@@ -157,6 +158,7 @@ def test_the_loop_begins_on_the_controller_that_the_scenario_gives(tmp_path, tex
     assert (scenario.agent_settings().supervision.fallback is None) == ("edge" in text)
 
 
+@pytest.mark.slow
 def test_a_sample_rate_says_nothing_of_gains(tmp_path):
     scenario = load(tmp_path, "[controller]\nsample_rate_hz = 5000.0\n")
     assert scenario.agent_settings().parameters.fallback

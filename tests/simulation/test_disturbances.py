@@ -106,7 +106,7 @@ def test_the_limit_holds_inside_the_dead_zone_too(rate: float | None) -> None:
     assert speed == pytest.approx(0.3 / PAPER.k_B, rel=1e-9)
 
 
-def test_what_is_not_asked_for_costs_nothing() -> None:
+def test_an_absent_disturbance_costs_nothing() -> None:
     plain = continuous_loop(PAPER, PAPER.controller, Shape())
     assert not {"input bias", "friction", "feedforward", "offset"} & set(plain.automaton.names)
     assert len(plain.automaton.modes) == 9

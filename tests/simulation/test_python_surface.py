@@ -136,7 +136,7 @@ def test_a_run_becomes_an_arrow_table(run):
     assert np.array_equal(table["position_m"].to_numpy(), run.position)
 
 
-def test_tune_at_the_top_finds_what_was_asked_for(servo):
+def test_tune_at_the_top_meets_its_specification(servo):
     tuned = st.tune(servo, 10.0, math.radians(14.0))
     first = max(tuned.margins.gain_crossovers, key=lambda crossover: -abs(crossover.omega - 10.0))
     assert first.omega == pytest.approx(10.0)

@@ -5,6 +5,7 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pytest
 from exploration import examples
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, multiple, rule
@@ -182,4 +183,4 @@ class Against(RuleBasedStateMachine):
 
 
 Against.TestCase.settings = examples(25, stateful_step_count=25)
-TestAgainst = Against.TestCase
+TestAgainst = pytest.mark.slow(Against.TestCase)

@@ -47,7 +47,7 @@ def newest_window(store: Store) -> WindowMessage:
 
 def incoming(_store: Store, body: bytes, encoding: str) -> tuple[object, bytes]:
     """The message as the service would store it, and its bytes."""
-    ingest = Ingest(put=None, knows=lambda _: True, sample_times=SampleTimeLimiter(1e9, 1e9), metrics=Metrics())
+    ingest = Ingest(put=None, has_servo=lambda _: True, sample_times=SampleTimeLimiter(1e9, 1e9), metrics=Metrics())
     item, message = ingest.read(SERVO, body, encoding)
     return item, encode(message)
 

@@ -174,7 +174,7 @@ def test_equal_contexts_have_one_key_and_others_another():
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
-def test_what_is_not_understood_is_said(which):
+def test_what_is_not_understood_is_reported(which):
     good = list(estimated("fig15")[0][0])
     for bad in [b"", b"\xc1", encode(Acknowledge("a", "b", 1)), plain({"failed": "x"})] if which < 2 else ["", "[]"]:
         with pytest.raises(InvalidInput, match=r"not understood|can be estimated"):

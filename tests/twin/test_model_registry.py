@@ -122,7 +122,7 @@ def test_other_tables_are_left_to_others():
         ("[models.", "[mods.", "twin.toml: table [models] is missing"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(old, new, message):
+def test_a_mistake_is_reported_in_one_sentence(old, new, message):
     with pytest.raises(InvalidInput) as caught:
         read(TEXT.replace(old, new))
     assert message in str(caught.value)

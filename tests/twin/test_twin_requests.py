@@ -178,7 +178,7 @@ def test_what_no_estimator_takes_is_no_reason_to_move_the_machine() -> None:
     assert store.excitations == {}
 
 
-def test_without_settings_answers_are_kept_and_nothing_is_asked() -> None:
+def test_without_settings_answers_are_stored_and_nothing_is_requested() -> None:
     twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), START, Says()))
     store = twin.log
     assert requests_after(twin, window(0), window(1), window(2)) == []

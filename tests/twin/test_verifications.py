@@ -117,7 +117,7 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: M
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
 
-def test_a_proof_that_holds_is_kept_and_changes_nothing(fleet: ModelRegistry) -> None:
+def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRegistry) -> None:
     queue, update, queued = begun(fleet)
     before = queue.state
     outcome = queue.give(queued)

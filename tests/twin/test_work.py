@@ -217,7 +217,7 @@ def test_an_overdue_update_is_sent_again_then_abandoned():
         state = outcome.state
 
 
-def test_an_answer_in_the_same_claim_is_heard_before_anything_is_sent_again():
+def test_an_answer_in_the_same_lease_is_processed_before_anything_is_sent_again():
     first = work(fleet(), claim(windows()[1]), 100.0)
     update = decode(first.outgoing[0])
     outcome = work(fleet(), claim(receipt(update), state=first.state), 200.0)
@@ -277,7 +277,7 @@ def test_a_hello_says_what_a_restarted_edge_runs():
     assert (decode(then.outgoing[0]).version, decode(then.outgoing[0]).base_version) == (8, 7)
 
 
-def test_a_state_that_is_not_understood_is_kept_and_the_twin_begins_anew():
+def test_a_state_that_cannot_be_read_is_stored_and_the_twin_begins_anew():
     version = msgspec.structs.replace(windows()[1], parameter_version=40)
     outcome = work(fleet(), claim(version, state=b"\x81\xa4typeonce"), 0.0)
     (first, *rest) = outcome.evidence

@@ -5,11 +5,9 @@ import zlib
 
 import httpx
 import pytest
-import schemathesis
 from exploration import examples
 from hypothesis import HealthCheck, example, given
 from hypothesis import strategies as st
-from schemathesis.checks import not_a_server_error
 from service_system import SERVO, bearer, hello, place, process, served, twin_file, window
 
 from servotwin.messages import Refusal, encode
@@ -33,13 +31,14 @@ def url(tmp_path_factory):
 
 @pytest.fixture
 def described(url):
+    import schemathesis  # a second, which only this test takes
+
+    @schemathesis.serializer("application/msgpack")
+    def raw(_context, value):
+        """A body is bytes already."""
+        return value.data if hasattr(value, "data") else value
+
     return schemathesis.openapi.from_url(f"{url}/openapi.json")
-
-
-@schemathesis.serializer("application/msgpack")
-def raw(_context, value):
-    """A body is bytes already."""
-    return value.data if hasattr(value, "data") else value
 
 
 @pytest.mark.slow
@@ -47,6 +46,8 @@ def raw(_context, value):
 @examples(120, deadline=None, suppress_health_check=list(HealthCheck))
 def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
+    from schemathesis.checks import not_a_server_error
+
     case = data.draw(st.one_of([result.ok().as_strategy() for result in described.get_all_operations()]))
     if "wait" in (case.query or {}):
         case.query["wait"] = "0.01"

@@ -71,7 +71,7 @@ def test_estimates_of_the_version_before_are_reproduced(folder: Path) -> None:
 def test_an_edge_of_the_version_before_starts_on_its_parameters(folder: Path) -> None:
     config = load(folder / "edge" / "edge.toml")
     assert config.agent.servo == "quick"
-    parameters = FileParameterStore(folder / "edge" / config.keeping.parameters).load()
+    parameters = FileParameterStore(folder / "edge" / config.files.parameters).load()
     assert parameters is not None
     assert (parameters.version, parameters.setting.tolerance) == (1, 0.0)
     gains, band = parameters.setting.gains, parameters.setting.band

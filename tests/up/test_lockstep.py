@@ -139,7 +139,7 @@ def test_a_url_is_one() -> None:
 def test_a_machine_in_lock_step_waits_for_a_client_whose_twin_is_slow(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervise, "SENDING", 0.05)
+    monkeypatch.setattr(supervise, "_TRANSFER_S", 0.05)
     plant = SimpleNamespace(index=0, version=0, block=1, over=True, read=lambda *_: None, advance=lambda *_: None)
     ours, theirs = socket.socketpair()
     with ours, theirs:

@@ -89,7 +89,7 @@ def stored(path: Path) -> dict[str, set[str]]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
-def test_it_runs_ends_and_goes_on_whether_it_was_asked_to_end_or_killed(tmp_path: Path) -> None:
+def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "up"
     with started(path, "--for", "5", "--speed", "10") as first:
         lines = lines_until(first, "all processes have ended")

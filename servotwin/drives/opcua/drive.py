@@ -27,14 +27,14 @@ _DECISION_POLL_S = 0.01
 class OpcUaDrive:
     """`edge.drive.SupervisedDrive` of OPC UA nodes.
 
-    Samples overwritten before they were read leave a gap in the blocks' numbers. Reconnected to the same run of the
-    machine it goes on with the sample that is due, as long as the ring buffers hold it.
+    Samples overwritten before they were read leave a gap in the blocks' numbers. After a reconnection to the same
+    run it continues with the next sample, if the ring buffers still hold it.
 
     Parameters
     ----------
     settings : OpcUaSettings
     clock, sleep : callable
-        Returns monotonic seconds; waits for so many seconds.
+        Returns monotonic seconds; waits for a number of seconds.
     """
 
     can_move = patient = False

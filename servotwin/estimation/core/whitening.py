@@ -59,7 +59,7 @@ class Autoregression:
         The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
         """
         poles = self.predictors[-1]
-        # Here, because scipy.signal takes most of a second to import and many commands never estimate.
+        # Here, because scipy.signal takes long to import and many commands never estimate.
         from scipy.signal import lfilter
 
         return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])

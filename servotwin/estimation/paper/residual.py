@@ -37,7 +37,7 @@ def standard_deviation(sensitivity: Array, nuisance: Array, residual: Array) -> 
     information = float(left @ left)
     if math.sqrt(information) <= _SINGULAR * math.sqrt(float(sensitivity @ sensitivity)):
         return math.inf
-    # Here, because scipy.signal takes most of a second to import and many commands never fit.
+    # Here, because scipy.signal takes long to import and many commands never fit.
     from scipy.signal import correlate
 
     shifted = correlate(residual, left, method="fft")

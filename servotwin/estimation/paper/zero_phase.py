@@ -38,7 +38,7 @@ class ZeroPhase:
 
     def respond(self, signal: Array) -> Array:
         """(n,) filtered signal (n,)."""
-        # Here, because scipy.signal takes most of a second to import and many commands never filter.
+        # Here, because scipy.signal takes long to import and many commands never filter.
         from scipy.signal import sosfiltfilt
 
         sections = _butterworth(self.order, self.cutoff, self.sample_rate)

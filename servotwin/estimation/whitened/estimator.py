@@ -15,10 +15,12 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
-from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, profile_interval
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
+from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     ModelShift,
+    contacts_seen,
     judge,
     lower_bound,
     model_shift,
@@ -27,6 +29,7 @@ from servotwin.estimation.whitened.gate import (
     slow_share,
     static_lost_motion,
 )
+from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
@@ -81,6 +84,8 @@ class WindowFit:
         rad, of the motor.
     aligned : AlignedFit, optional
         None: the channels are broken.
+    learnt : LearntFit, optional
+        The same with the factors that were free; None: the model was taken as it is.
     """
 
     window: Window
@@ -90,6 +95,7 @@ class WindowFit:
     blank: GapEstimate
     angle: Array
     aligned: AlignedFit | None
+    learnt: LearntFit | None = None
 
     def one_sided(self) -> str:
         """Reason for which the window has too little contact to show the gap; empty when it has enough."""
@@ -104,16 +110,34 @@ class WindowFit:
         if self.aligned is None:
             return self.blank
         evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
+        if self.learnt is not None:
+            evidence = _with_free_model(evidence, self.learnt, self.settings)
         status, reasons = judge(evidence, self.settings)
+        if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
+            status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
+        if status is GapStatus.OK:
+            contacts = contacts_seen(self.aligned, self.servo)
+            if not contacts.two:
+                return _one_contact(self.blank, evidence, contacts, self.settings)
         if status is GapStatus.MODEL_MISMATCH:
             reasons = (*likely_fault(self.window, self.angle, self.servo, evidence.unexplained), *reasons)
-        return _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
+        stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
+        if self.learnt is None or not stated.ok:
+            return stated
+        return replace(stated, machine=self.learnt.reading(self.settings.calibration))
 
 
 def fit(
-    window: Window, servo: Servo, prior: float | GapEstimate | None, settings: WhitenedSettings | None
+    window: Window,
+    servo: Servo,
+    prior: float | GapEstimate | None,
+    settings: WhitenedSettings | None,
+    machine: FactorPrior | None = None,
 ) -> WindowFit:
-    """The first half of `estimate`, with the same arguments and errors."""
+    """The first half of `estimate`, with the same arguments and errors.
+
+    With `machine`, the model's factors are free within that; without it the model is taken as it is.
+    """
     settings = settings or WhitenedSettings()
     _check(window)
     assert window.theta_m is not None
@@ -124,8 +148,12 @@ def fit(
         blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
         return WindowFit(window, servo, prior, settings, blank, window.theta_m, None)
     angle = motor_angle(window, servo.encoder_resolution, settings)
-    aligned = align_and_fit(angle, window.position, window.sample_rate, servo, _start(prior), settings)
-    return WindowFit(window, servo, prior, settings, blank, angle, aligned)
+    channels = (angle, window.position, window.sample_rate)
+    if machine is not None:
+        learnt = learn_and_fit(*channels, servo, _start(prior), settings, machine)
+        return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt)
+    _, points = look_around(*channels, servo, _start(prior), settings)
+    return WindowFit(window, servo, prior, settings, blank, angle, align_and_fit(*channels, servo, points, settings))
 
 
 def _check(window: Window) -> None:
@@ -160,6 +188,17 @@ def _evidence(
     )
 
 
+def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
+    """Widen a spread and an interval by what the model's factors leave open."""
+    std = learnt.gap_std(settings.calibration)
+    if not math.isfinite(std) or not std > evidence.std:
+        return evidence
+    gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
+    extra = NORMAL_95 * math.sqrt(std**2 - evidence.std**2)
+    interval = max(0.0, gap - math.hypot(gap - low, extra)), gap + math.hypot(high - gap, extra)
+    return replace(evidence, std=std, interval=interval)
+
+
 def _left(result: WhitenedFit) -> float:
     """Root mean square of the residual, m."""
     return float(np.sqrt(np.mean(result.left**2)))
@@ -172,6 +211,23 @@ def _travel(result: WhitenedFit) -> Travel:
     middle = result.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - count)
     at = result.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
     return travel(reduction.theta_m[:count], at)
+
+
+def _one_contact(
+    blank: GapEstimate, evidence: FitEvidence, contacts: ContactEvidence, settings: WhitenedSettings
+) -> GapEstimate:
+    """State a lower bound: one contact explains the window too, and then the gap is as wide as the lead at least."""
+    bound = max(0.0, min(contacts.lead - NORMAL_95 * settings.model_error, lower_bound(evidence, settings)))
+    reason = "one contact with a model that is a little off explains the window nearly as well as two"
+    return replace(
+        blank,
+        status=GapStatus.LOWER_BOUND,
+        reasons=(reason,),
+        gap=bound,
+        interval=(bound, math.inf),
+        rms=_left(evidence.aligned.whitened),
+        evaluations=evidence.aligned.whitened.evaluations,
+    )
 
 
 def _stated(

@@ -17,6 +17,7 @@ from servotwin.estimation.core.least_squares import least_squares, spread
 from servotwin.estimation.core.response import response
 from servotwin.estimation.core.whitening import Autoregression, burg, with_noise_put_back
 from servotwin.estimation.estimate import Interval
+from servotwin.estimation.whitened.free_model import same_way
 from servotwin.estimation.whitened.reduction import (
     CONSTANT,
     GAP,
@@ -222,14 +223,14 @@ class AlignedFit:
 
 
 def align_and_fit(
-    theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
+    theta_m: Array, position: Array, rate: float, servo: Servo, points: list[Point], settings: WhitenedSettings
 ) -> AlignedFit:
-    """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz); `prior` (rad) is one of the starts.
+    """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz) from some points on.
 
     A delay of more than half a sample is taken off in whole samples, and the fit repeated: what is left of it is small
     enough to be linear.
     """
-    shift, points = 0, _look_around(theta_m, position, rate, servo, prior, settings)
+    shift = 0
     for attempt in range(_ALIGNMENTS):
         ahead, behind = max(-shift, 0), max(shift, 0)
         angle = theta_m[ahead : theta_m.size - behind]
@@ -242,10 +243,13 @@ def align_and_fit(
     return AlignedFit(fitted.whitened, (shift + late) / rate, fitted.span, fitted.first)
 
 
-def _look_around(
+def look_around(
     theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
-) -> list[Point]:
-    """Find the points from which the search at the full rate begins."""
+) -> tuple[Reduction, list[Point]]:
+    """Decimate both channels, and find the points from which the search at the full rate begins.
+
+    `prior` (rad) is one of the gaps from which these are searched.
+    """
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
     angle, reduced = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
     model = response(servo, rate / reduce.factor)
@@ -254,7 +258,7 @@ def _look_around(
     )
     span = float(np.ptp(angle))
     starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
-    return candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
+    return slow, candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
 
 
 def _fit(
@@ -328,7 +332,7 @@ def profile_interval(result: WhitenedFit, std: float, calibration: float, larges
     def rise(gap: float) -> float:
         """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
         near = abs(gap - result.point.gap) < min(3.0 * std, _NEAR * result.point.gap)
-        places = (result.point.place,) if near else (*_same_way(result.point, gap), *PLACES)
+        places = (result.point.place,) if near else (*same_way(result.point, gap), *PLACES)
         lowest = math.inf
         for place in dict.fromkeys(places):
             fit = descend(result.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
@@ -339,19 +343,6 @@ def profile_interval(result: WhitenedFit, std: float, calibration: float, larges
 
     first = min(1.96 * std, 0.5 * largest)
     return _end(rise, result.point.gap, -first, 0.0), _end(rise, result.point.gap, first, largest)
-
-
-def _same_way(point: Point, gap: float) -> tuple[float, float, float]:
-    """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
-
-    A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact
-    being the same.
-    """
-    if gap == 0.0:
-        return (point.place,) * 3
-    share = point.gap / gap
-    ahead, behind = share * (1.0 + point.place) - 1.0, 1.0 - share * (1.0 - point.place)
-    return point.place, min(max(ahead, -1.0), 1.0), min(max(behind, -1.0), 1.0)
 
 
 def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:

@@ -23,6 +23,15 @@ from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.estimation.paper.observer import LagFilter, observer
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
+from servotwin.estimation.whitened.free_model import (
+    COMPLIANCE,
+    FREEDOM,
+    ContactEvidence,
+    FactorPrior,
+    FreeProblem,
+    contact_evidence,
+    motion_by,
+)
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
@@ -129,14 +138,15 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
     model, reduction = result.reduction.response, result.reduction
     polygons = polygon(reduction.theta_m, result.point.screw(0.0, reduction.rate))
     screw = polygons[:1]
-    here = model.respond(screw)
-    motions = [(other.respond(screw) - here) / step for other, step in _neighbours(servo, 1.0 / model.interval)]
-    motions.insert(2, here)
+    weights = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients
+    neighbours = _neighbours(servo, 1.0 / model.interval)
+    motions = [motion_by(reduction, other, screw, weights) / step for other, step in neighbours]
+    motions.insert(2, reduction.decimation.rows(model.respond(screw))[0])
     sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
-        motions.append(model.respond(polygons[BY_RATE:]))
+        motions.append(reduction.decimation.rows(model.respond(polygons[BY_RATE:]))[0])
         sizes.append(GROWTH * model.interval)
-    free = reduction.decimation.rows(np.vstack(motions)) * np.array(sizes)[:, None]
+    free = np.array(motions) * np.array(sizes)[:, None]
     table, size = np.vstack([reduction.table(result.point), free]), len(free)
     shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
     noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
@@ -263,6 +273,15 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     if silence:
         return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
+
+
+def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:
+    """Evidence for a second contact in a window, with the model free within its usual error."""
+    result = aligned.whitened
+    problem = FreeProblem(
+        result.reduction, result.noise, servo, FactorPrior.of_spreads(*FREEDOM), aligned.largest, COMPLIANCE
+    )
+    return contact_evidence(problem, result.misfit, result.point)
 
 
 def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:

@@ -174,7 +174,7 @@ def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """(count, dimensions) in 0 .. 1."""
-    # Here, because scipy.stats takes most of a second to import and many commands never draw machines.
+    # Here, because scipy.stats takes long to import and many commands never draw machines.
     from scipy.stats import qmc
 
     # Sobol points are balanced in powers of two only: draw one and keep the first `count`.

@@ -1,0 +1,175 @@
+"""The machine's own numbers, learnt across windows: stiffness and damping over the masses, and pitch.
+
+A nameplate is off by percents, and an estimate of the gap by whole degrees with it. Every window whose estimate counts
+narrows what is known of the machine; time widens it again, slowly: a gap wears, a structure hardly does, and that is
+what tells the two apart. A machine that contradicts what was learnt (another screw, another load, another machine under
+the same name) yields no estimate until some windows in a row agree on its new numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from servotwin.config.keys import check, key, settings
+from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
+from servotwin.estimation.whitened.free_model import FACTORS, FactorPrior
+from servotwin.plant.signals import Array
+
+_DAY_S = 86400.0
+_AGREEMENT = 4.0  # standard deviations, of the distance of two readings with 3 degrees of freedom
+_DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
+
+
+@settings("machine")
+@dataclass(frozen=True)
+class MachineSettings:
+    """How the twin learns the machine's stiffness, damping and pitch.
+
+    How far they may be off at first is stated by `k_percent`, `c_percent` and `m_percent` of the uncertainty.
+    """
+
+    learn: Annotated[bool, key(help="Learn the machine's numbers from its windows; false: the model is exact.")] = True
+    pitch: Annotated[
+        float, key("pitch_percent", above=0.0, below=1.0, help="Standard deviation of the pitch before any window.")
+    ] = 0.01
+    k_drift: Annotated[
+        float,
+        key("k_drift_percent_per_sqrt_day", minimum=0.0, help="Random walk of the stiffness over the masses."),
+    ] = 0.001
+    c_drift: Annotated[
+        float, key("c_drift_percent_per_sqrt_day", minimum=0.0, help="Random walk of the damping over the masses.")
+    ] = 0.01
+    k_floor: Annotated[
+        float,
+        key("k_floor_percent", above=0.0, help="No number of windows tells the stiffness over the masses better."),
+    ] = 2e-4
+    c_floor: Annotated[
+        float, key("c_floor_percent", above=0.0, help="No number of windows tells the damping over the masses better.")
+    ] = 1e-3
+    pitch_floor: Annotated[
+        float, key("pitch_floor_percent", above=0.0, help="No number of windows tells the pitch better.")
+    ] = 1e-4
+    restart_after: Annotated[
+        int,
+        key(minimum=1, help="So many windows in a row that agree on other numbers mean that the machine is another."),
+    ] = 3
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def walk(self, elapsed: float) -> Array:
+        """(3,) variances that `elapsed` seconds add."""
+        days = max(0.0, elapsed) / _DAY_S
+        return np.square([self.k_drift, self.c_drift, 0.0]) * days
+
+    @property
+    def floor(self) -> Array:
+        """(3,) least variances."""
+        return np.square([self.k_floor, self.c_floor, self.pitch_floor])
+
+
+class Machine(Struct, frozen=True):
+    """What is known of a machine after some windows.
+
+    Attributes
+    ----------
+    factors, covariance : tuple of 3 and of 9 float
+        Logarithms of the factors on the model's k/m, c/m and pitch; row by row.
+    time : float
+        s, on the twin's clock, of the last window that counted.
+    windows : int
+        Windows that counted.
+    alarm : str
+        Sentence on a machine that is not what was learnt; empty without one.
+    rival : Machine or None
+        What windows since then say that contradict it.
+    """
+
+    factors: tuple[float, ...]
+    covariance: tuple[float, ...]
+    time: float
+    windows: int = 1
+    alarm: str = ""
+    rival: Machine | None = None
+
+    def prior(self, given: MachineSettings, now: float) -> FactorPrior:
+        """What is known at a time, s."""
+        covariance = np.array(self.covariance).reshape(3, 3) + np.diag(given.walk(now - self.time))
+        short = np.maximum(0.0, given.floor - np.diag(covariance))
+        return FactorPrior(np.array(self.factors), covariance + np.diag(short))
+
+    def words(self) -> str:
+        """The factors in per cent off the model."""
+        parts = zip(FACTORS, self.factors, np.sqrt(np.diag(np.array(self.covariance).reshape(3, 3))), strict=True)
+        return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
+
+
+def nameplate(given: MachineSettings, k: float, c: float, m: float) -> FactorPrior:
+    """Prior before any window, for half-widths of stiffness, damping and mass within which all values are alike."""
+    return FactorPrior.of_spreads(math.hypot(k, m) / math.sqrt(3.0), math.hypot(c, m) / math.sqrt(3.0), given.pitch)
+
+
+def updated(
+    before: Machine | None, given: MachineSettings, estimate: GapEstimate, counts: bool, now: float
+) -> Machine | None:
+    """What is known after a window.
+
+    Parameters
+    ----------
+    before : Machine, optional
+        None: no window has counted yet.
+    given : MachineSettings
+    estimate : GapEstimate
+        With its reading, if it has one.
+    counts : bool
+        True where the trend accepted the estimate.
+    now : float
+        s, on the twin's clock.
+    """
+    reading = estimate.machine
+    if reading is None:
+        return before
+    if estimate.ok:
+        if not counts:
+            return before
+        windows = 1 if before is None else before.windows + 1
+        alarm = "" if before is None else _drift(before.prior(given, now), reading)
+        return Machine(reading.factors, reading.covariance, now, windows, alarm)
+    if before is None or estimate.status is not GapStatus.MODEL_MISMATCH:
+        return before
+    rival = Machine(reading.factors, reading.covariance, now)
+    if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
+        rival = replace(rival, windows=before.rival.windows + 1)
+    alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
+    if rival.windows >= given.restart_after:
+        return replace(rival, alarm=f"{alarm}; it is learnt anew from {rival.windows} windows that agree")
+    return replace(before, alarm=alarm, rival=rival)
+
+
+def _distance(known: FactorPrior, reading: MachineReading) -> float:
+    """Distance of a reading from what is known, both uncertain, in standard deviations."""
+    away = np.array(reading.factors) - known.mean
+    return math.sqrt(float(away @ np.linalg.solve(known.covariance + np.array(reading.covariance).reshape(3, 3), away)))
+
+
+def _drift(known: FactorPrior, reading: MachineReading) -> str:
+    """Sentence on a window whose own reading lies far from what was known; empty where it does not.
+
+    The reading holds the prior, so that its move has the variance by which the prior's shrank.
+    """
+    moved = np.array(reading.factors) - known.mean
+    shrunk = known.covariance - np.array(reading.covariance).reshape(3, 3)
+    values, vectors = np.linalg.eigh(shrunk)
+    told = values > 1e-3 * np.trace(known.covariance) / 3.0
+    far = float(np.sum(np.square(vectors[:, told].T @ moved) / values[told])) if np.any(told) else 0.0
+    if far <= _DRIFT**2:
+        return ""
+    index = int(np.argmax(np.abs(moved) / np.sqrt(np.diag(known.covariance))))
+    change = 100.0 * math.expm1(float(moved[index]))
+    return f"the model drifts: {FACTORS[index]} moved by {change:+.2g} % in one window, beyond what is assumed of it"

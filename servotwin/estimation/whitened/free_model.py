@@ -1,0 +1,317 @@
+"""Fit of gap, place and the model's own numbers to a whitened window, and the hypothesis of a single contact.
+
+A machine is never quite its model. Its stiffness and damping over the masses and its pitch are free here, within what
+is known of them beforehand, beside the gap and the screw's place in it; a compliance of the screw is a nuisance. The
+model's factors enter nonlinearly and are iterated (Levenberg-Marquardt), unlike the tangents of `gate.model_shift`.
+
+The same fit with a gap that is too wide for the motor to cross says how well one contact alone explains the window. A
+fit of two contacts may bend a wrong model into any gap: two are believed only where one explains significantly less.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from servotwin.estimation.core.contacts import polygon, travel
+from servotwin.estimation.core.least_squares import least_squares, orthonormal, project_out
+from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
+from servotwin.estimation.whitened.search import PLACES
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+FACTORS = ("k/m", "c/m", "pitch")
+FREEDOM = (0.1, 0.5, 0.05)  # relative standard deviations of the factors where nothing else is known of them
+LARGEST = 4.0  # standard deviations by which a factor may move
+_STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
+_SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
+COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
+_FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
+_STEPS, _GAIN = 12, 1e-4  # of a fit; of the cost, in a whitened window far below one standard deviation of anything
+_SINGULAR = 1e-10  # of a column's length
+_ANY = (0.0, math.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class FactorPrior:
+    """Prior knowledge of the logarithms of `FACTORS`, the machine's numbers over the model's.
+
+    Attributes
+    ----------
+    mean : (3,) array
+    covariance : (3, 3) array
+    """
+
+    mean: Array
+    covariance: Array
+
+    @classmethod
+    def of_spreads(cls, k: float, c: float, pitch: float) -> FactorPrior:
+        """Independent factors about 1, with relative standard deviations."""
+        return cls(np.zeros(3), np.diag(np.square([k, c, pitch])))
+
+    @property
+    def root(self) -> Array:
+        """(3, 3) whitening matrix: root (factors - mean) has unit covariance."""
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)))
+
+    def limits(self) -> tuple[Array, Array]:
+        """(3,) least and largest factors that are searched."""
+        reach = LARGEST * np.sqrt(np.diag(self.covariance))
+        return self.mean - reach, self.mean + reach
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFit:
+    """A minimum with a free model.
+
+    Attributes
+    ----------
+    point : Point
+    factors : (3,) array
+        Logarithms of `FACTORS` over the model's.
+    cost : float
+        Squared length of the whitened residual, prior included.
+    covariance : (5, 5) array
+        Of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal of what is not known.
+    evaluations : int
+    """
+
+    point: Point
+    factors: Array
+    cost: float
+    covariance: Array
+    evaluations: int
+
+
+def adapted(servo: Servo, factors: Array) -> Servo:
+    """The servo with other logarithms of `FACTORS`."""
+    k, c, p = (math.exp(value) for value in factors)
+    return servo.replace(k=tuple(k * servo.stiffnesses), c=tuple(c * servo.dampings), p=p * servo.p)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeProblem:
+    """A window in known noise as a function of gap, place and factors.
+
+    Attributes
+    ----------
+    reduction : Reduction
+        Of the window, with any model's response.
+    noise : Autoregression
+    servo : Servo
+        To which the factors refer.
+    prior : FactorPrior
+    largest : float
+        rad, of the gap.
+    compliance : float
+        Usual size of the structure's stiffness over the screw's, a nuisance; 0: the screw is as stiff as the model's.
+    """
+
+    reduction: Reduction
+    noise: Autoregression
+    servo: Servo
+    prior: FactorPrior
+    largest: float
+    compliance: float = 0.0
+
+    def rows(self, q: Array) -> tuple[Array, Array]:
+        """Residual (M,) and derivatives of the motion (5, M) at a point (5,), nuisances out, prior appended."""
+        point, factors = Point(q[0], q[1]), q[2:]
+        rate = 1.0 / self.reduction.response.interval
+        reduction = replace(self.reduction, response=_response(self.servo, tuple(factors), rate))
+        table = reduction.table(point)
+        rows = reduction.prepared(self.noise, table, CONSTANT)
+        weights = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
+        screw = polygon(reduction.theta_m, point.screw(0.0, reduction.rate))[:1]
+        others = self._others(factors, rate)
+        motions = [motion_by(reduction, other, screw, weights) / step for other, step in others]
+        whole = reduction.prepared(self.noise, np.vstack([table, motions]), CONSTANT)
+        last = len(table) + factors.size
+        known = np.zeros((len(whole), len(motions)))
+        known[len(table) : last, : factors.size] = self.prior.root.T
+        known[RESIDUAL, : factors.size] = self.prior.root @ (self.prior.mean - factors)
+        known[last:, factors.size :] = np.eye(len(motions) - factors.size)
+        whole = np.hstack([whole, known])
+        basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
+        left = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
+        return left[RESIDUAL], left[GAP:]
+
+    def _others(self, factors: Array, rate: float) -> list[tuple[Response, float]]:
+        moved = [(_response(self.servo, tuple(factors + _STEP * row), rate), _STEP) for row in np.eye(factors.size)]
+        if self.compliance == 0.0:
+            return moved
+        return [*moved, (_softened(self.servo, tuple(factors), rate), _SOFT / self.compliance)]
+
+    def descend(self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY) -> FreeFit:
+        """Descend from a start (5,); of gap and place only what is `free` moves.
+
+        It ends early once the cost is below the first number of `within`, or once even the linearised problem cannot
+        bring it below the second: its value is then not that of the minimum, but on the same side of both.
+        """
+        least, most = self.prior.limits()
+        low, high = np.concatenate([[0.0, -1.0], least]), np.concatenate([[self.largest, 1.0], most])
+        movable, (enough, hopeless) = np.array([*free, True, True, True]), within
+        q, damping = np.clip(start, low, high), _FIRST_DAMPING
+        residual, rows = self.rows(q)
+        cost, count = float(residual @ residual), 1
+        while count < _STEPS and damping < _LARGEST_DAMPING and cost > enough:
+            if _linear_floor(residual, rows, movable) > hopeless:
+                break
+            trial = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high)
+            ahead, slopes = self.rows(trial)
+            after, count = float(ahead @ ahead), count + 1
+            if after < cost:
+                gained = cost - after
+                q, residual, rows, cost, damping = trial, ahead, slopes, after, max(0.1 * damping, _LEAST_DAMPING)
+                if gained <= _GAIN * cost:
+                    break
+            else:
+                damping *= 10.0
+        return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, _covariance(rows, movable), count)
+
+
+def motion_by(reduction: Reduction, other: Response, screw: Array, weights: Array) -> Array:
+    """(m,) change of the fitted position with another response, that of the structure's free motion included.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        With the fitted response.
+    other : Response
+        A little off.
+    screw : (1, n) array
+        rad, the fitted screw.
+    weights : (r,) array
+        Fitted shares of the nuisances, the constant and the free motions first. Without their change, a window that
+        begins in motion would show derivatives of the wrong size and sign.
+    """
+    forced = reduction.decimation.rows(other.respond(screw) - reduction.response.respond(screw))[0]
+    mine, samples = reduction.fixed(), reduction.theta_m.size
+    theirs = reduction.decimation.rows(np.vstack([np.ones((1, samples)), other.free(samples)]))
+    if len(theirs) != len(mine):  # a screw that just became soft has a mode more, which is not excited
+        return np.asarray(forced)
+    return np.asarray(forced + weights[: len(mine)] @ (theirs - mine))
+
+
+def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
+    """Squared length of what is left of a residual where all derivatives may have any share of it."""
+    left = project_out(orthonormal(rows[movable]), residual[None])[0]
+    return float(left @ left)
+
+
+@dataclass(frozen=True)
+class ContactEvidence:
+    """Rise of the cost where only one contact is allowed, over the variance of the noise; model free in both.
+
+    Attributes
+    ----------
+    rise : float
+        At least, where it is far above what is `BELIEVED`.
+    lead : float
+        rad, range by which the motor leads the screw in the fit of one contact: the gap is at least as wide.
+    """
+
+    rise: float
+    lead: float
+
+    @property
+    def two(self) -> bool:
+        """True where two contacts are believed."""
+        return self.rise >= BELIEVED
+
+
+# The square of the contacts' least travel over the largest accepted standard deviation is 100 too: a second contact
+# that is worth less could not have made an acceptable estimate.
+BELIEVED = 100.0
+_ENOUGH, _HOPELESS = 0.3, 30.0  # times that: clearly too little; so much that no start has come back from there
+_STARTS = 3
+
+
+def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> ContactEvidence:
+    """Compare the fit of a window that has two contacts with the best one of a single contact, both with a free model.
+
+    Parameters
+    ----------
+    problem : FreeProblem
+        In the noise of the fit of two contacts: where one contact is the truth, both fits leave this noise.
+    misfit : Misfit
+        In the same noise with the model fixed, for the starts.
+    two : Point
+        The fit of two contacts.
+    """
+    mean = problem.prior.mean
+    believed = problem.descend(np.array([*two, *mean]), (True, True))
+    variance = max(1.0, believed.cost / max(1, misfit.position.size))
+    wide, allowed = problem.largest, BELIEVED * variance
+    places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
+    order = np.argsort([misfit.cost(Point(wide, place)) for place in places], kind="stable")
+    within = (believed.cost + _ENOUGH * allowed, believed.cost + _HOPELESS * allowed)
+    fits = []
+    for index in order[:_STARTS]:
+        start = np.array([wide, places[index], *believed.factors])
+        fits.append(problem.descend(start, (False, True), within))
+        if fits[-1].cost <= within[0]:
+            break
+    best = min(fits, key=lambda one: one.cost)
+    theta_m = problem.reduction.theta_m
+    return ContactEvidence((best.cost - believed.cost) / variance, travel(theta_m, best.point.screw(theta_m[0])).lead)
+
+
+def same_way(point: Point, gap: float) -> tuple[float, float, float]:
+    """Places in another gap (rad) at a point's place, and as far from the contact ahead, and from the one behind.
+
+    A window of one contact is explained by any gap from whose other side the motor stays away, the way to this contact
+    being the same.
+    """
+    if gap == 0.0:
+        return (point.place,) * 3
+    share = point.gap / gap
+    ahead, behind = share * (1.0 + point.place) - 1.0, 1.0 - share * (1.0 - point.place)
+    return point.place, min(max(ahead, -1.0), 1.0), min(max(behind, -1.0), 1.0)
+
+
+def _step(residual: Array, rows: Array, movable: Array, q: Array, low: Array, high: Array, damping: float) -> Array:
+    """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
+    downhill = rows @ residual
+    blocked = ((q <= low) & (downhill < 0.0)) | ((q >= high) & (downhill > 0.0))
+    size = np.linalg.norm(rows, axis=1)
+    use = np.flatnonzero(np.logical_and.reduce([movable, ~blocked, size > 0.0]))
+    step = np.zeros(q.size)
+    if use.size:
+        scaled = rows[use] / size[use, None]
+        matrix = scaled @ scaled.T + damping * np.eye(use.size)
+        step[use] = np.linalg.solve(matrix, downhill[use] / size[use]) / size[use]
+    return step
+
+
+def _covariance(rows: Array, movable: Array) -> Array:
+    size = np.linalg.norm(rows, axis=1)
+    use = np.flatnonzero(movable & (size > 0.0))
+    covariance = np.zeros((rows.shape[0], rows.shape[0]))
+    np.fill_diagonal(covariance, np.where(movable, math.inf, 0.0))
+    scaled = rows[use] / size[use, None]
+    values, vectors = np.linalg.eigh(scaled @ scaled.T)
+    good = values > _SINGULAR * values[-1]
+    if np.all(good):
+        inverse = (vectors / values) @ vectors.T / np.outer(size[use], size[use])
+        covariance[np.ix_(use, use)] = inverse
+    return covariance
+
+
+@lru_cache(maxsize=64)
+def _response(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
+    return response(adapted(servo, np.array(factors)), rate)
+
+
+@lru_cache(maxsize=64)
+def _softened(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
+    machine = adapted(servo, np.array(factors))
+    stiffness = float(machine.stiffnesses.max())
+    soft = _SOFT + (0.0 if machine.rigid else stiffness / machine.k_d)
+    return response(machine.replace(k_d=stiffness / soft), rate)
