@@ -16,7 +16,7 @@ from servotwin.control.law import LawParameters, LawState
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import Scratch, dot, product
-from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, flow_until, step_once
+from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.lifted import (
     BLOCK,
     COARSE,
@@ -32,11 +32,11 @@ tick = verbatim(law.tick)
 
 LINEAR, LIMITED, RATE_LIMITED = 0, 1, 2
 KINDS = 3
+UNFILLED = 3
+"""Status of a run that needs the tables of the mode and branch where it is."""
 """Branches of the limits: neither acts, the voltage limit does, the rate limit does."""
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
-# Search steps per tick from which on blocks of them are quicker than one after the other.
-_MANY_SEARCHES = 6
 
 
 class Places(NamedTuple):
@@ -369,9 +369,16 @@ def _plant_watch(t: Tables, loop: Loop, places: Places, mode: int, guard: int, m
             value[i], slope[i] = new_value[i], new_slope[i]
 
 
+@inlined
+def slot_of(mode: int, active: bool, kind: int) -> int:
+    """Slot of a mode of the plant and a branch of the law."""
+    return (mode * 2 + (1 if active else 0)) * KINDS + kind
+
+
 @bare
-def fill(t: Tables, loop: Loop, places: Places, mode: int, active: bool, kind: int, memory: LiftedMemory) -> None:
-    """Fill the slot of a mode of the plant and a branch of the law."""
+def fill_here(t: Tables, loop: Loop, places: Places, place: Place, memory: LiftedMemory) -> None:
+    """Fill the slot of the plant's mode and the law's branch where a run is."""
+    mode, active, kind = place.at[1], place.at[2] == 1, place.at[3]
     n, w, slot = places.states, memory.workspace, slot_of(mode, active, kind)
     guards = t.guard_count[mode]
     watches = _law_rows(loop, places, active, kind, memory, guards)
@@ -393,12 +400,6 @@ def fill(t: Tables, loop: Loop, places: Places, mode: int, active: bool, kind: i
         memory.voltage_rows[slot * n + i] = memory.tick_map[places.voltage * n + i] + (i == places.voltage)
     fill_slot(memory.lifted, slot, watches, w)
     memory.filled[slot] = 1
-
-
-@inlined
-def slot_of(mode: int, active: bool, kind: int) -> int:
-    """Slot of a mode of the plant and a branch of the law."""
-    return (mode * 2 + (1 if active else 0)) * KINDS + kind
 
 
 @inlined
@@ -450,33 +451,12 @@ def note(segments: Segments, k: int, slot: int, z: Array) -> None:
 
 
 @bare
-def flow_tick(t: Tables, loop: Loop, mode: int, x: Array, k: int, record: RunRecord, scratch: Scratch) -> int:
-    """Flow to the next tick; return the mode, -1 when Zeno."""
-    step = k * loop.searches
-    record.size[0] = 0
-    if loop.searches >= _MANY_SEARCHES:
-        status, _, _, mode = flow_until(t, x, mode, step, 0.0, step + loop.searches, 0.0, record, scratch)
-        record.size[0] = 0
-        return -1 if status != DONE else mode
-    for _ in range(loop.searches):
-        mode = step_once(t, mode, x, step, record, scratch)
-        step += 1
-        record.size[0] = 0
-        if mode < 0:
-            break
-    return mode
-
-
-@bare
 def advance_block(
     t: Tables, loop: Loop, places: Places, z: Array, place: Place, end: int, segments: Segments, memory: LiftedMemory
 ) -> int:
     """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced."""
-    mode, active, kind = place.at[1], place.at[2] == 1, place.at[3]
-    slot, begin, lifted = slot_of(mode, active, kind), place.at[0], memory.lifted
+    slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
     watches, k = set_bounds(t, loop, places, place, memory), place.at[0]
-    if memory.filled[slot] == 0:
-        fill(t, loop, places, mode, active, kind, memory)
     while end - k >= 2 and segments.size[0] + 4 < len(segments.tick):
         if place.at[5] >= FINE and end - k >= FINE:
             wanted = min(COARSE, (end - k) // FINE)
@@ -523,7 +503,7 @@ def run_lifted(
     memory: LiftedMemory,
 ) -> int:
     """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
-    FULL where a record must grow."""
+    FULL where a record must grow, and UNFILLED where `fill_here` is due."""
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
     while at[0] < end:
@@ -532,10 +512,13 @@ def run_lifted(
         if record.size[1] > room:
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
-        if at[5] > 0 and end - at[0] >= 2 and advance_block(t, loop, places, z, place, end, segments, memory) > 0:
-            if at[0] >= end:
-                break
-            set_reference(places, coefficients, at[0] / rate - origin, z)
+        if at[5] > 0 and end - at[0] >= 2:
+            if memory.filled[slot_of(at[1], at[2] == 1, at[3])] == 0:
+                return UNFILLED
+            if advance_block(t, loop, places, z, place, end, segments, memory) > 0:
+                if at[0] >= end:
+                    break
+                set_reference(places, coefficients, at[0] / rate - origin, z)
         active, mode, side, kind, sign = at[2], at[1], at[4], at[3], place.sign[0]
         error = take_tick(loop, places, z, place)
         # The first tick finds the zone that holds at the start.
@@ -545,9 +528,13 @@ def run_lifted(
             segments.change_error[change] = error
             segments.size[1] = change + 1
         note(segments, at[0], TICKED, z)
-        at[1] = flow_tick(t, loop, mode, x, at[0], record, scratch)
-        if at[1] < 0:
-            return ZENO
+        step = at[0] * loop.searches
+        for _ in range(loop.searches):
+            at[1] = step_once(t, at[1], x, step, record, scratch)
+            step += 1
+            record.size[0] = 0
+            if at[1] < 0:
+                return ZENO
         # Another branch may hold for one tick only: blocks begin after two alike.
         alike = at[1] == mode and at[2] == active and at[4] == side and at[3] == kind and place.sign[0] == sign
         at[5] = at[5] + 1 if alike else 0

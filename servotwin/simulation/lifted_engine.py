@@ -11,6 +11,7 @@ from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import (
+    DONE,
     FULL,
     ZENO,
     follow_schedule,
@@ -28,10 +29,12 @@ from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.lifted import (
     KINDS,
     TICKED,
+    UNFILLED,
     LiftedMemory,
     Loop,
     Place,
     Places,
+    fill_here,
     more_segments,
     new_segments,
     run_lifted,
@@ -200,7 +203,7 @@ class LiftedEngine:
     def _run(self, end: int) -> None:
         coefficients, origin = self._now()
         status = FULL
-        while status == FULL:
+        while status != DONE:
             status = run_lifted(
                 self.tables,
                 self.loop,
@@ -216,6 +219,8 @@ class LiftedEngine:
                 self.scratch,
                 self.memory,
             )
+            if status == UNFILLED:
+                fill_here(self.tables, self.loop, self.places, self.place, self.memory)
             self._grow(status)
 
     def _grow(self, status: int) -> None:

@@ -17,11 +17,13 @@ from servotwin.hybrid.members import figures_of
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted import (
     TICKED,
+    UNFILLED,
     LiftedMemory,
     Loop,
     Place,
     Places,
     Segments,
+    fill_here,
     note,
     run_lifted,
     sample_lifted,
@@ -134,10 +136,14 @@ def run_one(
             continue
         for i in range(4):
             worker.coefficients[i] = starts.reference[k] * family.coefficients[piece, i]
-        status = run_lifted(
-            worker.tables, loop, places, worker.coefficients, family.times[piece], rate, z, worker.place, stop,
-            segments, record, worker.scratch, worker.lifted,
-        )  # fmt: skip
+        status = UNFILLED
+        while status == UNFILLED:
+            status = run_lifted(
+                worker.tables, loop, places, worker.coefficients, family.times[piece], rate, z, worker.place, stop,
+                segments, record, worker.scratch, worker.lifted,
+            )  # fmt: skip
+            if status == UNFILLED:
+                fill_here(worker.tables, loop, places, worker.place, worker.lifted)
         if status != DONE:
             return status
         if stop == end and (piece + 1 == len(family.times) or family.times[piece + 1] * rate - _LATE > end):
