@@ -143,6 +143,13 @@ def _double(n: int, power: int, w: LiftedWorkspace) -> None:
 
 
 @bare
+def _transpose(n: int, source: Array, base: int, target: Array, to: int) -> None:
+    for i in range(n):
+        for j in range(n):
+            target[to + j * n + i] = source[base + i * n + j]
+
+
+@bare
 def _fill_powers(t: LiftedTables, slot: int, w: LiftedWorkspace) -> None:
     n, n2 = t.states, t.states * t.states
     for i in range(n2):
@@ -158,13 +165,6 @@ def _fill_powers(t: LiftedTables, slot: int, w: LiftedWorkspace) -> None:
         _transpose(n, w.powers, j * n2, t.jump_fine, (slot * FINE + j) * n2)
     for j in range(COARSE):
         _transpose(n, w.powers, first + j * n2, t.jump_coarse, (slot * COARSE + j) * n2)
-
-
-@bare
-def _transpose(n: int, source: Array, base: int, target: Array, to: int) -> None:
-    for i in range(n):
-        for j in range(n):
-            target[to + j * n + i] = source[base + i * n + j]
 
 
 @bare

@@ -44,13 +44,13 @@ from servotwin.simulation.lifted import (
 )
 
 _ROOM = 4096
-# Ticks per piece of the inputs below which blocks do not pay.
-_TICKS_PER_PIECE = 64
+# Ticks, of a run and per piece of the inputs, below which blocks do not pay.
+_TICKS_PER_RUN, _TICKS_PER_PIECE = 20_000, 64
 
 
 def advances_in_blocks(servo: Servo, controller: Controller, inputs: RunInputs, samples: int) -> bool:
     """True for a noise-free run that `LiftedEngine` can do: a sampled law, an ideal sensor, ticks at every sample, and
-    inputs of few pieces with a tolerance that is constant in each."""
+    many ticks, inputs of few pieces with a tolerance that is constant in each."""
     if controller.sample_rate is None or servo.position_resolution != 0.0:
         return False
     ratio = controller.sample_rate / inputs.sample_rate
@@ -60,7 +60,7 @@ def advances_in_blocks(servo: Servo, controller: Controller, inputs: RunInputs, 
         return False
     signals = [inputs.reference, inputs.gap, *([] if inputs.tolerance is None else [inputs.tolerance])]
     pieces = sum(signal.times.size - 1 for signal in signals)
-    return pieces * _TICKS_PER_PIECE <= max(samples - 1, 1) * round(ratio)
+    return (samples - 1) * round(ratio) >= max(pieces * _TICKS_PER_PIECE, _TICKS_PER_RUN)
 
 
 def places_of(plant: ServoAutomaton, controller: Controller, delay: int, reference_degree: int) -> Places:
