@@ -114,8 +114,8 @@ def learning_twin(
         estimator, wear = estimator_of(model, settings), Wear(0.0)
         for number, case in enumerate(step_windows(run, loop, model, noise, rng)):
             now = case.window.mid_time
-            expected = wear.expect(settings.trend, "boot", now, now, settings.machine)
+            expected = wear.expect(settings.trend, "boot", now, now, settings.learning)
             estimate = estimator(case.window, expected)
-            wear, _ = wear.update(settings.trend, "boot", estimate, now, settings.machine)
+            wear, _ = wear.update(settings.trend, "boot", estimate, now, settings.learning)
             tally.add(case, estimate, number >= 10)
     return tally

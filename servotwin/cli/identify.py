@@ -83,8 +83,8 @@ def identify(options: IdentifyOptions) -> Identification:
     estimates = []
     for window in windows:
         now = window.mid_time
-        estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now, settings.machine)))
-        wear, _ = wear.update(settings.trend, "log", estimates[-1], now, settings.machine)
+        estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now, settings.learning)))
+        wear, _ = wear.update(settings.trend, "log", estimates[-1], now, settings.learning)
     limit, trend = settings.gap_limit, wear.trend(settings.trend)
     until = None if limit is None or trend is None else trend.time_until(limit)
     return Identification(servo, windows, tuple(estimates), trend, until)

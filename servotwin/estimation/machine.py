@@ -26,9 +26,9 @@ _AGREEMENT = 4.0  # standard deviations, of the distance of two readings with 3 
 _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
 
 
-@settings("machine")
+@settings("learning")
 @dataclass(frozen=True)
-class MachineSettings:
+class LearningSettings:
     """How the twin learns the machine's stiffness, damping and pitch.
 
     How far they may be off at first is stated by `k_percent`, `c_percent` and `m_percent` of the uncertainty.
@@ -74,7 +74,7 @@ class MachineSettings:
         return np.square([self.k_floor, self.c_floor, self.pitch_floor])
 
 
-class Machine(Struct, frozen=True):
+class LearntMachine(Struct, frozen=True):
     """What is known of a machine after some windows.
 
     Attributes
@@ -87,7 +87,7 @@ class Machine(Struct, frozen=True):
         Windows that counted.
     alarm : str
         Sentence on a machine that is not what was learnt; empty without one.
-    rival : Machine or None
+    rival : LearntMachine or None
         What windows since then say that contradict it.
     """
 
@@ -96,9 +96,9 @@ class Machine(Struct, frozen=True):
     time: float
     windows: int = 1
     alarm: str = ""
-    rival: Machine | None = None
+    rival: LearntMachine | None = None
 
-    def prior(self, given: MachineSettings, now: float) -> FactorPrior:
+    def prior(self, given: LearningSettings, now: float) -> FactorPrior:
         """What is known at a time, s."""
         covariance = np.array(self.covariance).reshape(3, 3) + np.diag(given.walk(now - self.time))
         short = np.maximum(0.0, given.floor - np.diag(covariance))
@@ -110,21 +110,21 @@ class Machine(Struct, frozen=True):
         return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
 
 
-def nameplate(given: MachineSettings, k: float, c: float, m: float) -> FactorPrior:
+def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
     """Prior before any window, for half-widths of stiffness, damping and mass within which all values are alike."""
     return FactorPrior.of_spreads(math.hypot(k, m) / math.sqrt(3.0), math.hypot(c, m) / math.sqrt(3.0), given.pitch)
 
 
 def updated(
-    before: Machine | None, given: MachineSettings, estimate: GapEstimate, counts: bool, now: float
-) -> Machine | None:
+    before: LearntMachine | None, given: LearningSettings, estimate: GapEstimate, counts: bool, now: float
+) -> LearntMachine | None:
     """What is known after a window.
 
     Parameters
     ----------
-    before : Machine, optional
+    before : LearntMachine, optional
         None: no window has counted yet.
-    given : MachineSettings
+    given : LearningSettings
     estimate : GapEstimate
         With its reading, if it has one.
     counts : bool
@@ -135,15 +135,16 @@ def updated(
     reading = estimate.machine
     if reading is None:
         return before
-    if estimate.ok:
-        if not counts:
-            return before
+    if estimate.ok and not counts:
+        return before
+    # A window may show the machine's numbers, and the gap not well enough.
+    if estimate.ok or estimate.status is GapStatus.UNIDENTIFIABLE:
         windows = 1 if before is None else before.windows + 1
         alarm = "" if before is None else _drift(before.prior(given, now), reading)
-        return Machine(reading.factors, reading.covariance, now, windows, alarm)
-    if before is None or estimate.status is not GapStatus.MODEL_MISMATCH:
+        return LearntMachine(reading.factors, reading.covariance, now, windows, alarm)
+    if before is None:
         return before
-    rival = Machine(reading.factors, reading.covariance, now)
+    rival = LearntMachine(reading.factors, reading.covariance, now)
     if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"

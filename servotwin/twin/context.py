@@ -76,7 +76,10 @@ def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
     """
     try:
         servo = msgspec.convert(_nested(parts, _MODEL), Servo)
-        values = _nested(parts, _SETTINGS)
+        values = {
+            "learning": {"learn": False},
+            **_nested(parts, _SETTINGS),
+        }  # versions without this part learnt nothing
         estimator = values.pop("estimator", None)
         if estimator is not None:
             estimator = msgspec.convert(estimator, METHODS[values["method"]].settings)

@@ -17,7 +17,7 @@ from servotwin.estimation import whitened
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import estimate_gap, settings_of
-from servotwin.estimation.machine import Machine, MachineSettings, nameplate, updated
+from servotwin.estimation.machine import LearningSettings, LearntMachine, nameplate, updated
 from servotwin.estimation.offset import estimate_carrying
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -27,7 +27,7 @@ from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED
 from servotwin.twin.settings import TwinSettings
 
-NOT_LEARNING = MachineSettings(learn=False)
+NOT_LEARNING = LearningSettings(learn=False)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Wear(Struct, frozen=True):
         Boot and arrival (s, on the twin's clock) of the last window that changed the trend.
     state : TrendState or None
         None before the first estimate.
-    machine : Machine or None
+    machine : LearntMachine or None
         None before a window told of the machine's numbers.
     """
 
@@ -140,14 +140,14 @@ class Wear(Struct, frozen=True):
     boot: str = ""
     arrived: float = 0.0
     state: TrendState | None = None
-    machine: Machine | None = None
+    machine: LearntMachine | None = None
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
         return None if self.state is None else self.state.trend(settings)
 
     def expect(
-        self, settings: TrendSettings, boot: str, time: float, now: float, learning: MachineSettings = NOT_LEARNING
+        self, settings: TrendSettings, boot: str, time: float, now: float, learning: LearningSettings = NOT_LEARNING
     ) -> Expectation:
         """Expectation of a window of `boot` with its middle at `time` (s) that arrived at `now`.
 
@@ -163,7 +163,7 @@ class Wear(Struct, frozen=True):
         boot: str,
         estimate: GapEstimate,
         now: float,
-        learning: MachineSettings = NOT_LEARNING,
+        learning: LearningSettings = NOT_LEARNING,
     ) -> tuple[Wear, str]:
         """Return trend and machine after an estimate, and the reason for which no update may follow; empty: it may."""
         wear, rejection = self._update_trend(settings, boot, estimate, now)
@@ -216,8 +216,8 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
     options, known = settings_of(settings.method, settings.estimator), settings.uncertainty
-    learns = settings.machine.learn and servo.rigid
-    new = nameplate(settings.machine, known.k, known.c, known.m) if learns else None
+    learns = settings.learning.learn and servo.rigid
+    new = nameplate(settings.learning, known.k, known.c, known.m) if learns else None
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
         if not isinstance(options, whitened.WhitenedSettings):

@@ -13,7 +13,7 @@ from servotwin.config.toml import part, read
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
-from servotwin.estimation.machine import MachineSettings
+from servotwin.estimation.machine import LearningSettings
 from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
@@ -134,8 +134,8 @@ class TwinSettings:
     trend: Annotated[TrendSettings, key(makers={"": wear}, select=trend_maker, help="Assumptions on wear.")] = field(
         default_factory=TrendSettings
     )
-    machine: Annotated[MachineSettings, key(help="How the machine's stiffness, damping and pitch are learnt.")] = field(
-        default_factory=MachineSettings
+    learning: Annotated[LearningSettings, key(help="How the machine's stiffness, damping and pitch are learnt.")] = (
+        field(default_factory=LearningSettings)
     )
     gap_limit: Annotated[
         float | None,

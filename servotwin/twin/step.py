@@ -138,7 +138,7 @@ def next_wake(model: TwinModel, state: TwinState) -> float | None:
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
     """Process a window: estimate, redesign, and request."""
     message, arrived, trends = event.window, event.time, model.settings.trend
-    learning = model.settings.machine
+    learning = model.settings.learning
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records = DecodedWindow.of(message), list[Record]()
     if model.triage is not None and state.triage is not None and decoded.window is not None:

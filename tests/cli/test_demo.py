@@ -10,23 +10,26 @@ from servotwin.cli import demo
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
-    console = Console(file=io.StringIO(), width=80)
-    path = demo.demo(tmp_path_factory.mktemp("demo"), console=console)
-    return path, console.file.getvalue()
+    """The report's path, the text in the terminal, and the three runs that both show."""
+    console, compared, compare = Console(file=io.StringIO(), width=80), [], demo.compare
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "compare", lambda *given: compared.append(compare(*given)) or compared[-1])
+        path = demo.demo(tmp_path_factory.mktemp("demo"), console=console)
+    return path, console.file.getvalue(), compared[0]
 
 
 @pytest.mark.slow
 def test_the_terminal_shows_every_step_within_eighty_columns(shown):
-    _, text = shown
+    path, text, _ = shown
     rows = [line for line in text.splitlines() if line[:2].strip().isdigit()]
     assert [int(line.split()[0]) for line in rows] == list(range(1, 11))
     assert all(line.count("rests") + line.count("swings") == 3 for line in rows)
     assert "…" not in text
-    assert f"report: {shown[0]}" in text
+    assert f"report: {path}" in text
 
 
 def test_the_report_stands_alone(shown):
-    path, _ = shown
+    path = shown[0]
     page = path.read_text()
     assert "data:image/svg+xml;base64," in page
     assert 'src="http' not in page
@@ -34,8 +37,8 @@ def test_the_report_stands_alone(shown):
 
 
 @pytest.mark.slow
-def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does():
-    result = demo.compare(*demo.scenarios("paper"), Console(file=io.StringIO()))
+def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does(shown):
+    result = shown[2]
     rows = demo.demo_steps(result)
     assert [row.twinned.settled for row in rows] == [True] * 10
     assert max(row.left for row in rows) < 5e-6

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ ROOT = Path(__file__).parents[2]
 OPERATOR = ROOT / "docs/operator"
 GUIDE, ALARM = (OPERATOR / "guide.md").read_text(), (OPERATOR / "alarms.md").read_text()
 UNITS = OPERATOR / "systemd"
-PATIENCE = 240.0
+PATIENCE = 600.0
 ROW = re.compile(r"^\|(.+)\|$", re.MULTILINE)
 NAME = re.compile(r"`([^`]+)`")
 
@@ -61,6 +62,7 @@ def named(title: str) -> list[str]:
     return [name for cells in rows(title) for name in NAME.findall(cells[0])]
 
 
+@cache
 def trees(package: str) -> list[ast.Module]:
     """Parse every module of a package, so that a moved function is still found."""
     return [ast.parse(path.read_text()) for path in sorted((ROOT / "servotwin" / package).rglob("*.py"))]

@@ -13,7 +13,7 @@ from servotwin.estimation import whitened
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.machine import Machine, MachineSettings, nameplate, updated
+from servotwin.estimation.machine import LearningSettings, LearntMachine, nameplate, updated
 from servotwin.estimation.offset import estimate_carrying
 from servotwin.estimation.whitened.free_model import FactorPrior, FreeProblem, adapted, contact_evidence
 from servotwin.estimation.whitened.learning import look_around
@@ -126,7 +126,7 @@ def test_a_nameplate_wrong_by_a_factor_of_two_is_said_and_not_estimated():
     assert estimate.status is GapStatus.MODEL_MISMATCH
 
 
-GIVEN = MachineSettings()
+GIVEN = LearningSettings()
 
 
 def reading_of(factors, std=1e-3, status=GapStatus.OK):
@@ -177,7 +177,7 @@ def test_the_nameplates_spread_is_that_of_the_stated_ranges():
 
 def test_a_machine_survives_its_encoding():
     machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0)), True, 5.0)
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(machine), type=Machine) == machine
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(machine), type=LearntMachine) == machine
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from servotwin.up.enrolment import Enrolment, enroll
 RATE, WINDOW_S = 500.0, 0.8
 EVERY = 410
 """Samples between changes of the reference: windows follow each other closely."""
-PATIENCE = 120.0
+PATIENCE = 240.0
 TWIN = """
 [service]
 port = {port}

@@ -15,7 +15,7 @@ from servotwin.drives.simulated.machine_state import read_state
 from servotwin.edge_process.config_file import load
 from servotwin.errors import InvalidInput
 from servotwin.store.store import open_store
-from servotwin.up import folder
+from servotwin.up import command, folder
 from servotwin.up.plan import SERVOS
 
 RUNNING = "x real time"
@@ -25,9 +25,9 @@ PATIENCE_S = 120.0
 @contextmanager
 def started(path: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`servotwin up` in a group of its own; whatever is left of it in the end is killed."""
-    command = [sys.executable, "-m", "servotwin", "up", "--folder", str(path), *options]
+    arguments = [sys.executable, "-m", "servotwin", "up", "--folder", str(path), *options]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
     assert process.stdout is not None
     try:
@@ -57,10 +57,10 @@ def left_behind(path: Path) -> list[int]:
     result = []
     for entry in Path("/proc").iterdir():
         try:
-            command = (entry / "cmdline").read_bytes() if entry.name.isdecimal() else b""
+            words = (entry / "cmdline").read_bytes() if entry.name.isdecimal() else b""
         except OSError:
             continue
-        if b"servotwin.runtime.child_process" in command and os.fsencode(path) in command:
+        if b"servotwin.runtime.child_process" in words and os.fsencode(path) in words:
             result.append(int(entry.name))
     return result
 
@@ -172,11 +172,19 @@ def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [("--speed", "0"), ("--speed", "101"), ("--for", "-1")])
-def test_an_invalid_speed_or_time_is_refused(tmp_path: Path, options: tuple[str, str]) -> None:
-    command = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def test_an_invalid_speed_is_refused_by_the_process(tmp_path: Path) -> None:
+    arguments = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), "--speed", "0"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert options[0] in done.stderr
+    assert "--speed" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "up").exists()
+
+
+@pytest.mark.parametrize(("option", "value"), [("--speed", 101.0), ("--for", -1.0)])
+def test_an_invalid_speed_or_time_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, value: float
+) -> None:
+    monkeypatch.setattr(command, "opened", lambda *_: pytest.fail("it starts"))
+    with pytest.raises(InvalidInput, match=option):
+        command.up(tmp_path / "up", **{"speed" if option == "--speed" else "seconds": value})

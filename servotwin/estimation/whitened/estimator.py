@@ -16,7 +16,7 @@ from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
-from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     ModelShift,
@@ -38,6 +38,7 @@ from servotwin.plant.signals import Array
 __all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "fit", "shortest_window"]
 
 METHOD = "whitened"
+_ONE_CONTACT = "one contact with a model that is a little off explains the window nearly as well as two"
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
 
@@ -115,16 +116,25 @@ class WindowFit:
         status, reasons = judge(evidence, self.settings)
         if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
             status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
-        if status is GapStatus.OK:
+        teaches = self._teaches(evidence, status)
+        if status is GapStatus.OK or teaches or (self.learnt is not None and status is GapStatus.LOWER_BOUND):
             contacts = contacts_seen(self.aligned, self.servo)
-            if not contacts.two:
-                return _one_contact(self.blank, evidence, contacts, self.settings)
+            if status is not GapStatus.UNIDENTIFIABLE and not contacts.two:
+                reasons = reasons or (_ONE_CONTACT,)
+                return _one_contact(self.blank, evidence, contacts.lead, reasons, self.settings)
+            teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
             reasons = (*likely_fault(self.window, self.angle, self.servo, evidence.unexplained), *reasons)
         stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
-        if self.learnt is None or not stated.ok:
+        if self.learnt is None or not teaches:
             return stated
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
+
+    def _teaches(self, evidence: FitEvidence, status: GapStatus) -> bool:
+        """True where the window shows the machine's numbers, whether or not it shows the gap well enough."""
+        known = self.learnt is not None and bool(np.all(np.isfinite(self.learnt.free.covariance)))
+        wide = status is GapStatus.UNIDENTIFIABLE and math.isfinite(evidence.interval[1]) and not self.one_sided()
+        return known and (status is GapStatus.OK or wide)
 
 
 def fit(
@@ -214,15 +224,14 @@ def _travel(result: WhitenedFit) -> Travel:
 
 
 def _one_contact(
-    blank: GapEstimate, evidence: FitEvidence, contacts: ContactEvidence, settings: WhitenedSettings
+    blank: GapEstimate, evidence: FitEvidence, lead: float, reasons: tuple[str, ...], settings: WhitenedSettings
 ) -> GapEstimate:
-    """State a lower bound: one contact explains the window too, and then the gap is as wide as the lead at least."""
-    bound = max(0.0, min(contacts.lead - NORMAL_95 * settings.model_error, lower_bound(evidence, settings)))
-    reason = "one contact with a model that is a little off explains the window nearly as well as two"
+    """State a lower bound: one contact explains the window too, and then the gap is as wide as the lead (rad)."""
+    bound = max(0.0, min(lead - NORMAL_95 * settings.model_error, lower_bound(evidence, settings)))
     return replace(
         blank,
         status=GapStatus.LOWER_BOUND,
-        reasons=(reason,),
+        reasons=reasons,
         gap=bound,
         interval=(bound, math.inf),
         rms=_left(evidence.aligned.whitened),

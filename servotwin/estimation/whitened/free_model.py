@@ -32,7 +32,10 @@ _STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
 _SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
 _FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
-_STEPS, _GAIN = 12, 1e-4  # of a fit; of the cost, in a whitened window far below one standard deviation of anything
+_EVALUATIONS, _GAIN = (
+    12,
+    1e-4,
+)  # of a fit; of the cost, in a whitened window far below one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
 _ANY = (0.0, math.inf)
 
@@ -148,8 +151,10 @@ class FreeProblem:
             return moved
         return [*moved, (_softened(self.servo, tuple(factors), rate), _SOFT / self.compliance)]
 
-    def descend(self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY) -> FreeFit:
-        """Descend from a start (5,); of gap and place only what is `free` moves.
+    def descend(
+        self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
+    ) -> FreeFit:
+        """Descend from a start (5,) with at most so many evaluations; of gap and place only what is `free` moves.
 
         It ends early once the cost is below the first number of `within`, or once even the linearised problem cannot
         bring it below the second: its value is then not that of the minimum, but on the same side of both.
@@ -160,7 +165,7 @@ class FreeProblem:
         q, damping = np.clip(start, low, high), _FIRST_DAMPING
         residual, rows = self.rows(q)
         cost, count = float(residual @ residual), 1
-        while count < _STEPS and damping < _LARGEST_DAMPING and cost > enough:
+        while count < evaluations and damping < _LARGEST_DAMPING and cost > enough:
             if _linear_floor(residual, rows, movable) > hopeless:
                 break
             trial = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high)
@@ -246,7 +251,8 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
         The fit of two contacts.
     """
     mean = problem.prior.mean
-    believed = problem.descend(np.array([*two, *mean]), (True, True))
+    # One evaluation: the fit is a minimum already, and a little too high a cost only makes the second contact weaker.
+    believed = problem.descend(np.array([*two, *mean]), (True, True), evaluations=1)
     variance = max(1.0, believed.cost / max(1, misfit.position.size))
     wide, allowed = problem.largest, BELIEVED * variance
     places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
