@@ -3,9 +3,9 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
-import msgspecfrom types import SimpleNamespace
-
+import msgspec
 import numpy as np
 import pytest
 
