@@ -10,9 +10,9 @@ import numpy as np
 from benchmarks.contest import Contestant
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import Trial
 from servotwin.redesign.certified.certificate import Certificate, Demands
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
 KNOWN_BIAS = (-2e-4, 2e-4)  # V
@@ -28,10 +28,11 @@ def decisions(quick: bool) -> tuple[Contestant, ...]:
 
 
 def _decision(name: str, gap_deg: tuple[float, float], bias: tuple[float, float], quick: bool) -> Contestant:
-    servo, demands, trial = Servo.preset("paper"), Demands(), Trial()
+    servo, demands = Servo.preset("paper"), Demands()
     if quick:
-        demands, trial = replace(demands, plants=4, conditions=4, screened=2), replace(trial, duration=30.0)
+        demands = replace(demands, machines=16, conditions=4, screened=2, settled=0.8)
     known = Uncertainty(gap=(math.radians(gap_deg[0]), math.radians(gap_deg[1])), input_bias=bias)
+    trial = trial_for(servo, known, demands)
 
     def job() -> Array:
         result = certify(servo, known, demands, trial)

@@ -41,9 +41,9 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     10, 30 and 60 deg.
     """
     policy = CertifiedPolicy(model, known)
-    demands = replace(policy.demands, Ms=_NOT_BOUND)
+    demands = replace(policy.demands, Ms=_NOT_BOUND, Ms_worst=_NOT_BOUND, shapes=((1.0, 1.0),))
     own, policies = model.controller, {}
-    for setting in candidates_of(model, demands, 0.0, disturbed=True, noisy=False):
+    for setting in candidates_of(model, known, demands, disturbed=True, noisy=False):
         law = setting.controller
         policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
     for share in (1.0 / 6.0, 0.5, 1.0):

@@ -13,10 +13,11 @@ from benchmarks.policies.machines import BLOCKS, TrialMachine, machines
 from benchmarks.policies.trial import Contender, Scores, run_machine
 from servotwin.analysis.maps.pool import shared
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import STILL
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
 LEAST_SETTLED = 0.99
+STILL = 1e-6
+"""m: half peak-to-peak of the error below which a machine counts as settled in this table."""
 _SCREENED, _FEWEST, _FINALISTS = 0.2, 20, 4
 
 

@@ -141,8 +141,10 @@ def start_of(fallback: FallbackSet) -> Parameters:
 def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
     own, demands = policy.servo.controller, policy.demands_within_band()
-    scales = [setting.controller.Kp / own.Kp for setting in candidates_of(policy.servo, demands, 0.0, True, False)]
-    middle, factor = math.sqrt(min(scales) * max(scales)), math.sqrt(max(scales) / min(scales)) * _ROUNDING
+    laws = [setting.controller for setting in candidates_of(policy.servo, policy.uncertainty, demands, True, False)]
+    ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
+    middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
+    factor = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values()) * _ROUNDING
     leave = max((leave for _, leave in demands.hysteresis), default=1.0)
     limits = Limits(
         maximum=demands.tolerance,
@@ -151,7 +153,11 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
         feedforward=policy.feedforward_limit * _ROUNDING,
         patience_s=PATIENCE,
     )
-    return limits, Gains(own.Kp * middle, own.Ki, own.Kd * middle, own.Tf, 0.0, max(leave, own.leave) / factor)
+    return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)
+
+
+def _range(values: list[float]) -> tuple[float, float]:
+    return min(map(abs, values)), max(map(abs, values))
 
 
 def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:

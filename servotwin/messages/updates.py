@@ -57,6 +57,11 @@ class Verification(Struct, frozen=True):
         Of the model without a gap: the sensitivity's peak; rad/s and rad.
     saturated : bool
         True where a machine reached the voltage limit.
+    settled_least, confidence : float
+        Lower bound of the share that settles, and its confidence; 0 in those of versions that had none.
+    Ms_worst, phase_margin_worst : float
+        Worst of all plants in the uncertainty, at the controller's own rate: peak, and rad; 0 in those of versions that
+        had none.
     """
 
     members: Count
@@ -68,6 +73,10 @@ class Verification(Struct, frozen=True):
     crossover: float
     phase_margin: float
     saturated: bool
+    settled_least: float = 0.0
+    confidence: float = 0.0
+    Ms_worst: float = 0.0
+    phase_margin_worst: float = 0.0
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:

@@ -33,9 +33,10 @@ class Design:
         return Setting(self.tolerance, gains_of(self.controller), band)
 
     @property
-    def continuous(self) -> Design:
-        """The same design in continuous time, in which candidates are simulated."""
-        return Design(self.controller.replace(sample_rate=None, rate_limit=None), self.tolerance)
+    def simulated(self) -> Design:
+        """The design as it is simulated: as it runs, but that a law in continuous time has no rate limit."""
+        law = self.controller
+        return self if law.sample_rate is not None else Design(law.replace(rate_limit=None), self.tolerance)
 
     def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
         """Voltage (V rms) caused by white measurement noise of `noise` (m rms) within `band` (Hz).

@@ -305,4 +305,8 @@ def verification_of(certificate: Certificate) -> Verification:
         crossover=certificate.crossover,
         phase_margin=certificate.phase_margin,
         saturated=certificate.saturated,
+        settled_least=certificate.settled_least,
+        confidence=certificate.confidence if certificate.settled_least else 0.0,
+        Ms_worst=0.0 if certificate.loop is None else certificate.loop.Ms_worst,
+        phase_margin_worst=0.0 if certificate.loop is None else certificate.loop.phase_margin_worst,
     )

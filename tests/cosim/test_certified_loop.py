@@ -67,7 +67,7 @@ def test_evidence_goes_with_the_update_and_stays_in_the_store():
     for update, redesign in zip(loop().updates, sent, strict=True):
         assert isinstance(redesign.certificate, Certificate)
         assert update.verification == verification_of(redesign.certificate)
-        assert update.verification.members == 256
+        assert update.verification.members == 300
         assert update.verification.settled >= 0.99
         assert update.verification.Ms <= 2.0
         assert update.setting.band == redesign.setting.band

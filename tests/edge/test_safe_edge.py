@@ -14,7 +14,7 @@ from servotwin.cosim import Cosimulation, simulation_of
 from servotwin.messages import Cause, Gains, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
-from servotwin.redesign.certified.assess import Trial, assess
+from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -22,7 +22,7 @@ from servotwin.redesign.certified.uncertainty import draw as members_of
 from servotwin.simulation import Simulation
 from servotwin.twin.settings import TwinSettings
 
-QUICK = TwinSettings(demands=Demands(plants=8, screened=4, scales=(0.7, 1.0)))
+QUICK = TwinSettings(demands=Demands(machines=64, screened=4, scales=(0.5, 0.7), settled=0.95))
 """Settings verified on fewer machines than usual."""
 
 
@@ -68,9 +68,11 @@ def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -
 def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
     """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be."""
     policy = CertifiedPolicy(hostile.model())
-    candidates = candidates_of(policy.servo, policy.demands_within_band(), 0.0, disturbed=True, noisy=False)
+    candidates = candidates_of(
+        policy.servo, policy.uncertainty, policy.demands_within_band(), disturbed=True, noisy=False
+    )
     known = policy.uncertainty.replace(input_bias=(-policy.bias_floor, policy.bias_floor))
-    for outcome in assess(candidates, members_of(policy.servo, known, 16, 8, seed=3), Trial()):
+    for outcome in assess(candidates, members_of(policy.servo, known, 16, 8, seed=3), policy.simulations):
         assert outcome.tail.max() < hostile.band().error
 
 

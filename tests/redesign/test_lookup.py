@@ -17,8 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import Trial
-from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import (
     CellIndex,
     CertifiedTable,
@@ -31,6 +30,7 @@ from servotwin.redesign.certified.lookup import (
 )
 from servotwin.redesign.certified.lookup_file import build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence
@@ -43,8 +43,8 @@ GRID = Grid(finest=15.0 * DEG, biases=(1e-2, 5e-2), noises=(0.0, 1e-5))
 POLICY = CertifiedPolicy(
     SERVO,
     Uncertainty(gap=(0.0, 30.0 * DEG), input_bias=(-0.1, 0.1)),
-    Demands(plants=8, conditions=4, screened=2),
-    Trial(duration=30.0, last=10.0),
+    Demands(machines=16, conditions=4, screened=2, settled=0.8, integral=(0.0,), beyond=Beyond(machines=4)),
+    Trial(),
     clock=lambda: 0.0,
 )
 

@@ -76,8 +76,9 @@ def test_certified_designs_for_the_controller_that_runs():
     law = policy.fallback().setting.controller
     assert (law.loop_filter_hz, law.sample_rate) == (20.0, 5000.0)
     assert policy.feedforward_limit == 0.1
-    assert policy.fallback().Ms == pytest.approx(PAPER.margins(law).Ms)
-    assert policy.fallback().Ms != pytest.approx(PAPER.margins(law.replace(loop_filter_hz=None)).Ms, rel=1e-3)
+    # Nearly those of continuous time: at 5 kHz the hold costs little.
+    assert policy.fallback().Ms == pytest.approx(PAPER.margins(law).Ms, rel=3e-3)
+    assert policy.fallback().Ms != pytest.approx(PAPER.margins(law.replace(loop_filter_hz=None)).Ms, rel=1e-2)
 
 
 @pytest.mark.slow
@@ -123,7 +124,7 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
 @pytest.mark.slow
 def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"no fallback set for the servo's stated range: none of \d+ candidates"):
-        load(tmp_path, "[twin.uncertainty]\ninput_bias_v = [0, 0]\n[twin.demands]\novershoot_percent = 0.5")
+        load(tmp_path, "[twin.demands]\nsettled_percent = 100")
 
 
 def test_an_unstable_loop_is_refused_under_every_policy(tmp_path):
@@ -169,14 +170,16 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
-    laws = [s.controller for s in candidates_of(policy.servo, Demands(), math.radians(5.0), True, True)]
+    laws = [s.controller for s in candidates_of(policy.servo, policy.uncertainty, Demands(), True, True)]
     for law in laws:
         for fed in (-0.1, 0.1):
             assert limits.allows_gains(gains_of(law.replace(feedforward=fed)), own)
     first = laws[0]
     for change in (
-        {"Kp": 1.01 * max(law.Kp for law in laws)},
-        {"Kp": 0.99 * min(law.Kp for law in laws)},
+        {"Kd": 1.01 * min(law.Kd for law in laws)},
+        {"Kd": 0.99 * max(law.Kd for law in laws)},
+        {"Kp": 1.5 * max(law.Kp for law in laws)},
+        {"Kp": 0.6 * min(law.Kp for law in laws)},
         {"Ki": 1.01 * max(law.Ki for law in laws)},
         {"Ki": -1.0},
         {"feedforward": 0.101},

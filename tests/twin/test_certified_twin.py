@@ -21,7 +21,7 @@ from servotwin.twin.settings import TwinSettings
 from servotwin.twin.step import verification_of
 
 PAPER = Servo.preset("paper")
-FEW = Demands(plants=4, screened=2, scales=(0.7, 1.0))
+FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8)
 SETTINGS = TwinSettings(demands=FEW)
 
 

@@ -28,7 +28,7 @@ from servotwin.twin.work import work
 DEG = math.pi / 180.0
 SCENARIO = Scenario.preset("certified").replace(gap=12.0 * DEG, duration=145.0, name="axis")
 GRID = Grid(finest=30.0 * DEG, biases=(1e-2,), noises=(0.0,))
-SETTINGS = TwinSettings(demands=Demands(plants=4, conditions=4, screened=2), triage=TriageSettings())
+SETTINGS = TwinSettings(demands=Demands(machines=16, conditions=4, screened=2, settled=0.8), triage=TriageSettings())
 SERVO = SCENARIO.model
 
 

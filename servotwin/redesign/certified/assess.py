@@ -1,4 +1,8 @@
-"""Simulation of settings on many machines within the model's uncertainty, and the measures of each."""
+"""Simulation of settings on many machines within the model's uncertainty, and the measures of each.
+
+A controller with a sample rate is simulated as the sampled loop that runs: its own tick at its rate, delay, counts of
+the sensor, limits; exact between samples. A continuous one is simulated in continuous time.
+"""
 
 from __future__ import annotations
 
@@ -11,35 +15,21 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
 from servotwin.simulation.ensemble import Cases, summarise_members
-
-STILL = 1e-6
-"""m: half peak-to-peak of the error below which a loop counts as settled."""
+from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 
 NEAR = 0.02
-"""Share of the largest step within which the loop has arrived."""
+"""Share of the step within which the loop has arrived."""
+COUNTS = 2.0
+"""Counts of the position sensor within which the loop may hunt: a quantised loop without friction has no rest."""
 
-
-@dataclass(frozen=True)
-class Trial:
-    """Duration and sampling of the simulations.
-
-    Parameters
-    ----------
-    duration, last : float
-        s: length of a run from rest with one step of the reference, and of its judged last part.
-    rate : float
-        Hz, at which errors and voltages are sampled.
-    threads : int, optional
-        As many as there are processors by default.
-    """
-
-    duration: float = 60.0
-    last: float = 10.0
-    rate: float = 50.0
-    threads: int | None = None
+# Half peak-to-peak of the error of a loop that has settled: shares of the step and of the lost motion. A limit cycle in
+# a gap is several times as large as the lost motion; where there is hardly a gap, only the step counts.
+_STILL_STEP, _STILL_GAP, _STILL_LEAST = 1e-2, 2e-2, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +48,13 @@ class MachineMeasures:
         Largest error beyond the mean of the last part, per step and error there: the error that an input bias leaves is
         not overshoot.
     settling : array
-        s, last time at which the error is beyond `nearness`.
+        s, last time at which the error is beyond `nearness` of the largest step.
     cost : array
         s, integral of abs(error) over the whole run, per step.
     saturated : array of bool
         True where the voltage met its limit.
+    still, near : array
+        m, ripple and tail below which the loop has settled.
     """
 
     ripple: Array
@@ -73,56 +65,115 @@ class MachineMeasures:
     settling: Array
     cost: Array
     saturated: NDArray[np.bool_]
+    still: Array
+    near: Array
+
+    @property
+    def at_rest(self) -> NDArray[np.bool_]:
+        """(P, C), True where the loop came to rest, wherever that is."""
+        return self.ripple <= self.still
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """(P, C), True where the loop settled."""
-        return self.ripple < STILL
+        """(P, C), True where the loop came to rest near its reference."""
+        return self.at_rest & (self.tail <= self.near)
 
 
 def assess(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[MachineMeasures]:
-    """Simulate every setting on every machine, exactly and in continuous time; the reference steps once from rest."""
+    """Simulate every setting on every machine, exactly; the reference steps once from rest.
+
+    Parameters
+    ----------
+    settings : sequence of Design
+        All continuous, or all sampled.
+    members : SimulatedMachines
+    trial : Trial
+    """
     laws = np.empty((len(settings), 1, 1), dtype=object)
-    laws[:, 0, 0] = [setting.continuous.controller for setting in settings]
+    laws[:, 0, 0] = [setting.simulated.controller for setting in settings]
     plants = np.empty((len(members.plants), 1), dtype=object)
     plants[:, 0] = members.plants
-    tolerance = np.array([setting.tolerance for setting in settings])[:, None, None]
-    figures = summarise_members(
-        plants,
-        laws,
-        trial.duration,
-        Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias, members.friction),
-        trial.last,
-        {"error": np.stack([nearness(setting, members.input_bias, members.step.max()) for setting in settings])},
-        ("error", "voltage"),
-        trial.rate,
-        trial.threads,
-    )
+    near = np.stack([nearness(setting, members, members.step.max()) for setting in settings])
+    figures = _figures(laws, plants, np.array([setting.tolerance for setting in settings]), members, near, trial)
     # The voltage of a saturated machine equals its limit exactly, so that reaching it is what counts.
     limits = [setting.controller.voltage_limit or math.inf for setting in settings]
+    still = stillness(members)
     return [
-        _measures(_of(figures["error"], k), _of(figures["voltage"], k), members.step, trial, limit)
+        _measures(
+            _of(figures["error"], k),
+            _of(figures["voltage"], k),
+            members,
+            trial,
+            limit,
+            still,
+            nearness(settings[k], members, members.step),
+        )
         for k, limit in enumerate(limits)
     ]
 
 
-def nearness(setting: Design, input_bias: Array, step: float) -> Array:
-    """Error (m) within which the loop has arrived, for each input bias (V) and the largest step (m).
+def _figures(
+    laws: NDArray[np.object_],
+    plants: NDArray[np.object_],
+    tolerances: Array,
+    members: SimulatedMachines,
+    near: Array,
+    trial: Trial,
+) -> dict[str, Figures]:
+    tolerance = tolerances[:, None, None]
+    cases = Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias, members.friction)
+    outputs, limits = ("error", "voltage"), {"error": near}
+    if laws[0, 0, 0].sample_rate is None:
+        return summarise_members(
+            plants, laws, trial.duration, cases, trial.last, limits, outputs, trial.rate, trial.threads
+        )
+    sampled = SampledCases(*cases, delay=members.delay, resolution=members.plants[0].position_resolution)
+    return summarise_sampled(
+        plants, laws, trial.duration, sampled, trial.last, limits, outputs, trial.rate, trial.threads
+    )
 
-    It is 2 % of the step, plus the error that an input bias leaves where nothing integrates, plus the dead zone.
+
+def stillness(members: SimulatedMachines) -> Array:
+    """(P, C) m, half peak-to-peak of the error below which a loop has come to rest: by step, lost motion and sensor."""
+    lost = members.plants[0].p * members.gap
+    moved = np.clip(_STILL_GAP * lost, _STILL_LEAST * members.step, _STILL_STEP * members.step)
+    return np.asarray(moved + COUNTS * members.plants[0].position_resolution)
+
+
+def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -> Array:
+    """(P, C) m, error within which the loop has arrived, for steps (m).
+
+    It is 2 % of the step, plus the error that input bias and friction leave where nothing integrates, plus the dead
+    zone and two counts of the sensor.
     """
+    model = members.plants[0]
+    return left_over(setting, model, members.input_bias, members.friction, step)
+
+
+def left_over(setting: Design, model: Servo, input_bias: Array, friction: Array, step: Array | float) -> Array:
+    """`nearness` for input biases (V) and frictions (N m)."""
     law = setting.controller
-    # In the steady state the proportional term must supply what the feedforward leaves of the bias.
-    steady = np.abs(input_bias + law.feedforward) / abs(law.Kp)
-    return np.asarray(max(NEAR * step, STILL) + steady + law.leave * setting.tolerance)
+    # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
+    # motor against what it answers to the error.
+    steady = (np.abs(input_bias + law.feedforward) + friction * model.R / model.k_T) / abs(law.Kp)
+    return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 
 
 def _of(figures: Figures, setting: int) -> Figures:
     return Figures(*(values[setting] for values in figures))
 
 
-def _measures(error: Figures, voltage: Figures, step: Array, trial: Trial, limit: float) -> MachineMeasures:
+def _measures(
+    error: Figures,
+    voltage: Figures,
+    members: SimulatedMachines,
+    trial: Trial,
+    limit: float,
+    still: Array,
+    near: Array,
+) -> MachineMeasures:
     """Measures from (P, C) figures."""
+    step = members.step
     return MachineMeasures(
         ripple=0.5 * (error.last_highest - error.last_lowest),
         tail=np.maximum(error.last_highest, -error.last_lowest),
@@ -132,4 +183,6 @@ def _measures(error: Figures, voltage: Figures, step: Array, trial: Trial, limit
         settling=error.outside / trial.rate,
         cost=error.mean_size * trial.duration / step,
         saturated=np.maximum(voltage.highest, -voltage.lowest) >= limit,
+        still=still,
+        near=near,
     )

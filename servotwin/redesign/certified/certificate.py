@@ -7,7 +7,47 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
+from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
 from servotwin.redesign.design import Design
+
+
+@settings("beyond")
+@dataclass(frozen=True)
+class Beyond:
+    """Ranges beyond the stated ones: a setting must settle in them too, though nobody stated them.
+
+    Parameters
+    ----------
+    machines : int
+        Machines that are simulated there.
+    """
+
+    k_T: Annotated[
+        float,
+        key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the motor's gain, relative."),
+    ] = 0.1
+    delay: Annotated[
+        int,
+        key(
+            "delay_samples",
+            minimum=0,
+            maximum=LARGEST_DELAY,
+            help="Longest delay between a measurement and its voltage, of a sampled controller.",
+        ),
+    ] = 3
+    friction: Annotated[
+        float,
+        key(
+            "friction_percent",
+            minimum=0.0,
+            help="Largest Coulomb friction, relative to the torque with which the servo's own Kp answers the smallest "
+            "step; none with an elastic screw.",
+        ),
+    ] = 0.2
+    machines: int = 60
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @settings("demands")
@@ -18,47 +58,143 @@ class Demands:
     Parameters
     ----------
     tail, tolerance : float
-        m: largest error of a member in the last part, widest dead zone.
+        m: largest error of a machine in the last part, widest dead zone.
     scales : tuple of float
         Factors on Kp and Kd.
+    shapes : tuple of (float, float)
+        Factors on Kd / (Kp Tf) and on Tf, tried with every scale: they move the derivative action.
     integral : tuple of float
-        Factors on Ki, tried where there is friction, or where the input bias is known to no better than `bias_known`.
-    bias_known : float
-        V.
+        Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
+    known : float
+        Share of the smallest step: a bias that leaves a smaller error under the servo's own Kp counts as known.
     hysteresis : tuple of (float, float)
         enter and leave of a dead zone of p gap, tried beside no dead zone where there is noise.
     effort_weight : float
-        s/V: cost of a volt (rms) of measurement noise in the voltage, beside seconds of error.
-    screened, plants, conditions : int
-        Plants that rank the candidates, plants of the verification, and conditions of each.
+        Cost of measurement noise in the voltage, in periods 1 / crossover, where it is as large (rms) as the answer of
+        the servo's own Kp to the largest step.
+    screened, conditions : int
+        Plants that rank the candidates, and conditions of each.
+    machines : int
+        Machines of the verification, drawn independently of one another and of those that rank.
     attempts : int
-        Candidates that are simulated on all machines before the search gives up.
+        Candidates that are verified before the search gives up, each on machines of its own.
     """
 
     Ms: Annotated[
         float, key(minimum=1.0, help="Largest sensitivity peak of the loop without a gap on the model itself.")
     ] = 2.0
+    Ms_worst: Annotated[
+        float,
+        key(
+            minimum=1.0,
+            help="Largest sensitivity peak of the loop without a gap on any plant of the stated ranges and beyond.",
+        ),
+    ] = 2.2
     settled: Annotated[
-        float, key("settled_percent", minimum=0.0, maximum=1.0, help="Least share of the members that settle.")
+        float,
+        key(
+            "settled_percent",
+            minimum=0.0,
+            maximum=1.0,
+            help="Share of machines that settles at least, at the stated confidence (a binomial lower bound).",
+        ),
     ] = 0.99
+    confidence: Annotated[
+        float, key("confidence_percent", above=0.0, below=1.0, help="Confidence of that lower bound.")
+    ] = 0.95
     overshoot: Annotated[
         float, key("overshoot_percent", minimum=0.0, help="Largest overshoot of a member, per step.")
     ] = 0.5
+    error: Annotated[
+        float,
+        key(
+            "error_percent",
+            above=0.0,
+            help="Largest error in the end, relative to the largest step; the dead zone and two counts of the sensor "
+            "come on top.",
+        ),
+    ] = 0.1
+    beyond: Annotated[Beyond, key(help="Ranges that nobody stated, in which a setting must settle too.")] = field(
+        default_factory=Beyond
+    )
     tail: float = math.inf
     tolerance: float = math.inf
-    scales: tuple[float, ...] = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+    scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+    shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.05)
-    bias_known: float = 0.01
+    known: float = 0.0726
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
-    effort_weight: float = 1.0
+    effort_weight: float = 14.0
     screened: int = 4
-    plants: int = 32
     conditions: int = 8
+    machines: int = 300
     attempts: int = 4
     seed: int = 0
 
     def __post_init__(self) -> None:
         check(self, but=("overshoot",))  # inf: no demand, where an input bias or friction disturbs
+
+
+@dataclass(frozen=True)
+class LoopMargins:
+    """Margins of the linear loop without a gap, at the controller's own rate.
+
+    Attributes
+    ----------
+    plants : int
+        Number of plants: the model, every corner of the ranges, and others within.
+    delay : int
+        Largest delay, samples.
+    Ms, crossover, phase_margin : float
+        Of the model: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain is below one
+        at every frequency has the crossover 0 and the margin pi.
+    Ms_worst, gain_margin_worst, phase_margin_worst, delay_margin_worst : float
+        Worst of all plants and delays: peak, factor, rad, s; Ms_worst is inf where one of them is unstable.
+    decay : float
+        1/s, of the slowest mode of all plants; negative: it grows.
+    passivity : float
+        Least 1 + Re L of all plants. Above 0 the circle criterion excludes a limit cycle in a gap of any width, where
+        the law is continuous, linear and without integral action; of a sampled law the describing function does.
+    """
+
+    plants: int
+    delay: int
+    Ms: float
+    crossover: float
+    phase_margin: float
+    Ms_worst: float
+    gain_margin_worst: float
+    phase_margin_worst: float
+    delay_margin_worst: float
+    decay: float
+    passivity: float
+
+
+@dataclass(frozen=True)
+class BeyondResult:
+    """Result of a setting in the ranges that nobody stated.
+
+    Attributes
+    ----------
+    k_T : float
+        Half-width of the motor's gain, relative.
+    delay : int
+        Longest delay, samples.
+    friction : float
+        N m, largest Coulomb friction.
+    machines : int
+    settled : float
+        Share of the machines that came to rest; where friction holds them does not matter.
+    tail : float
+        m, largest error in the end.
+    """
+
+    k_T: float
+    delay: int
+    friction: float
+    machines: int
+    settled: float
+    tail: float
 
 
 @dataclass(frozen=True)
@@ -83,7 +219,7 @@ class Certificate:
     settling, settling_worst : float
         s until the error stays below `within`: the 95th percentile, and the worst.
     within : float
-        m: 2 % of the largest step, plus the error that the input bias leaves, plus the dead zone.
+        m: 2 % of the largest step, plus the error that input bias and friction leave, plus the dead zone.
     Ms, crossover, phase_margin : float
         Of the model without a gap: the peak, the highest gain crossover in rad/s, its margin in rad; a loop whose gain
         is below one at every frequency has the crossover 0 and the margin pi.
@@ -93,6 +229,21 @@ class Certificate:
         Number of candidates simulated, this one included.
     seconds : float
         Computing time.
+    settled_least : float
+        Lower bound of the share that settles, at `confidence`; 0 in certificates of versions that had none.
+    confidence : float
+    loop : LoopMargins, optional
+        Margins over all plants; None in certificates of versions that had none.
+    beyond : BeyondResult, optional
+        Result in ranges beyond the stated ones.
+    rate : float, optional
+        Hz, at which the law was simulated; None: in continuous time.
+    delay : int
+        Longest stated delay, samples.
+    error_per_volt : float
+        m/V: error that a constant input bias leaves; 0 with integral action.
+    lag : float
+        s: steady lag behind a ramp of the reference, on the model; 0 with integral action.
     """
 
     setting: Design
@@ -117,6 +268,45 @@ class Certificate:
     saturated: bool
     looked_at: int
     seconds: float = field(compare=False)
+    settled_least: float = 0.0
+    confidence: float = 0.95
+    loop: LoopMargins | None = None
+    beyond: BeyondResult | None = None
+    rate: float | None = None
+    delay: int = 0
+    error_per_volt: float = 0.0
+    lag: float = 0.0
+
+    @property
+    def tried(self) -> str:
+        """Sentence on what was tried, with ranges."""
+        law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, up to {self.delay} samples late"
+        low, high = (math.degrees(end) for end in self.gap)
+        text = (
+            f"verified on {self.members} simulated machines {law}: steps of {1e3 * self.step[0]:.3g} to "
+            f"{1e3 * self.step[1]:.3g} mm from rest, gaps of {low:.4g} to {high:.4g} deg, input bias of "
+            f"{self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} V, friction of {self.friction[0]:.3g} to "
+            f"{self.friction[1]:.3g} N m; {100.0 * self.settled_least:.4g} % settle at least, with "
+            f"{100.0 * self.confidence:g} % confidence"
+        )
+        if self.loop is not None:
+            text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
+        if self.beyond is not None:
+            extra = self.beyond
+            text += (
+                f"; beyond that, {extra.machines} machines with the motor's gain up to {100.0 * extra.k_T:.3g} % off "
+                f"and friction of up to {extra.friction:.3g} N m"
+            )
+            text += f", up to {extra.delay} samples late" if self.rate else ""
+        return text
+
+    @property
+    def not_tried(self) -> str:
+        """Sentence on what no simulation contained."""
+        return (
+            "not tried: measurement noise, a gap that grows while the loop moves, compliance other than the model's, "
+            "several axes, and a sensor or drive that fails"
+        )
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
-from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.certify import certify, known_bias
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Range, Region
 from servotwin.redesign.design import Design
@@ -184,9 +184,9 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     known = policy.uncertainty.replace(gap=cell_range(grid, stated, key), input_bias=(-bias, bias))
     limit = policy.servo.controller.voltage_limit
     servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
-    demands = replace(policy.demands_within_band(), settled=1.0)
-    certificate = certify(servo, known, demands, policy.trial, 0.0, grid.noises[key.noise], policy.clock)
-    if isinstance(certificate, NotVerified) or certificate.saturated:
+    demands = policy.demands_within_band()
+    certificate = certify(servo, known, demands, policy.simulations, 0.0, grid.noises[key.noise], policy.clock)
+    if isinstance(certificate, NotVerified) or certificate.saturated or certificate.settled < 1.0:
         return None
     law = certificate.setting.controller.replace(voltage_limit=limit)
     return replace(certificate, setting=replace(certificate.setting, controller=law))
@@ -195,7 +195,7 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
 def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[CellIndex, Certificate | None]) -> CertifiedTable:
     """Table of the certificates of a policy."""
     known = policy.uncertainty
-    least = policy.demands.bias_known
+    least = known_bias(policy.servo, known, policy.demands)
     return CertifiedTable(grid, known.gap, known.friction, policy.feedforward_limit, least, policy.fallback(), cells)
 
 

@@ -95,7 +95,7 @@ def dependencies(policy: CertifiedPolicy) -> dict[str, str]:
     parts = {"servotwin": servotwin.__version__, "feedforward_limit": repr(policy.feedforward_limit)}
     for name in ("servo", "uncertainty", "demands"):
         parts |= dict(flattened(name, getattr(policy, name)))
-    trial = {f"trial.{name}": repr(getattr(policy.trial, name)) for name in ("duration", "last", "rate")}
+    trial = {f"trial.{name}": repr(getattr(policy.simulations, name)) for name in ("duration", "last", "rate")}
     return {**parts, **trial}
 
 

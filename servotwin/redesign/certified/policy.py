@@ -14,16 +14,21 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.trend import Trend
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import NEAR, Trial
+from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
+from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
-# Relative, and V: a smaller change is not worth an update.
-_SAME, _SAME_FEEDFORWARD = 1e-3, 1e-3
+# Relative: a smaller change of a gain is not worth an update.
+_SAME = 1e-3
+# Voltages, relative to the answer of the servo's own Kp to the smallest step: a smaller change of the feedforward is
+# not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
+# rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
+_SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
 
 
 class Verifier(Protocol):
@@ -58,14 +63,10 @@ class CertifiedPolicy:
     uncertainty : Uncertainty
         Prior knowledge, before any window; the fallback set is verified for its range of gaps.
     demands : Demands
-    trial : Trial
+    trial : Trial, optional
+        Made for the servo by default.
     feedforward_limit : float
         V, either sign.
-    bias_floor : float
-        V: least half-width of the range of input biases, however well it is estimated.
-    bias_moved : float
-        V: a voltage at rest that differs by this much from the feedforward indicates friction, which stops the motor
-        short of its reference.
     horizon : float
         s for which a setting is to hold: the gap may grow meanwhile as fast as the trend says.
     clock : callable
@@ -75,14 +76,33 @@ class CertifiedPolicy:
     servo: Servo
     uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
     demands: Demands = field(default_factory=Demands)
-    trial: Trial = field(default_factory=Trial)
+    trial: Trial | None = None
     feedforward_limit: float = 0.2
-    bias_floor: float = 2e-4
-    bias_moved: float = 5e-3
     horizon: float = 40.0
     needs_estimate: ClassVar[bool] = False
     provisional: ClassVar[bool] = False
     clock: Callable[[], float] = field(default=perf_counter, compare=False)
+
+    @property
+    def simulations(self) -> Trial:
+        """Trial of every verification.
+
+        Raises
+        ------
+        InvalidInput
+            No candidate is within the bounds on Ms.
+        """
+        return self.trial or trial_for(self.servo, self.uncertainty, self.demands)
+
+    @property
+    def smallest_answer(self) -> float:
+        """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
+        return abs(self.servo.controller.Kp) * self.uncertainty.step[0]
+
+    @property
+    def bias_floor(self) -> float:
+        """V: least half-width of the range of input biases, however well one is estimated."""
+        return _BIAS_FLOOR * self.smallest_answer
 
     def redesign(self, evidence: Evidence) -> Redesign:
         """Choose the verified setting for the evidence; without one the fallback set, and the reason.
@@ -110,7 +130,7 @@ class CertifiedPolicy:
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
-        if _in_force(result.setting, evidence):
+        if _in_force(result.setting, evidence, _SAME_FEEDFORWARD * self.smallest_answer):
             return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=result)
         redesign = _redesign(result, region.noise, estimate.gap, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
@@ -119,13 +139,21 @@ class CertifiedPolicy:
         """Find the cheapest setting for a region, by simulation."""
         known = region.within(self.uncertainty)
         return certify(
-            self.servo, known, self.demands_within_band(), self.trial, region.feedforward, region.noise, self.clock
+            self.servo,
+            known,
+            self.demands_within_band(),
+            self.simulations,
+            region.feedforward,
+            region.noise,
+            self.clock,
         )
 
     def confirm(self, region: Region, setting: Design) -> Certificate | NotVerified:
         """Verify one setting for a region, by simulation."""
         known = region.within(self.uncertainty)
-        return confirm(self.servo, known, setting, self.demands_within_band(), self.trial, region.noise, self.clock)
+        return confirm(
+            self.servo, known, setting, self.demands_within_band(), self.simulations, region.noise, self.clock
+        )
 
     def demands_within_band(self) -> Demands:
         """Demands with the fallback set's band as a bound; a dead zone must open the loop inside of that band."""
@@ -141,7 +169,7 @@ class CertifiedPolicy:
         InvalidInput
             No setting is verified for the whole range: state a narrower one, or lower the demands.
         """
-        return _fallback(self.servo, self.uncertainty, self.demands, self.trial)
+        return _fallback(self.servo, self.uncertainty, self.demands, self.simulations)
 
     def _estimate(self, evidence: Evidence) -> GapEstimate | None:
         if not evidence.unusable:
@@ -176,7 +204,9 @@ class CertifiedPolicy:
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
-        return low, max(high, left * self.servo.k_T / self.servo.R) if left > self.bias_moved else high
+        return low, max(
+            high, left * self.servo.k_T / self.servo.R
+        ) if left > _BIAS_MOVED * self.smallest_answer else high
 
 
 def _noise(evidence: Evidence) -> float:
@@ -185,10 +215,10 @@ def _noise(evidence: Evidence) -> float:
     return noise if math.isfinite(noise) else 0.0
 
 
-def _in_force(setting: Design, evidence: Evidence) -> bool:
-    """True when the edge runs the setting already, by its last report."""
+def _in_force(setting: Design, evidence: Evidence, small: float) -> bool:
+    """True when the edge runs the setting already, by its last report, but for a `small` (V) change of feedforward."""
     now, new = evidence.gains, setting.controller
-    if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > _SAME_FEEDFORWARD:
+    if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > small:
         return False
     gains = ((getattr(now, name), getattr(new, name)) for name in ("Kp", "Ki", "Kd", "Tf", "enter", "leave"))
     pairs = (*gains, (evidence.setting.tolerance, setting.tolerance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -15,14 +16,66 @@ from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
 
 Range = tuple[float, float]
-_PARAMETERS = ("k", "c", "k_B", "m")
+LARGEST_DELAY = 64
+"""Longest delay that is simulated, samples."""
+PARAMETERS = ("k", "c", "k_B", "m", "k_T")
+"""Numbers of the plant that are uncertain, in the order of the drawn factors."""
+# Standard deviations beyond which a learnt factor is not drawn.
+_TAILS = 3.0
+# Gap, step, bias, start of the screw, friction, delay.
+_CONDITIONS = 6
 _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
+
+
+@dataclass(frozen=True)
+class LearntFactors:
+    """Posterior of plant parameters, as a normal distribution of the logarithms of their factors on the model's values.
+
+    Attributes
+    ----------
+    names : tuple of N str
+        Of `PARAMETERS`.
+    mean : tuple of N float
+    covariance : tuple of N tuples of N float
+
+    Raises
+    ------
+    InvalidInput
+        A name is unknown or comes twice, or the covariance is not symmetric, positive semidefinite and of that size.
+    """
+
+    names: tuple[str, ...]
+    mean: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        if len(set(self.names)) < len(self.names) or not set(self.names) <= set(PARAMETERS):
+            raise InvalidInput(f"learnt factors of {self.names!r}: each must be one of {', '.join(PARAMETERS)}, once")
+        matrix, size = np.array(self.covariance, dtype=float), len(self.names)
+        if matrix.shape != (size, size) or len(self.mean) != size or not np.isfinite(matrix).all():
+            raise InvalidInput(f"learnt factors: {size} names need {size} means and a covariance of {size} by {size}")
+        values = np.linalg.eigvalsh(matrix) if size else np.zeros(1)
+        if not np.allclose(matrix, matrix.T) or values[0] < -1e-9 * max(float(values[-1]), 1e-300):
+            raise InvalidInput("learnt factors: the covariance must be symmetric and positive semidefinite")
+
+    def factors(self, places: Array) -> Array:
+        """(count, N) factors for (count, N) places in 0 .. 1, at most three standard deviations off."""
+        from scipy.special import ndtri
+
+        values, vectors = np.linalg.eigh(np.array(self.covariance))
+        normal = np.clip(ndtri(np.clip(places, 1e-12, 1.0 - 1e-12)), -_TAILS, _TAILS)
+        return np.asarray(np.exp(np.array(self.mean) + normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T))
 
 
 @settings("uncertainty")
 @dataclass(frozen=True)
 class Uncertainty:
     """Ranges of a machine's parameters and conditions; within them every value is possible.
+
+    Parameters
+    ----------
+    learnt : LearntFactors, optional
+        Posterior of some parameters, which counts in place of their half-widths.
 
     Raises
     ------
@@ -58,6 +111,20 @@ class Uncertainty:
     friction: Annotated[
         Range, key("friction_n_m", minimum=0.0, help="Range of the Coulomb friction on the motor's shaft.")
     ] = (0.0, 0.0)
+    k_T: Annotated[
+        float,
+        key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the torque gain, relative to the model's."),
+    ] = 0.0
+    delay: Annotated[
+        int,
+        key(
+            "delay_samples",
+            minimum=0,
+            maximum=LARGEST_DELAY,
+            help="Longest delay between a measurement and its voltage, of a sampled controller.",
+        ),
+    ] = 0
+    learnt: LearntFactors | None = None
 
     def __post_init__(self) -> None:
         check(self)
@@ -113,8 +180,8 @@ class SimulatedMachines:
     Attributes
     ----------
     plants : tuple of P Servo
-    gap, step, input_bias, theta_d0, friction : (P, C) array
-        rad, m, V, rad, N m.
+    gap, step, input_bias, theta_d0, friction, delay : (P, C) array
+        rad, m, V, rad, N m, samples.
     """
 
     plants: tuple[Servo, ...]
@@ -123,6 +190,7 @@ class SimulatedMachines:
     input_bias: Array
     theta_d0: Array
     friction: Array
+    delay: Array
 
     @property
     def count(self) -> int:
@@ -136,32 +204,84 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
     The first plant is the model itself. The first two conditions of every plant have the largest and the smallest gap
     and input bias: the ends of an estimate's interval are where a setting fails first.
     """
-    conditioned = _sobol(5, plants * conditions, seed + 1).reshape(plants, conditions, 5)
+    places = _sobol(_CONDITIONS, plants * conditions, seed + 1).reshape(plants, conditions, _CONDITIONS)
     if conditions > 1:
-        conditioned[:, 0, :3:2], conditioned[:, 1, :3:2] = 1.0, 0.0
-    gap = _spread(uncertainty.gap, conditioned[..., 0])
-    step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), conditioned[..., 1]))
-    return SimulatedMachines(
-        drawn_plants(servo, uncertainty, plants, seed),
-        gap,
-        step,
-        _spread(uncertainty.input_bias, conditioned[..., 2]),
-        (conditioned[..., 3] - 0.5) * gap,
-        _spread(uncertainty.friction, conditioned[..., 4]),
-    )
+        places[:, 0, :3:2], places[:, 1, :3:2] = 1.0, 0.0
+    return _machines(drawn_plants(servo, uncertainty, plants, seed), uncertainty, places)
+
+
+def draw_independently(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> SimulatedMachines:
+    """Draw `count` machines independently of one another, each a plant of its own in one condition.
+
+    Shares of such machines are binomial, which those of an even spread are not.
+    """
+    rng = np.random.default_rng(seed)
+    factors = _factors(uncertainty, rng.random((count, len(PARAMETERS))))
+    return _machines(_scaled_plants(servo, factors), uncertainty, rng.random((count, 1, _CONDITIONS)))
 
 
 def drawn_plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
     """The model and `count` - 1 plants drawn about it."""
-    widths = tuple(getattr(uncertainty, name) for name in _PARAMETERS)
-    return _plants(servo, widths, count, seed)
+    return _plants(servo, parameters_of(uncertainty), count, seed)
+
+
+def parameters_of(uncertainty: Uncertainty) -> Uncertainty:
+    """Uncertainty of the plant alone, equal for all conditions."""
+    return Uncertainty(
+        **{name: getattr(uncertainty, name) for name in PARAMETERS}, delay=uncertainty.delay, learnt=uncertainty.learnt
+    )
+
+
+def extreme_plants(servo: Servo, uncertainty: Uncertainty, more: int, seed: int) -> tuple[Servo, ...]:
+    """The model, every corner of the parameters' ranges, and `more` plants within.
+
+    Corners of learnt parameters are two standard deviations off along each axis of their covariance.
+    """
+    corners = np.array(list(itertools.product((0.0, 1.0), repeat=len(PARAMETERS))))
+    learnt = uncertainty.learnt
+    if learnt is not None:
+        # Places of plus and minus two standard deviations of a normal distribution.
+        which = [PARAMETERS.index(name) for name in learnt.names]
+        corners[:, which] = np.where(corners[:, which] > 0.5, 0.97725, 0.02275)
+    factors = _factors(uncertainty, np.concatenate([corners, _sobol(len(PARAMETERS), more, seed)]))
+    return (servo, *_scaled_plants(servo, np.unique(factors, axis=0)))
 
 
 @lru_cache(maxsize=16)
-def _plants(servo: Servo, widths: tuple[float, ...], count: int, seed: int) -> tuple[Servo, ...]:
-    factors = 1.0 + (2.0 * _sobol(4, count, seed) - 1.0) * np.array(widths)
+def _plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
+    factors = _factors(uncertainty, _sobol(len(PARAMETERS), count, seed))
     factors[0] = 1.0
-    return tuple(_scaled(servo, dict(zip(_PARAMETERS, row.tolist(), strict=True))) for row in factors)
+    return _scaled_plants(servo, factors)
+
+
+def _factors(uncertainty: Uncertainty, places: Array) -> Array:
+    """(count, parameters) factors on the model's values for places in 0 .. 1."""
+    widths = np.array([getattr(uncertainty, name) for name in PARAMETERS])
+    factors = 1.0 + (2.0 * places - 1.0) * widths
+    learnt = uncertainty.learnt
+    if learnt is not None and learnt.names:
+        which = [PARAMETERS.index(name) for name in learnt.names]
+        factors[:, which] = learnt.factors(places[:, which])
+    return np.asarray(factors)
+
+
+def _machines(plants: tuple[Servo, ...], uncertainty: Uncertainty, places: Array) -> SimulatedMachines:
+    """Machines of plants for (P, C, conditions) places in 0 .. 1."""
+    gap = _spread(uncertainty.gap, places[..., 0])
+    step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), places[..., 1]))
+    return SimulatedMachines(
+        plants,
+        gap,
+        step,
+        _spread(uncertainty.input_bias, places[..., 2]),
+        (places[..., 3] - 0.5) * gap,
+        _spread(uncertainty.friction, places[..., 4]),
+        np.minimum(np.floor(places[..., 5] * (uncertainty.delay + 1)), uncertainty.delay),
+    )
+
+
+def _scaled_plants(servo: Servo, factors: Array) -> tuple[Servo, ...]:
+    return tuple(_scaled(servo, dict(zip(PARAMETERS, row.tolist(), strict=True))) for row in factors)
 
 
 def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:

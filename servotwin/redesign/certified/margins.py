@@ -1,0 +1,152 @@
+"""Margins of a law over every plant of the uncertainty, and the candidates that keep to the demands on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.loop_set import PlantSet
+from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Demands, LoopMargins
+from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
+
+# Plants within the ranges, beside the model and the corners.
+_WITHIN = 32
+_WORTH_TRYING = 0.25
+_ROUNDED = 1.0 + 1e-6
+
+
+def widened(uncertainty: Uncertainty, demands: Demands) -> Uncertainty:
+    """Uncertainty of the plant with the ranges that nobody stated."""
+    known, beyond = parameters_of(uncertainty), demands.beyond
+    learnt = known.learnt is not None and "k_T" in known.learnt.names
+    gain = known.k_T if learnt else 1.0 - (1.0 - known.k_T) * (1.0 - beyond.k_T)
+    return known.replace(k_T=gain, delay=max(known.delay, beyond.delay))
+
+
+@lru_cache(maxsize=16)
+def plant_set(servo: Servo, uncertainty: Uncertainty, rate: float | None) -> PlantSet:
+    """The model, the corners of the uncertainty and plants within, for a law with this rate."""
+    servos = extreme_plants(servo, uncertainty, _WITHIN, seed=0)
+    return PlantSet.of([each.plant() for each in servos], rate)
+
+
+def delays_of(law: Controller, uncertainty: Uncertainty) -> tuple[int, ...]:
+    """Shortest and longest delay in samples."""
+    return (0,) if law.sample_rate is None or uncertainty.delay == 0 else (0, uncertainty.delay)
+
+
+@lru_cache(maxsize=256)
+def loop_margins(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+    """Margins of a law on the model and over all plants of an uncertainty.
+
+    Parameters
+    ----------
+    servo : Servo
+    uncertainty : Uncertainty
+        Of the plant alone, as `widened` makes it: equal ones share a stored result.
+    law : Controller
+    """
+    plants = plant_set(servo, uncertainty, law.sample_rate)
+    found = [plants.margins(law, delay) for delay in delays_of(law, uncertainty)]
+    nominal = nominal_margins(servo, law)
+    crossover = nominal.gain_crossovers[-1] if nominal.gain_crossovers else GainCrossover(0.0, math.pi)
+    return LoopMargins(
+        plants=len(plants.A),
+        delay=delays_of(law, uncertainty)[-1],
+        Ms=nominal.Ms,
+        crossover=crossover.omega,
+        phase_margin=crossover.phase_margin,
+        Ms_worst=max(float(each.Ms.max()) for each in found),
+        gain_margin_worst=min(float(each.gain_margin.min()) for each in found),
+        phase_margin_worst=min(float(each.phase_margin.min()) for each in found),
+        delay_margin_worst=min(float(each.delay_margin.min()) for each in found),
+        decay=min(float(each.decay.min()) for each in found),
+        passivity=min(float(each.passivity.min()) for each in found),
+    )
+
+
+@lru_cache(maxsize=256)
+def nominal_margins(servo: Servo, law: Controller) -> Margins:
+    """Margins of a law on the model itself, at the law's own rate."""
+    if law.sample_rate is None:
+        return servo.margins(law)
+    plants = PlantSet.of([servo.plant()], law.sample_rate)
+    return margins_of_response(
+        lambda omega: plants.loop(law, 0, np.atleast_1d(omega)[None])[0],
+        np.unique(plants.omega[0]),
+        stable=bool(plants.margins(law).stable[0]),
+    )
+
+
+@lru_cache(maxsize=16)
+def laws_within(
+    servo: Servo, uncertainty: Uncertainty, demands: Demands, integral: tuple[float, ...]
+) -> tuple[Controller, ...]:
+    """Scaled controllers that are stable on all plants and keep to the bounds on Ms.
+
+    Parameters
+    ----------
+    servo : Servo
+    uncertainty : Uncertainty
+        Of the plant alone, as `widened` makes it.
+    demands : Demands
+    integral : tuple of float
+        Factors on Ki.
+
+    Raises
+    ------
+    InvalidInput
+        There is none.
+    """
+    scaled = [
+        scaled_law(servo.controller, scale, shape, share)
+        for share in integral
+        for shape in demands.shapes
+        for scale in demands.scales
+    ]
+    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
+    laws: list[Controller] = []
+    closest = math.inf
+    for law in dict.fromkeys(scaled):
+        peaks = np.array([plants.peaks(law, delay) for delay in delays_of(law, uncertainty)])
+        stable = all(plants.decays(law, delay).min() > 0.0 for delay in delays_of(law, uncertainty))
+        closest = min(closest, float(peaks.max())) if stable else closest
+        if stable and peaks[0, 0] <= demands.Ms * _ROUNDED and peaks.max() <= demands.Ms_worst * _ROUNDED:
+            laws.append(law)
+    if not laws:
+        rate = servo.controller.sample_rate
+        at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
+        found = f"; the least that any has is {closest:.3g}" if math.isfinite(closest) else "; none is stable there"
+        raise InvalidInput(
+            f"no candidate has Ms <= {demands.Ms:g} on this servo and <= {demands.Ms_worst:g} on every plant of the "
+            f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
+            f"{min(demands.scales):g}"
+        )
+    # A loop with a fraction of the gain that another one may have is slower, and only that.
+    least = _WORTH_TRYING * max(abs(law.Kp) for law in laws)
+    return tuple(law for law in laws if abs(law.Kp) >= least)
+
+
+def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share: float) -> Controller:
+    """The controller with Kp and Kd scaled, its derivative action moved by a shape, and a share of its Ki."""
+    lead, slower = shape
+    return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
+
+
+def unfed(law: Controller) -> Controller:
+    """The law without feedforward and thresholds, on which margins do not depend: equal ones share a stored result."""
+    return law.replace(feedforward=0.0, enter=1.0, leave=1.0)
+
+
+def with_margins(demands: Demands) -> Demands:
+    """The part of the demands that the candidates depend on."""
+    known = Demands()
+    names = ("Ms", "Ms_worst", "scales", "shapes", "integral", "beyond")
+    return replace(known, **{name: getattr(demands, name) for name in names})

@@ -1,0 +1,282 @@
+"""Verification of the loop that runs: its own rate, the worst plant, bounds of shares, no units, what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import msgspec
+import numpy as np
+import pytest
+from scipy import stats
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.loop_set import PlantSet
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
+from servotwin.redesign.certified.assess import assess, stillness
+from servotwin.redesign.certified.bounds import share_at_least
+from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certify import candidates_of, certify, confirm
+from servotwin.redesign.certified.margins import widened
+from servotwin.redesign.certified.trial import Trial, trial_for
+from servotwin.redesign.certified.uncertainty import (
+    PARAMETERS,
+    LearntFactors,
+    Uncertainty,
+    draw,
+    draw_independently,
+    extreme_plants,
+)
+from servotwin.redesign.design import Design
+from servotwin.simulation import simulate
+
+DEG = math.pi / 180.0
+SERVO = Servo.preset("paper")
+OWN = SERVO.controller
+SMALL = Demands(
+    machines=16, conditions=4, screened=2, settled=0.8, scales=(0.5, 0.7), integral=(0.0,), beyond=Beyond(machines=4)
+)
+NARROW = Uncertainty(gap=(9.9 * DEG, 10.1 * DEG), input_bias=(-2e-4, 2e-4))
+
+
+def scaled(servo: Servo, time: float, length: float, voltage: float) -> Servo:
+    """The same servo in other units: every solution is the same but for its scale."""
+    law, per = servo.controller, voltage / length
+    return servo.replace(
+        R=servo.R * voltage,
+        L=servo.L * voltage * time,
+        k_B=servo.k_B * voltage * time,
+        J=servo.J * time**2,
+        p=servo.p * length,
+        k=servo.k / time**2,
+        c=servo.c / time,
+        Kp=law.Kp * per,
+        Ki=law.Ki * per / time,
+        Kd=law.Kd * per * time,
+        Tf=law.Tf * time,
+        sample_rate=None if law.sample_rate is None else law.sample_rate / time,
+    )
+
+
+def inert_axis(rate: float) -> Servo:
+    """A stiff axis whose motor alone makes the dynamics: it crosses over at 120 rad/s in continuous time."""
+    axis = SERVO.replace(m=20.0, k=1e9, c=2e4, Ki=0.0, Kd=0.0, sample_rate=rate)
+    return axis.replace(Kp=120.0 * axis.k_B / axis.p)
+
+
+# --- bounds of a share
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (7, 10), (299, 300), (300, 300)])
+def test_the_share_is_at_least_the_bound_of_clopper_and_pearson(successes: int, trials: int) -> None:
+    exact = stats.binomtest(successes, trials, alternative="greater").proportion_ci(0.95, "exact").low
+    assert share_at_least(successes, trials, 0.95) == pytest.approx(exact, abs=1e-12)
+
+
+def test_three_hundred_machines_without_a_failure_show_ninety_nine_percent() -> None:
+    assert share_at_least(300, 300, 0.95) == pytest.approx(0.05 ** (1.0 / 300.0))
+    assert share_at_least(299, 300, 0.95) < 0.99 < share_at_least(300, 300, 0.95)
+    with pytest.raises(InvalidInput, match="4 successes in 3 trials"):
+        share_at_least(4, 3, 0.95)
+
+
+# --- the loop that runs
+
+
+def test_a_loop_that_its_rate_makes_unstable_is_refused_in_a_sentence() -> None:
+    """In continuous time the same gains are certified."""
+    with pytest.raises(InvalidInput, match=r"at 50 Hz with up to 3 samples of delay; none is stable there") as caught:
+        certify(inert_axis(50.0), NARROW, replace(SMALL, scales=(0.7, 1.0)))
+    assert "\n" not in str(caught.value)
+    calm = inert_axis(50.0).replace(sample_rate=None)
+    assert isinstance(certify(calm, NARROW, SMALL), Certificate)
+    found = confirm(inert_axis(50.0), NARROW, Design(inert_axis(50.0).controller), SMALL, Trial(8.0, 2.0, 50.0))
+    assert isinstance(found, NotVerified)
+    assert "is unstable at 50 Hz" in found.reason
+
+
+def test_a_slower_setting_is_verified_at_the_rate_of_the_axis() -> None:
+    found = certify(inert_axis(50.0), NARROW, replace(SMALL, scales=(0.05, 0.1, 1.0), shapes=((1.0, 1.0),)))
+    assert isinstance(found, Certificate)
+    assert found.rate == 50.0
+    assert found.setting.controller.Kp < 0.2 * inert_axis(50.0).controller.Kp
+    assert found.loop is not None
+    assert found.loop.Ms_worst <= 2.2
+    assert "at 50 Hz" in found.tried
+
+
+def test_a_sampled_setting_is_simulated_with_its_ticks_counts_and_limits() -> None:
+    """The oracle: one `simulate` per machine, whose loop is the edge's."""
+    servo = SERVO.replace(sample_rate=500.0, voltage_limit=0.5, rate_limit=5.0, position_resolution=2e-6)
+    setting = Design(servo.controller.replace(Ki=0.0, Kp=700.0, Kd=-70.0), 2e-5)
+    known = NARROW.replace(input_bias=(-0.01, 0.01))
+    members, trial = draw(servo, known, 2, 2, 3), Trial(10.0, 2.0, 50.0)
+    (found,) = assess([setting], members, trial)
+    assert found.saturated.any()
+    for p, c in np.ndindex(2, 2):
+        run = simulate(
+            members.plants[p],
+            10.0,
+            controller=setting.controller,
+            reference=members.step[p, c],
+            gap=members.gap[p, c],
+            tolerance=setting.tolerance,
+            theta_d0=members.theta_d0[p, c],
+            input_bias=members.input_bias[p, c],
+            sample_rate=500.0,
+        )
+        last = (run.reference - run.position)[::10][-100:]
+        assert found.tail[p, c] == pytest.approx(np.abs(last).max(), rel=1e-6)
+        assert found.ripple[p, c] == pytest.approx(0.5 * np.ptp(last), rel=1e-6, abs=1e-12)
+
+
+# --- the worst plant
+
+
+@pytest.mark.parametrize("rate", [None, 200.0])
+def test_no_plant_of_the_stated_set_exceeds_the_worst_Ms(rate: float | None) -> None:
+    servo = SERVO.replace(sample_rate=rate)
+    demands = Demands(integral=(0.0,))
+    laws = [setting.controller for setting in candidates_of(servo, Uncertainty(), demands, False, False)]
+    fresh = draw_independently(servo, widened(Uncertainty(), demands), 512, 11)
+    plants = PlantSet.of([plant.plant() for plant in fresh.plants], rate)
+    for law in laws:
+        for delay in (0,) if rate is None else (0, 3):
+            found = plants.margins(law, delay)
+            assert found.stable.all()
+            assert found.Ms.max() <= demands.Ms_worst * 1.01
+
+
+def test_the_constant_with_hindsight_is_among_the_candidates_of_a_known_plant() -> None:
+    exact = Uncertainty(k=0.01, c=0.02, k_B=0.01, m=0.01)
+    found = {round(s.controller.Kp / OWN.Kp, 3) for s in candidates_of(SERVO, exact, Demands(), False, False)}
+    assert {0.6, 1.0} <= found
+
+
+def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> None:
+    covariance = ((4e-4, 1e-4), (1e-4, 9e-4))
+    learnt = LearntFactors(("k", "c"), (0.02, -0.1), covariance)
+    known = Uncertainty(learnt=learnt)
+    plants = draw_independently(SERVO, known, 4000, 0).plants
+    logs = np.log([[plant.k / SERVO.k, plant.c / SERVO.c] for plant in plants])
+    assert logs.mean(axis=0) == pytest.approx([0.02, -0.1], abs=3e-3)
+    assert np.cov(logs.T) == pytest.approx(np.array(covariance), rel=0.1, abs=2e-5)
+    wide, narrow = (len(candidates_of(SERVO, each, Demands(), False, False)) for each in (Uncertainty(), known))
+    assert narrow > wide
+    assert extreme_plants(SERVO, known, 4, 0)[0] == SERVO
+    with pytest.raises(InvalidInput, match="each must be one of k, c, k_B, m, k_T"):
+        LearntFactors(("mass",), (0.0,), ((1.0,),))
+    with pytest.raises(InvalidInput, match="symmetric and positive semidefinite"):
+        LearntFactors(("k",), (0.0,), ((-1.0,),))
+    assert set(learnt.names) < set(PARAMETERS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
+def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
+    servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
+    found = certify(servo, known)
+    assert isinstance(found, Certificate), found
+    members = draw_independently(servo, known, 2048, 99)
+    (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
+    assert measures.settled.mean() >= Demands().settled
+
+
+# --- demands
+
+
+def test_a_limit_cycle_of_a_tiny_step_is_not_settled() -> None:
+    known = Uncertainty(gap=(0.2 * DEG, 0.3 * DEG), step=(2.5e-6, 2.5e-6))
+    members = draw(SERVO, known, 2, 2)
+    own, calm = assess([Design(OWN), Design(OWN.replace(Ki=0.0))], members, Trial())
+    assert (own.ripple < 1e-5).all()
+    assert not own.settled.any()
+    assert calm.settled.all()
+    assert (stillness(members) < 0.02 * 2.5e-6).all()
+
+
+def test_a_bias_that_leaves_a_large_error_is_not_certified() -> None:
+    found = certify(SERVO, NARROW.replace(input_bias=(-1.0, 1.0)), SMALL)
+    assert isinstance(found, NotVerified)
+    assert "mm in the end, and 0.25 mm are allowed" in found.reason
+
+
+def test_the_certificate_says_what_was_tried_and_what_leaving_out_integral_action_costs() -> None:
+    found = certify(SERVO, NARROW, SMALL)
+    assert isinstance(found, Certificate)
+    law = found.setting.controller
+    assert found.beyond is not None
+    assert (found.beyond.machines, found.beyond.settled) == (4, 1.0)
+    assert found.error_per_volt == pytest.approx(1.0 / law.Kp)
+    assert "verified on 16 simulated machines in continuous time" in found.tried
+    assert found.not_tried.startswith("not tried: measurement noise")
+    speed = 1e-3
+    ramp = PiecewiseCubic(np.array([0.0]), np.array([[0.0, speed, 0.0, 0.0]]))
+    run = simulate(SERVO, 20.0, controller=law, reference=ramp, sample_rate=100.0)
+    assert run.reference[-1] - run.position[-1] == pytest.approx(found.lag * speed, rel=1e-3)
+
+
+def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() -> None:
+    """The analysis and the simulation agree; the servo's own integral action fails both."""
+    plants = PlantSet.of([SERVO.plant()], None)
+    calm = OWN.replace(Ki=0.0, Kp=0.6 * OWN.Kp, Kd=0.6 * OWN.Kd)
+    assert plants.margins(calm).passivity[0] > 0.0 > plants.margins(OWN).passivity[0]
+    for gap in (1.0, 30.0, 180.0):
+        members = draw(SERVO, Uncertainty(k=0.0, c=0.0, k_B=0.0, m=0.0, gap=(gap * DEG, gap * DEG)), 1, 4)
+        settled, hunting = assess([Design(calm), Design(OWN)], members, Trial(200.0, 20.0))
+        assert settled.at_rest.all()
+        assert not hunting.at_rest.any()
+
+
+# --- no units
+
+
+@pytest.mark.parametrize(
+    ("time", "length", "voltage"),
+    [(1e-3, 1.0, 1.0), (1e3, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1e6, 1.0), (1.0, 1.0, 1e-2), (10.0, 1e-3, 1e2)],
+)
+def test_another_unit_changes_no_verdict_and_scales_the_setting(time: float, length: float, voltage: float) -> None:
+    here = certify(SERVO, NARROW, SMALL)
+    there = certify(
+        scaled(SERVO, time, length, voltage),
+        NARROW.replace(
+            step=tuple(length * end for end in NARROW.step),
+            input_bias=tuple(voltage * end for end in NARROW.input_bias),
+        ),
+        SMALL,
+    )
+    assert isinstance(here, Certificate)
+    assert isinstance(there, Certificate)
+    law, other = here.setting.controller, there.setting.controller
+    assert other.Kp == pytest.approx(law.Kp * voltage / length, rel=1e-9)
+    assert other.Kd == pytest.approx(law.Kd * voltage * time / length, rel=1e-9)
+    assert other.Tf == pytest.approx(law.Tf * time, rel=1e-9)
+    assert there.Ms == pytest.approx(here.Ms, rel=1e-6)
+    assert there.loop is not None
+    assert here.loop is not None
+    assert there.loop.Ms_worst == pytest.approx(here.loop.Ms_worst, rel=1e-6)
+    assert there.looked_at == here.looked_at
+
+
+@pytest.mark.parametrize("time", [1e-2, 10.0])
+def test_a_slower_or_faster_servo_has_a_fallback_set(time: float) -> None:
+    servo = scaled(SERVO, time, 1.0, 1.0)
+    known = Uncertainty(input_bias=(-0.1, 0.1))
+    assert isinstance(certify(servo, known, replace(SMALL, scales=(0.5,), shapes=((1.5, 0.85),))), Certificate)
+    assert trial_for(servo, known, Demands()).duration == pytest.approx(
+        time * trial_for(SERVO, known, Demands()).duration, rel=1e-6
+    )
+
+
+# --- stored ones
+
+
+def test_a_certificate_of_the_version_before_is_read() -> None:
+    found = certify(SERVO, NARROW, SMALL)
+    assert isinstance(found, Certificate)
+    new = ("settled_least", "confidence", "loop", "beyond", "rate", "delay", "error_per_volt", "lag")
+    document = {name: value for name, value in msgspec.to_builtins(found).items() if name not in new}
+    read = msgspec.convert(document, Certificate)
+    assert read.loop is None
+    assert all(getattr(read, f.name) == getattr(found, f.name) for f in fields(read) if f.compare and f.name not in new)
