@@ -54,9 +54,9 @@ class MachineReading:
 
     Attributes
     ----------
-    factors : tuple of 3 float
-        Logarithms of the factors on k/m, c/m and pitch.
-    covariance : tuple of 9 float
+    factors : tuple of 4 float
+        Logarithms of the factors on k/m, c/m, pitch and mass ratio.
+    covariance : tuple of 16 float
         Of these, row by row.
     """
 

@@ -1,4 +1,4 @@
-"""The machine's own numbers, learnt across windows: stiffness and damping over the masses, and pitch.
+"""The machine's own numbers, learnt across windows: stiffness and damping over the masses, pitch, mass ratio.
 
 A nameplate is off by percents, and an estimate of the gap by whole degrees with it. Every window whose estimate counts
 narrows what is known of the machine; time widens it again, slowly: a gap wears, a structure hardly does, and that is
@@ -21,8 +21,9 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.whitened.free_model import FACTORS, FactorPrior
 from servotwin.plant.signals import Array
 
+_SIZE = len(FACTORS)
 _DAY_S = 86400.0
-_AGREEMENT = 4.0  # standard deviations, of the distance of two readings with 3 degrees of freedom
+_AGREEMENT = 4.0  # standard deviations, of the distance of two readings with as many degrees of freedom as factors
 _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
 
 
@@ -55,6 +56,9 @@ class LearningSettings:
     pitch_floor: Annotated[
         float, key("pitch_floor_percent", above=0.0, help="No number of windows tells the pitch better.")
     ] = 1e-4
+    ratio_floor: Annotated[
+        float, key("mass_ratio_floor_percent", above=0.0, help="No number of windows tells the mass ratio better.")
+    ] = 1e-3
     restart_after: Annotated[
         int,
         key(minimum=1, help="So many windows in a row that agree on other numbers mean that the machine is another."),
@@ -64,14 +68,14 @@ class LearningSettings:
         check(self)
 
     def walk(self, elapsed: float) -> Array:
-        """(3,) variances that `elapsed` seconds add."""
+        """(4,) variances that `elapsed` seconds add."""
         days = max(0.0, elapsed) / _DAY_S
-        return np.square([self.k_drift, self.c_drift, 0.0]) * days
+        return np.square([self.k_drift, self.c_drift, 0.0, 0.0]) * days
 
     @property
     def floor(self) -> Array:
-        """(3,) least variances."""
-        return np.square([self.k_floor, self.c_floor, self.pitch_floor])
+        """(4,) least variances."""
+        return np.square([self.k_floor, self.c_floor, self.pitch_floor, self.ratio_floor])
 
 
 class LearntMachine(Struct, frozen=True):
@@ -79,8 +83,8 @@ class LearntMachine(Struct, frozen=True):
 
     Attributes
     ----------
-    factors, covariance : tuple of 3 and of 9 float
-        Logarithms of the factors on the model's k/m, c/m and pitch; row by row.
+    factors, covariance : tuple of 4 and of 16 float
+        Logarithms of the factors on the model's k/m, c/m, pitch and mass ratio; row by row.
     time : float
         s, on the twin's clock, of the last window that counted.
     windows : int
@@ -100,19 +104,22 @@ class LearntMachine(Struct, frozen=True):
 
     def prior(self, given: LearningSettings, now: float) -> FactorPrior:
         """What is known at a time, s."""
-        covariance = np.array(self.covariance).reshape(3, 3) + np.diag(given.walk(now - self.time))
+        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
         short = np.maximum(0.0, given.floor - np.diag(covariance))
         return FactorPrior(np.array(self.factors), covariance + np.diag(short))
 
     def words(self) -> str:
         """The factors in per cent off the model."""
-        parts = zip(FACTORS, self.factors, np.sqrt(np.diag(np.array(self.covariance).reshape(3, 3))), strict=True)
+        parts = zip(
+            FACTORS, self.factors, np.sqrt(np.diag(np.array(self.covariance).reshape(_SIZE, _SIZE))), strict=True
+        )
         return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
 
 
 def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
     """Prior before any window, for half-widths of stiffness, damping and mass within which all values are alike."""
-    return FactorPrior.of_spreads(math.hypot(k, m) / math.sqrt(3.0), math.hypot(c, m) / math.sqrt(3.0), given.pitch)
+    k_std, c_std, ratio_std = (math.hypot(one, other) / math.sqrt(3.0) for one, other in ((k, m), (c, m), (m, m)))
+    return FactorPrior.of_spreads(k_std, c_std, given.pitch, max(ratio_std, given.ratio_floor))
 
 
 def updated(
@@ -156,7 +163,9 @@ def updated(
 def _distance(known: FactorPrior, reading: MachineReading) -> float:
     """Distance of a reading from what is known, both uncertain, in standard deviations."""
     away = np.array(reading.factors) - known.mean
-    return math.sqrt(float(away @ np.linalg.solve(known.covariance + np.array(reading.covariance).reshape(3, 3), away)))
+    return math.sqrt(
+        float(away @ np.linalg.solve(known.covariance + np.array(reading.covariance).reshape(_SIZE, _SIZE), away))
+    )
 
 
 def _drift(known: FactorPrior, reading: MachineReading) -> str:
@@ -165,7 +174,7 @@ def _drift(known: FactorPrior, reading: MachineReading) -> str:
     The reading holds the prior, so that its move has the variance by which the prior's shrank.
     """
     moved = np.array(reading.factors) - known.mean
-    shrunk = known.covariance - np.array(reading.covariance).reshape(3, 3)
+    shrunk = known.covariance - np.array(reading.covariance).reshape(_SIZE, _SIZE)
     values, vectors = np.linalg.eigh(shrunk)
     told = values > 1e-3 * np.trace(known.covariance) / 3.0
     far = float(np.sum(np.square(vectors[:, told].T @ moved) / values[told])) if np.any(told) else 0.0

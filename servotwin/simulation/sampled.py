@@ -31,9 +31,19 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
-from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
+from servotwin.simulation.ticks import (
+    Output,
+    Port,
+    TickInputs,
+    new_whole_tick,
+    no_whole_tick,
+    run_ticks,
+    tick_and_record,
+)
 
 _CHUNK = 1 << 15
+# Search steps per base step up to which one product checks them all, and numbers of states.
+_SEARCHES_IN_ONE, _STATES_IN_ONE = 4, (12, 16)
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -51,6 +61,7 @@ class SampledEngine:
     rng: np.random.Generator
     keep: int | None = None
     delay: int = 0
+    hurried: bool = False
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
@@ -72,6 +83,8 @@ class SampledEngine:
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
+        in_one = self.hurried and searches <= _SEARCHES_IN_ONE and len(self.state) in _STATES_IN_ONE
+        self.whole = new_whole_tick(self.tables, searches) if in_one else no_whole_tick()
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
 
@@ -175,6 +188,7 @@ class SampledEngine:
                 self.output,
                 self.record,
                 self.scratch,
+                self.whole,
             )
             self._check(status)
 

@@ -15,6 +15,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.inputs import RunInputs, quantised, spliced
+from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
 
@@ -276,7 +277,12 @@ def simulate(
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
-    simulation.advance(simulation.samples - 1)
+    law, inputs, samples = simulation.controller, simulation.inputs, simulation.samples
+    if noise is None and advances_in_blocks(servo, law, inputs, samples):
+        engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
+        engine.advance(samples - 1)
+        return Run(servo, inputs, samples, engine.channel, engine.events)
+    simulation.advance(samples - 1)
     return simulation.run()
 
 

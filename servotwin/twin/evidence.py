@@ -199,7 +199,7 @@ class StoredExpectation(Struct, frozen=True):
         trend, numbers = None if self.trend is None else self.trend.trend(settings), self.machine
         if numbers is None:
             return Expectation(self.previous, trend)
-        known = FactorPrior(np.array(numbers.factors), np.array(numbers.covariance).reshape(3, 3))
+        known = FactorPrior(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
         return Expectation(self.previous, trend, known)
 
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -125,15 +126,17 @@ def test_a_window_with_two_contacts_never_uses_the_carried_offset():
 
 def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
     """However sure it is: an offset that is right does not change what is left over."""
-    window, true = noisy(stretch(5.0, 1.2), 1), whitened.estimate
+    window, true = noisy(stretch(5.0, 1.2), 1), whitened.fit
 
-    def lost(window, servo, prior, settings):
-        found = true(window, servo, prior, settings)
-        return found if settings.offset is None else replace(found, gap=found.gap + DEG, rms=100.0 * found.rms)
+    def lost(window, servo, prior, settings, machine):
+        fitted = true(window, servo, prior, settings, machine)
+        right = fitted.concluded()
+        wrong = replace(right, gap=right.gap + DEG, rms=100.0 * right.rms)
+        return fitted if settings.offset is None else SimpleNamespace(servo=servo, concluded=lambda: wrong)
 
     known = (0.0, 0.01 * DEG)
     assert estimate_carrying(window, SERVO, None, SETTINGS, known).ok
-    monkeypatch.setattr(whitened, "estimate", lost)
+    monkeypatch.setattr(whitened, "fit", lost)
     refused = estimate_carrying(window, SERVO, None, SETTINGS, known)
     assert refused.status in REFUSED
     assert "times as much is left over" in refused.reasons[-1]

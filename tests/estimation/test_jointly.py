@@ -231,7 +231,7 @@ def test_impossible_requests_are_refused_with_the_reason(channels, options, word
     ("settings", "words"),
     [
         ({"spreads": {"k": 1.0}}, "allowed are k/m"),
-        ({"spreads": {"k/m": 0.0}}, "must be a positive number"),
+        ({"spreads": {"k/m": 0.0}}, "must be finite and positive"),
         ({"inflation": math.nan}, "inflation = nan: must be a number, at least 0, finite"),
         ({"whitenings": 2.5}, "whitenings = 2.5: must be an integer, at least 0"),
         ({"noise_order": True}, "noise_order = True: must be an integer, at least 0"),

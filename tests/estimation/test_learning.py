@@ -23,7 +23,7 @@ from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
 
 MODEL = Servo.preset("paper")
-TRUTH = np.log([1.03, 0.75, 1.005])
+TRUTH = np.log([1.03, 0.75, 1.005, 1.02])
 ROUGH = FactorPrior.of_spreads(0.1, 0.3, 0.01)
 
 
@@ -69,7 +69,7 @@ def test_one_contact_with_a_model_a_little_off_is_not_taken_for_two():
 
 
 def test_two_contacts_are_believed_where_they_are():
-    case = machine_window(factors=np.zeros(3))
+    case = machine_window(factors=np.zeros(4))
     problem, points = problem_of(case, noise=1e-6)
     evidence = contact_evidence(problem, problem.reduction.misfit(problem.noise, points[0]), points[0])
     assert evidence.two
@@ -79,14 +79,14 @@ def test_two_contacts_are_believed_where_they_are():
 def test_derivatives_are_those_of_the_residual():
     """Where the residual vanishes, the derivatives of what is left off the nuisances are those of the motion."""
     case = machine_window(noise=0.0)
-    problem, points = problem_of(case, FactorPrior.of_spreads(1e3, 1e3, 1e3), noise=1e-9)
-    fit = problem.descend(np.array([*points[0], 0.0, 0.0, 0.0]), (True, True))
+    problem, points = problem_of(case, FactorPrior.of_spreads(1e3, 1e3, 1e3, 1e3), noise=1e-9)
+    fit = problem.descend(np.array([*points[0], 0.0, 0.0, 0.0, 0.0]), (True, True))
     q = np.array([*fit.point, *fit.factors])
     residual, rows = problem.rows(q)
-    for index, step in enumerate((1e-6, None, 1e-5, 1e-5, 1e-5)):
+    for index, step in enumerate((1e-6, None, 1e-5, 1e-5, 1e-5, 1e-5)):
         if step is None:  # the place has a kink in contact
             continue
-        ahead, behind = (problem.rows(q + sign * step * np.eye(5)[index])[0] for sign in (1.0, -1.0))
+        ahead, behind = (problem.rows(q + sign * step * np.eye(6)[index])[0] for sign in (1.0, -1.0))
         assert np.linalg.norm((behind - ahead) / (2.0 * step) - rows[index]) < 0.02 * np.linalg.norm(rows[index])
     assert residual.size > rows.shape[0]
 
@@ -98,16 +98,16 @@ def test_without_noise_the_factors_come_out_exactly():
 
 
 def test_with_noise_the_spreads_hold_what_they_promise():
-    """Squared distances of the factors, in standard deviations, are chi-squared with three degrees of freedom."""
+    """Squared distances of the factors, in standard deviations, are chi-squared with four degrees of freedom."""
     distances, errors = [], []
     for seed in range(8):
         fitted = whitened.fit(machine_window(seed=seed).window, MODEL, None, None, ROUGH)
         reading = fitted.learnt.reading(1.0)
         away = np.array(reading.factors) - TRUTH
-        distances.append(away @ np.linalg.solve(np.array(reading.covariance).reshape(3, 3), away))
+        distances.append(away @ np.linalg.solve(np.array(reading.covariance).reshape(4, 4), away))
         gap_error = fitted.aligned.whitened.point.gap - math.radians(10.0)
         errors.append(gap_error / fitted.learnt.gap_std(1.0))
-    assert 0.7 < np.mean(distances) < 6.0  # 3 for the right spreads; the sum has 24 degrees of freedom
+    assert 1.0 < np.mean(distances) < 8.0  # 4 for the right spreads; the sum has 32 degrees of freedom
     assert 0.3 < np.mean(np.square(errors)) < 2.7
 
 
@@ -119,7 +119,7 @@ def test_a_model_that_is_taken_as_exact_gives_no_estimate():
 
 
 def test_a_nameplate_wrong_by_a_factor_of_two_is_said_and_not_estimated():
-    window = machine_window(factors=np.log([2.0, 2.0, 1.0])).window
+    window = machine_window(factors=np.log([2.0, 2.0, 1.0, 1.0])).window
     estimate = estimate_carrying(
         window, MODEL, None, whitened.WhitenedSettings(), None, FactorPrior.of_spreads(0.03, 0.1, 0.01)
     )
@@ -130,39 +130,39 @@ GIVEN = LearningSettings()
 
 
 def reading_of(factors, std=1e-3, status=GapStatus.OK):
-    reading = MachineReading(tuple(factors), tuple(np.diag([std**2] * 3).ravel().tolist()))
+    reading = MachineReading(tuple(factors), tuple(np.diag([std**2] * 4).ravel().tolist()))
     return replace(GapEstimate(0.1, 1e-3, 1e-3, (0.09, 0.11), status, 0.0), machine=reading)
 
 
 def test_time_widens_what_was_learnt_and_no_number_of_windows_goes_below_the_floor():
-    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0), 1e-9), True, 0.0)
+    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0, 0.0), 1e-9), True, 0.0)
     assert np.sqrt(np.diag(machine.prior(GIVEN, 0.0).covariance)) == pytest.approx(np.sqrt(GIVEN.floor))
     later = np.sqrt(np.diag(machine.prior(GIVEN, 4.0 * 86400.0).covariance))
     assert later[:2] == pytest.approx([2.0 * GIVEN.k_drift, 2.0 * GIVEN.c_drift], rel=1e-3)
 
 
 def test_an_estimate_that_the_trend_refuses_teaches_nothing():
-    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0)), True, 0.0)
-    assert updated(machine, GIVEN, reading_of((0.5, 0.1, 0.0)), False, 1.0) == machine
+    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0, 0.0)), True, 0.0)
+    assert updated(machine, GIVEN, reading_of((0.5, 0.1, 0.0, 0.0)), False, 1.0) == machine
 
 
 def test_another_machine_is_learnt_only_when_windows_agree_on_it():
-    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0)), True, 0.0)
-    other = reading_of((0.2, -0.3, 0.0), status=GapStatus.MODEL_MISMATCH)
+    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0, 0.0)), True, 0.0)
+    other = reading_of((0.2, -0.3, 0.0, 0.0), status=GapStatus.MODEL_MISMATCH)
     once = updated(machine, GIVEN, other, False, 1.0)
     assert once.factors == machine.factors
     assert "not the one that was learnt" in once.alarm
-    mixed = updated(updated(once, GIVEN, reading_of((0.01, 0.1, 0.0)), True, 2.0), GIVEN, other, False, 3.0)
+    mixed = updated(updated(once, GIVEN, reading_of((0.01, 0.1, 0.0, 0.0)), True, 2.0), GIVEN, other, False, 3.0)
     assert mixed.rival.windows == 1  # two machines under one name never agree in a row
     thrice = updated(updated(once, GIVEN, other, False, 2.0), GIVEN, other, False, 3.0)
-    assert thrice.factors == (0.2, -0.3, 0.0)
+    assert thrice.factors == (0.2, -0.3, 0.0, 0.0)
     assert "learnt anew" in thrice.alarm
 
 
 def test_a_model_that_moves_beyond_its_drift_raises_an_alarm():
-    machine = updated(None, GIVEN, reading_of((0.0, 0.0, 0.0), 1e-3), True, 0.0)
-    still = updated(machine, GIVEN, reading_of((1e-4, 0.0, 0.0), 5e-4), True, 1.0)
-    moved = updated(machine, GIVEN, reading_of((8e-3, 0.0, 0.0), 5e-4), True, 1.0)
+    machine = updated(None, GIVEN, reading_of((0.0, 0.0, 0.0, 0.0), 1e-3), True, 0.0)
+    still = updated(machine, GIVEN, reading_of((1e-4, 0.0, 0.0, 0.0), 5e-4), True, 1.0)
+    moved = updated(machine, GIVEN, reading_of((8e-3, 0.0, 0.0, 0.0), 5e-4), True, 1.0)
     assert still.alarm == ""
     assert moved.alarm.startswith("the model drifts: k/m")
 
@@ -171,12 +171,13 @@ def test_the_nameplates_spread_is_that_of_the_stated_ranges():
     prior = nameplate(GIVEN, 0.15, 0.5, 0.1)
     spread = np.sqrt(np.diag(prior.covariance))
     assert spread == pytest.approx(
-        [math.hypot(0.15, 0.1) / math.sqrt(3.0), math.hypot(0.5, 0.1) / math.sqrt(3.0), 0.01]
+        np.array([math.hypot(0.15, 0.1), math.hypot(0.5, 0.1), 0.01 * math.sqrt(3.0), math.hypot(0.1, 0.1)])
+        / math.sqrt(3.0)
     )
 
 
 def test_a_machine_survives_its_encoding():
-    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0)), True, 5.0)
+    machine = updated(None, GIVEN, reading_of((0.01, 0.1, 0.0, 0.0)), True, 5.0)
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(machine), type=LearntMachine) == machine
 
 

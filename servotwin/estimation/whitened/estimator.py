@@ -16,8 +16,9 @@ from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
-from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
+    SMALLEST_BOUND,
     FitEvidence,
     ModelShift,
     contacts_seen,
@@ -117,11 +118,11 @@ class WindowFit:
         if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
             status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
         teaches = self._teaches(evidence, status)
-        if status is GapStatus.OK or teaches or (self.learnt is not None and status is GapStatus.LOWER_BOUND):
+        if teaches or status in (GapStatus.OK, GapStatus.LOWER_BOUND):
             contacts = contacts_seen(self.aligned, self.servo)
             if status is not GapStatus.UNIDENTIFIABLE and not contacts.two:
                 reasons = reasons or (_ONE_CONTACT,)
-                return _one_contact(self.blank, evidence, contacts.lead, reasons, self.settings)
+                return _one_contact(self.blank, evidence, contacts, reasons, self.settings)
             teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
             reasons = (*likely_fault(self.window, self.angle, self.servo, evidence.unexplained), *reasons)
@@ -224,19 +225,20 @@ def _travel(result: WhitenedFit) -> Travel:
 
 
 def _one_contact(
-    blank: GapEstimate, evidence: FitEvidence, lead: float, reasons: tuple[str, ...], settings: WhitenedSettings
+    blank: GapEstimate,
+    evidence: FitEvidence,
+    contacts: ContactEvidence,
+    reasons: tuple[str, ...],
+    settings: WhitenedSettings,
 ) -> GapEstimate:
-    """State a lower bound: one contact explains the window too, and then the gap is as wide as the lead (rad)."""
-    bound = max(0.0, min(lead - NORMAL_95 * settings.model_error, lower_bound(evidence, settings)))
-    return replace(
-        blank,
-        status=GapStatus.LOWER_BOUND,
-        reasons=reasons,
-        gap=bound,
-        interval=(bound, math.inf),
-        rms=_left(evidence.aligned.whitened),
-        evaluations=evidence.aligned.whitened.evaluations,
-    )
+    """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
+    fitted = evidence.aligned.whitened
+    blank = replace(blank, reasons=reasons, rms=_left(fitted), evaluations=fitted.evaluations)
+    lead = contacts.lead - NORMAL_95 * math.hypot(settings.model_error, contacts.lead_std)
+    bound = min(lead, lower_bound(evidence, settings))
+    if bound < SMALLEST_BOUND:
+        return replace(blank, status=GapStatus.UNIDENTIFIABLE)
+    return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
 
 
 def _stated(

@@ -25,8 +25,8 @@ from servotwin.estimation.whitened.search import PLACES
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-FACTORS = ("k/m", "c/m", "pitch")
-FREEDOM = (0.1, 0.5, 0.05)  # relative standard deviations of the factors where nothing else is known of them
+FACTORS = ("k/m", "c/m", "pitch", "mass ratio")
+FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors where nothing else is known of them
 LARGEST = 4.0  # standard deviations by which a factor may move
 _STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
 _SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
@@ -46,25 +46,25 @@ class FactorPrior:
 
     Attributes
     ----------
-    mean : (3,) array
-    covariance : (3, 3) array
+    mean : (4,) array
+    covariance : (4, 4) array
     """
 
     mean: Array
     covariance: Array
 
     @classmethod
-    def of_spreads(cls, k: float, c: float, pitch: float) -> FactorPrior:
+    def of_spreads(cls, k: float, c: float, pitch: float, ratio: float = 0.03) -> FactorPrior:
         """Independent factors about 1, with relative standard deviations."""
-        return cls(np.zeros(3), np.diag(np.square([k, c, pitch])))
+        return cls(np.zeros(4), np.diag(np.square([k, c, pitch, ratio])))
 
     @property
     def root(self) -> Array:
-        """(3, 3) whitening matrix: root (factors - mean) has unit covariance."""
+        """(4, 4) whitening matrix: root (factors - mean) has unit covariance."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)))
 
     def limits(self) -> tuple[Array, Array]:
-        """(3,) least and largest factors that are searched."""
+        """(4,) least and largest factors that are searched."""
         reach = LARGEST * np.sqrt(np.diag(self.covariance))
         return self.mean - reach, self.mean + reach
 
@@ -76,11 +76,11 @@ class FreeFit:
     Attributes
     ----------
     point : Point
-    factors : (3,) array
+    factors : (4,) array
         Logarithms of `FACTORS` over the model's.
     cost : float
         Squared length of the whitened residual, prior included.
-    covariance : (5, 5) array
+    covariance : (6, 6) array
         Of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal of what is not known.
     evaluations : int
     """
@@ -93,9 +93,15 @@ class FreeFit:
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
-    """The servo with other logarithms of `FACTORS`."""
-    k, c, p = (math.exp(value) for value in factors)
-    return servo.replace(k=tuple(k * servo.stiffnesses), c=tuple(c * servo.dampings), p=p * servo.p)
+    """Return the servo with other logarithms of `FACTORS`.
+
+    The mass ratio is that of the last mass to the others. With two masses, the first of which moves with the screw,
+    there is none.
+    """
+    k, c, p, ratio = (math.exp(value) for value in factors)
+    masses = servo.masses.copy()
+    masses[-1] *= ratio if servo.n > 2 else 1.0
+    return servo.replace(m=tuple(masses), k=tuple(k * servo.stiffnesses), c=tuple(c * servo.dampings), p=p * servo.p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +130,7 @@ class FreeProblem:
     compliance: float = 0.0
 
     def rows(self, q: Array) -> tuple[Array, Array]:
-        """Residual (M,) and derivatives of the motion (5, M) at a point (5,), nuisances out, prior appended."""
+        """Residual (M,) and derivatives of the motion (6, M) at a point (6,), nuisances out, prior appended."""
         point, factors = Point(q[0], q[1]), q[2:]
         rate = 1.0 / self.reduction.response.interval
         reduction = replace(self.reduction, response=_response(self.servo, tuple(factors), rate))
@@ -154,14 +160,14 @@ class FreeProblem:
     def descend(
         self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
     ) -> FreeFit:
-        """Descend from a start (5,) with at most so many evaluations; of gap and place only what is `free` moves.
+        """Descend from a start (6,) with at most so many evaluations; of gap and place only what is `free` moves.
 
         It ends early once the cost is below the first number of `within`, or once even the linearised problem cannot
         bring it below the second: its value is then not that of the minimum, but on the same side of both.
         """
         least, most = self.prior.limits()
         low, high = np.concatenate([[0.0, -1.0], least]), np.concatenate([[self.largest, 1.0], most])
-        movable, (enough, hopeless) = np.array([*free, True, True, True]), within
+        movable, (enough, hopeless) = np.array([*free, *(True for _ in FACTORS)]), within
         q, damping = np.clip(start, low, high), _FIRST_DAMPING
         residual, rows = self.rows(q)
         cost, count = float(residual @ residual), 1
@@ -198,10 +204,17 @@ def motion_by(reduction: Reduction, other: Response, screw: Array, weights: Arra
     """
     forced = reduction.decimation.rows(other.respond(screw) - reduction.response.respond(screw))[0]
     mine, samples = reduction.fixed(), reduction.theta_m.size
-    theirs = reduction.decimation.rows(np.vstack([np.ones((1, samples)), other.free(samples)]))
-    if len(theirs) != len(mine):  # a screw that just became soft has a mode more, which is not excited
-        return np.asarray(forced)
+    same = _same_modes(reduction.response, other)
+    theirs = reduction.decimation.rows(np.vstack([np.ones((1, samples)), same.free(samples)]))
     return np.asarray(forced + weights[: len(mine)] @ (theirs - mine))
+
+
+def _same_modes(response: Response, other: Response) -> Response:
+    """Response with those modes of `other` that are nearest to another's; a screw that becomes soft has one more."""
+    if other.poles.size == response.poles.size:
+        return other
+    nearest = [int(np.argmin(np.abs(other.poles - pole))) for pole in response.poles]
+    return replace(other, poles=other.poles[nearest])
 
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
@@ -220,10 +233,13 @@ class ContactEvidence:
         At least, where it is far above what is `BELIEVED`.
     lead : float
         rad, range by which the motor leads the screw in the fit of one contact: the gap is at least as wide.
+    lead_std : float
+        rad, its standard deviation with the model free; 0 where the screw did not move.
     """
 
     rise: float
     lead: float
+    lead_std: float
 
     @property
     def two(self) -> bool:
@@ -266,7 +282,11 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
             break
     best = min(fits, key=lambda one: one.cost)
     theta_m = problem.reduction.theta_m
-    return ContactEvidence((best.cost - believed.cost) / variance, travel(theta_m, best.point.screw(theta_m[0])).lead)
+    motion = travel(theta_m, best.point.screw(theta_m[0]))
+    # The way to the contact is what the place says: half the gap per unit.
+    moved = motion.forwards + motion.backwards > 0.0
+    std = 0.5 * wide * math.sqrt(variance * best.covariance[1, 1]) if moved else 0.0
+    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std)
 
 
 def same_way(point: Point, gap: float) -> tuple[float, float, float]:

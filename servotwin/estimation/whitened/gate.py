@@ -220,7 +220,7 @@ def _transients(order: int, interval: float, samples: int) -> Array:
 
 
 _SIGMAS = 3.0  # standard deviations by which another view may disagree
-_SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
+SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
 
@@ -265,9 +265,10 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     """
     too_little = one_sided(evidence.travel, settings)
     disagreements = () if too_little else _disagreements(evidence, settings)
-    mismatches = tuple(filter(None, (_unexplained(evidence), _delayed(evidence, settings), *disagreements)))
+    own = (_unexplained(evidence), _delayed(evidence, settings), _growing(evidence.aligned.whitened))
+    mismatches = tuple(filter(None, (*own, *disagreements)))
     silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
-    bound = lower_bound(evidence, settings) > _SMALLEST_BOUND and math.isinf(evidence.interval[1])
+    bound = lower_bound(evidence, settings) > SMALLEST_BOUND and math.isinf(evidence.interval[1])
     if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
@@ -327,6 +328,19 @@ def _delayed(evidence: FitEvidence, settings: WhitenedSettings) -> str:
         return ""
     allowed = 1e3 * settings.largest_skew
     return f"position and theta_m would be {1e3 * delay:+.3g} ms apart, and {allowed:.3g} ms are allowed"
+
+
+def _growing(result: WhitenedFit) -> str:
+    """Reason against a window in which the gap grows faster than is assumed; empty where it does not."""
+    reduction = result.reduction
+    if reduction.growth is None:
+        return ""
+    left = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients[len(reduction.fixed())]
+    rate, assumed = reduction.rate + float(left), _SIGMAS * reduction.growth.std
+    if abs(rate) <= assumed:
+        return ""
+    per_s = 1.0 / reduction.response.interval
+    return f"the gap would grow by {_deg(rate * per_s)}/s within the window, and {_deg(assumed * per_s)}/s are assumed"
 
 
 def _disagreements(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from servotwin.plant.signals import Array
 
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
-_WIDE = (0.01, 0.05, 0.005)  # relative spreads of the factors: wider ones are searched before the noise is known
+_WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: wider ones are searched before the noise is known
 _AT_END = 1e-3  # of the range of a factor
 _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all to the window, nothing to the prior
 
