@@ -176,7 +176,7 @@ class _Search:
         """Candidates that meet the demands on a few machines first, then by cost."""
         demands = self.demands
         members = draw(self.servo, self.uncertainty, demands.screened, demands.conditions, demands.seed)
-        measures = assess([self._quick(setting) for setting in candidates], members, self.trial)
+        measures = assess([self._quick(setting) for setting in candidates], members, self.trial.half)
 
         def rank(k: int) -> tuple[bool, float]:
             few = measures[k]
