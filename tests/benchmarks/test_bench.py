@@ -163,9 +163,7 @@ def test_slow_contestants_run_on_request():
 def test_workloads_are_chosen_by_name():
     assert catalogue.chosen([]) == ("W1", "W2", "W3", "sampled", "quiet", "decision", "start")
     assert catalogue.chosen(["SAMPLED", "w1"]) == ("W1", "sampled", "quiet")
-    with pytest.raises(
-        InvalidInput, match=r"workload 'W9' does not exist.*W3, sampled, quiet, decision, start"
-    ):
+    with pytest.raises(InvalidInput, match=r"workload 'W9' does not exist.*W3, sampled, quiet, decision, start"):
         catalogue.chosen(["W9"])
 
 
