@@ -121,12 +121,25 @@ def _times(n: int, row: Array, matrix: Array, base: int, out: Array) -> None:
 
 
 @bare
-def _add_square(n: int, row: Array, factor: float, sums: Array, base: int) -> None:
+def add_square(n: int, row: Array, sums: Array, base: int) -> None:
+    """Add ``row' row`` to a matrix."""
     for i in range(n):
-        scaled = factor * row[i]
-        if scaled != 0.0:
+        factor = row[i]
+        if factor != 0.0:
             for j in range(n):
-                sums[base + i * n + j] += scaled * row[j]
+                sums[base + i * n + j] += factor * row[j]
+
+
+@inlined
+def cubic_weights(u: float, tilt: float) -> tuple[float, float, float, float]:
+    """Bernstein's weights of a cubic's value at `u` of its interval, plus `tilt` times a third of its slope there."""
+    v = 1.0 - u
+    return (
+        v * v * v - tilt * v * v,
+        3.0 * v * v * u + tilt * (v * v - 2.0 * u * v),
+        3.0 * v * u * u + tilt * (2.0 * u * v - u * u),
+        u * u * u + tilt * u * u,
+    )
 
 
 @bare
@@ -227,13 +240,8 @@ def _coarse_deviation(t: LiftedTables, watch: int, w: LiftedWorkspace) -> None:
             if point < 3 and w.discrete[watch] > 0.0:
                 continue
             u = (i if point == 1 else i + 1) / FINE
-            v = 1.0 - u
             tilt = 0.0 if point == 3 else (1.0 if point == 1 else -1.0) / FINE
-            # Bernstein's weights of the cubic's value there and, for an inner control point, of a third of its slope.
-            c0 = v * v * v - tilt * v * v
-            c1 = 3.0 * v * v * u + tilt * (v * v - 2.0 * u * v)
-            c2 = 3.0 * v * u * u + tilt * (2.0 * u * v - u * u)
-            c3 = u * u * u + tilt * u * u
+            c0, c1, c2, c3 = cubic_weights(u, tilt)
             for j in range(n):
                 start, end = w.rows[j], w.rows[FINE * n + j]
                 second = start + FINE * w.rows[9 * n + j]
@@ -244,7 +252,7 @@ def _coarse_deviation(t: LiftedTables, watch: int, w: LiftedWorkspace) -> None:
                 elif point == 2:
                     true -= w.rows[(18 + i + 1) * n + j]
                 w.row[j] = true - ((c0 * start + c1 * second) + (c2 * third + c3 * end))
-            _add_square(n, w.row, 1.0, w.sums, 0)
+            add_square(n, w.row, w.sums, 0)
 
 
 @bare

@@ -27,21 +27,16 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.lifted import (
-    KINDS,
     TICKED,
     UNFILLED,
-    LiftedMemory,
-    Loop,
-    Place,
-    Places,
-    fill_here,
     more_segments,
     new_segments,
     run_lifted,
-    sample_lifted,
     set_reference,
     take_tick,
 )
+from servotwin.simulation.lifted_output import sample_lifted
+from servotwin.simulation.lifted_tables import KINDS, LiftedLoop, LiftedMemory, Place, Places, fill_here
 
 _ROOM = 4096
 # Ticks, of a run and per piece of the inputs, below which blocks do not pay.
@@ -151,7 +146,7 @@ class LiftedEngine:
             self.state[self.places.feedforward] = self.controller.feedforward
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)
         dead_zone = self.inputs.tolerance is not None and bool(np.any(self.inputs.tolerance.coeffs[:, 0] > 0.0))
-        self.loop = Loop(law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes)
+        self.loop = LiftedLoop(law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes)
         self.memory = new_memory(self.places, modes, watches_of(self.plant, self.controller, dead_zone))
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)

@@ -5,6 +5,7 @@ Contacts of the gap inside a sample are located.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,19 +32,9 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
-from servotwin.simulation.ticks import (
-    Output,
-    Port,
-    TickInputs,
-    new_whole_tick,
-    no_whole_tick,
-    run_ticks,
-    tick_and_record,
-)
+from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
 _CHUNK = 1 << 15
-# Search steps per base step up to which one product checks them all, and numbers of states.
-_SEARCHES_IN_ONE, _STATES_IN_ONE = 4, (12, 16)
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -61,7 +52,6 @@ class SampledEngine:
     rng: np.random.Generator
     keep: int | None = None
     delay: int = 0
-    hurried: bool = False
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
@@ -83,8 +73,6 @@ class SampledEngine:
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
-        in_one = self.hurried and searches <= _SEARCHES_IN_ONE and len(self.state) in _STATES_IN_ONE
-        self.whole = new_whole_tick(self.tables, searches) if in_one else no_whole_tick()
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
 
@@ -167,10 +155,24 @@ class SampledEngine:
         return TickInputs(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
 
     def _run(self, end: int) -> None:
-        while self.base < end:
-            # In chunks, which bound the memory of the inputs that are laid out for the ticks.
-            stop = min(end, self.base + _CHUNK)
-            self.flow(stop, self.tick_inputs(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
+        if self.noise is None or end - self.base <= _CHUNK:
+            while self.base < end:
+                stop = min(end, self.base + _CHUNK)
+                self.flow(stop, self._inputs_until(self.base, stop))
+            return
+        # The noise of the next chunk is drawn while this one runs.
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(self._inputs_until, self.base, self.base + _CHUNK)
+            while self.base < end:
+                stop = min(end, self.base + _CHUNK)
+                tick_inputs = coming.result()
+                if stop < end:
+                    coming = pool.submit(self._inputs_until, stop, min(end, stop + _CHUNK))
+                self.flow(stop, tick_inputs)
+
+    def _inputs_until(self, base: int, end: int) -> TickInputs:
+        """Inputs of the ticks from one base step up to another."""
+        return self.tick_inputs(-(-base // self.tick_every), -(-end // self.tick_every))
 
     def flow(self, end: int, tick_inputs: TickInputs) -> None:
         """Advance to a base step; `tick_inputs` covers the ticks on the way, while the gap's cubic stays the same."""
@@ -188,7 +190,6 @@ class SampledEngine:
                 self.output,
                 self.record,
                 self.scratch,
-                self.whole,
             )
             self._check(status)
 

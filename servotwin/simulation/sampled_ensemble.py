@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -97,11 +97,7 @@ def summarise_sampled(
         does not exist, limits of an output that is not listed, or a `last` longer than the run.
     """
     members, span = sampled_members(servos, controllers, cases), _span(duration, sample_rate, outputs, last, shape)
-    bounds = np.full((len(members.servos), len(outputs)), np.inf)
-    for name, limit in (limits or {}).items():
-        if name not in outputs:
-            raise InvalidInput(f"limits name {name!r}, which is none of the outputs {', '.join(outputs)}")
-        bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
+    bounds = _bounds(members, limits or {}, outputs)
     values = np.empty((len(bounds), len(outputs), len(Figures._fields)))
     for group in groups_of(members, span):
         results = SampledResults(
@@ -109,13 +105,21 @@ def summarise_sampled(
         )
         run_group(group, span, bounds[group.which], results, threads)
         values[group.which] = results.figures
-    ticked = [k for k in range(len(bounds)) if not in_blocks(members, k, span)]
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for k, traces in zip(ticked, pool.map(lambda k: _run(members, k, span), ticked), strict=True):
-            for o, trace in enumerate(traces):
-                figures_of(trace, bounds[k, o], span.last, values[k, o])
+    for k, traces in _ticked(members, span, threads):
+        for o, trace in enumerate(traces):
+            figures_of(trace, bounds[k, o], span.last, values[k, o])
     by_output = np.moveaxis(values, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
     return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
+
+
+def _bounds(members: SampledMembers, limits: Mapping[str, ArrayLike], outputs: Sequence[str]) -> Array:
+    """(K, O) absolute values beyond which a sample is outside."""
+    bounds = np.full((len(members.servos), len(outputs)), np.inf)
+    for name, limit in limits.items():
+        if name not in outputs:
+            raise InvalidInput(f"limits name {name!r}, which is none of the outputs {', '.join(outputs)}")
+        bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
+    return bounds
 
 
 def simulate_sampled(
@@ -153,10 +157,8 @@ def simulate_sampled(
         )
         run_group(group, span, np.zeros((len(group.which), len(outputs))), results, threads)
         traces[group.which] = results.traces
-    ticked = [k for k in range(len(traces)) if not in_blocks(members, k, span)]
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for k, run in zip(ticked, pool.map(lambda k: _run(members, k, span), ticked), strict=True):
-            traces[k] = run
+    for k, run in _ticked(members, span, threads):
+        traces[k] = run
     return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
 
@@ -196,6 +198,13 @@ def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: flo
         if name not in OUTPUTS:
             raise InvalidInput(f"a sampled ensemble has no output {name!r}; allowed are {', '.join(OUTPUTS)}")
     return SampledSpan(as_pieces(shape, duration), samples, sample_rate, tuple(outputs), max(last_samples, 1))
+
+
+def _ticked(members: SampledMembers, span: SampledSpan, threads: int | None) -> Iterator[tuple[int, Array]]:
+    """Members that do not advance in blocks, with their (O, N) outputs, tick by tick."""
+    which = [k for k in range(len(members.servos)) if not in_blocks(members, k, span)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        yield from zip(which, pool.map(lambda k: _run(members, k, span), which), strict=True)
 
 
 def _run(members: SampledMembers, member: int, span: SampledSpan) -> Array:

@@ -23,8 +23,9 @@ from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.ensemble import starts_of
-from servotwin.simulation.lifted import KINDS, Place, Places, more_segments, new_segments
+from servotwin.simulation.lifted import more_segments, new_segments
 from servotwin.simulation.lifted_engine import new_memory, places_of, watches_of
+from servotwin.simulation.lifted_tables import KINDS, Place, Places
 from servotwin.simulation.sampled_members import (
     SampledFamily,
     SampledResults,

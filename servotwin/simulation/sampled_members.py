@@ -15,21 +15,9 @@ from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, RunRecord
 from servotwin.hybrid.members import figures_of
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.lifted import (
-    TICKED,
-    UNFILLED,
-    LiftedMemory,
-    Loop,
-    Place,
-    Places,
-    Segments,
-    fill_here,
-    note,
-    run_lifted,
-    sample_lifted,
-    set_reference,
-    take_tick,
-)
+from servotwin.simulation.lifted import TICKED, UNFILLED, Segments, note, run_lifted, set_reference, take_tick
+from servotwin.simulation.lifted_output import sample_lifted
+from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places, fill_here
 
 _LATE = 1e-9  # ticks: a knot that rounding puts behind the tick it belongs to
 
@@ -119,7 +107,7 @@ def run_one(
     parameters = LawParameters(
         p[0], p[1], p[2], p[3], starts.enter[k], starts.leave[k], p[6], p[7], p[8], p[9], p[10], p[11]
     )
-    loop = Loop(
+    loop = LiftedLoop(
         parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes
     )
     for i in range(places.states):

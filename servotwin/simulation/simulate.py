@@ -277,13 +277,20 @@ def simulate(
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
-    law, inputs, samples = simulation.controller, simulation.inputs, simulation.samples
-    if noise is None and advances_in_blocks(servo, law, inputs, samples):
-        engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
-        engine.advance(samples - 1)
-        return Run(servo, inputs, samples, engine.channel, engine.events)
-    simulation.advance(samples - 1)
+    if noise is None and (run := _run_in_blocks(simulation, theta_d0)) is not None:
+        return run
+    simulation.advance(simulation.samples - 1)
     return simulation.run()
+
+
+def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:
+    """The whole run without noise in blocks of ticks; None where they do not fit or do not pay."""
+    servo, law, inputs, samples = simulation.servo, simulation.controller, simulation.inputs, simulation.samples
+    if not advances_in_blocks(servo, law, inputs, samples):
+        return None
+    engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
+    engine.advance(samples - 1)
+    return Run(servo, inputs, samples, engine.channel, engine.events)
 
 
 def _described(sample_rate: float | None) -> str:
