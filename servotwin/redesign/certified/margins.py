@@ -18,7 +18,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants
 
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
-_WORTH_TRYING = 0.25
+_WORTH_TRYING = 0.5
 _ROUNDED = 1.0 + 1e-6
 
 
@@ -132,7 +132,7 @@ def laws_within(
             f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
             f"{min(demands.scales):g}"
         )
-    # A loop with a fraction of the gain that another one may have is slower, and only that.
+    # A loop with less than half of the gain that another one may have is slower, at every gap of the presets.
     least = _WORTH_TRYING * max(abs(law.Kp) for law in laws)
     return tuple(law for law in laws if abs(law.Kp) >= least)
 
