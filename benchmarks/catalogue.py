@@ -152,6 +152,18 @@ def sampled(options: Options) -> Workload:
     )
 
 
+def quiet(options: Options) -> Workload:
+    """The deployed loop without noise, as settings are verified."""
+    workload = NoisyWorkload(options.wear, noise_std=None)
+    return Workload(
+        "quiet",
+        f"{workload.wear.duration:g} s, law sampled at 5 kHz, loop filter, no noise",
+        (ours.noisy(workload), ours.ticked(workload), hold.noisy(workload)),
+        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_noisy(workload))),),
+        lambda seconds: f"{workload.wear.duration / seconds:,.0f} x real time",
+    )
+
+
 def decision(options: Options) -> Workload:
     """Time of a decision of the certified policy."""
     size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
@@ -171,11 +183,20 @@ def start(options: Options) -> Workload:
     )
 
 
-WORKLOADS: dict[str, Build] = {"W1": w1, "W2": w2, "W3": w3, "sampled": sampled, "decision": decision, "start": start}
+WORKLOADS: dict[str, Build] = {
+    "W1": w1,
+    "W2": w2,
+    "W3": w3,
+    "sampled": sampled,
+    "quiet": quiet,
+    "decision": decision,
+    "start": start,
+}
+_WITH = {"sampled": ("sampled", "quiet")}
 
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of workloads in their usual order, whatever their case; none means all.
+    """Names of workloads in their usual order, whatever their case; none means all, and sampled brings quiet along.
 
     Raises
     ------
@@ -189,6 +210,7 @@ def chosen(names: Sequence[str]) -> tuple[str, ...]:
             known_ones = f"{', '.join(WORKLOADS)}, or {' or '.join(ALONE)} alone"
             raise InvalidInput(f"workload {name!r} does not exist{hint}; give some of {known_ones}")
     selected = {known[name.lower()] for name in names} or set(WORKLOADS)
+    selected = {other for name in selected for other in _WITH.get(name, (name,))}
     return tuple(name for name in WORKLOADS if name in selected)
 
 

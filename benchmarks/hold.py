@@ -132,7 +132,9 @@ def noisy(workload: NoisyWorkload) -> Contestant:
         hold = hold_of(equations_of(wear.servo), rate, workload.loop_filter_hz)
 
         def job() -> Array:
-            noise = workload.noise.samples(wear.samples, rate, np.random.default_rng(workload.seed))
+            noise = np.empty(0)
+            if workload.noise is not None:
+                noise = workload.noise.samples(wear.samples, rate, np.random.default_rng(workload.seed))
             return _recorded(hold, _wear_inputs(wear, rate, noise), 1, wear.samples)
 
         return job

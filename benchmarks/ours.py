@@ -62,6 +62,28 @@ def noisy(workload: NoisyWorkload) -> Contestant:
     return Contestant(NAME, lambda: lambda: run_noisy(workload).position)
 
 
+def ticked(workload: NoisyWorkload) -> Contestant:
+    """The sampled run without noise, tick by tick as with noise."""
+    return Contestant(f"{NAME}, tick by tick", lambda: lambda: _ticked(workload, workload.wear.sample_rate))
+
+
+def _ticked(workload: NoisyWorkload, sample_rate: float) -> Array:
+    wear = workload.wear
+    simulation = Simulation(
+        wear.servo,
+        wear.duration,
+        controller=workload.controller,
+        reference=wear.reference,
+        gap=wear.gap,
+        tolerance=wear.tolerance,
+        sample_rate=sample_rate,
+        noise=workload.noise,
+        seed=workload.seed,
+    )
+    simulation.advance(simulation.samples - 1)
+    return simulation.run().position
+
+
 def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
     """W2."""
     gaps, tolerances = workload.members
@@ -92,7 +114,7 @@ def refined_wear(workload: WearWorkload) -> Array:
 @cache
 def refined_noisy(workload: NoisyWorkload) -> Array:
     """The sampled run's positions (N,) m with `REFINED` base steps a tick."""
-    return run_noisy(workload, REFINED * workload.wear.sample_rate).position[::REFINED]
+    return _ticked(workload, REFINED * workload.wear.sample_rate)[::REFINED]
 
 
 @cache

@@ -131,14 +131,14 @@ class NoisyWorkload:
     """The same wear with a sampled controller in measurement noise, behind the paper's loop filter (section 4.3)."""
 
     wear: WearWorkload
-    noise_std: float = 0.22e-3
+    noise_std: float | None = 0.22e-3
     loop_filter_hz: float = 20.0
     seed: int = 1
 
     @property
-    def noise(self) -> Noise:
-        """The paper's noise, high-passed."""
-        return Noise(std=self.noise_std)
+    def noise(self) -> Noise | None:
+        """The paper's noise, high-passed; None: the run without noise."""
+        return None if self.noise_std is None else Noise(std=self.noise_std)
 
     @property
     def controller(self) -> Controller:

@@ -61,9 +61,11 @@ def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
     return sample_step / divisor, divisor
 
 
-def divisors(fastest: ArrayLike, fastest_lasting: ArrayLike, sample_step: float) -> NDArray[np.int64]:
+def divisors(fastest: ArrayLike, fastest_lasting: ArrayLike, sample_step: ArrayLike) -> NDArray[np.int64]:
     """The number k of search steps a sample, of each automaton."""
-    turns = np.maximum(np.divide(fastest, SPECTRAL_STEP), np.divide(fastest_lasting, LASTING_STEP)) * sample_step
+    turns = np.maximum(np.divide(fastest, SPECTRAL_STEP), np.divide(fastest_lasting, LASTING_STEP)) * np.asarray(
+        sample_step
+    )
     return np.maximum(1, np.ceil(turns - 0.05)).astype(np.int64)
 
 

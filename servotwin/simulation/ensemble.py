@@ -108,7 +108,7 @@ class EnsembleMembers:
             members = np.flatnonzero(automaton == k)
             chosen = {name: values[members] for name, values in constants.items()}
             chosen |= _constants_of([laws[member] for member in members])
-            states[members] = _starts(servo, loop, chosen)
+            states[members] = starts_of(servo, loop, chosen)
             modes[members] = start_modes(loop, states[members], laws[members[0]].enter)
         rows = np.array([[_row(loop, name) for name in outputs] for loop in loops])
         return Group(which, [loop.automaton for loop in loops], rows, Members(automaton, modes, states))
@@ -335,7 +335,7 @@ def _constants_of(laws: list[Controller]) -> dict[str, Array]:
     return {name: np.array([controller_constants(law)[name] for law in laws]) for name in names}
 
 
-def _starts(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> Array:
+def starts_of(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> Array:
     """(k, n) states at rest: `plant_start` for many members."""
     names, index = loop.automaton.names, loop.automaton.index
     states = np.zeros((len(constants["gap"]), len(names)))

@@ -5,6 +5,7 @@ Contacts of the gap inside a sample are located.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -154,10 +155,24 @@ class SampledEngine:
         return TickInputs(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
 
     def _run(self, end: int) -> None:
-        while self.base < end:
-            # In chunks, which bound the memory of the inputs that are laid out for the ticks.
-            stop = min(end, self.base + _CHUNK)
-            self.flow(stop, self.tick_inputs(-(-self.base // self.tick_every), -(-stop // self.tick_every)))
+        if self.noise is None or end - self.base <= _CHUNK:
+            while self.base < end:
+                stop = min(end, self.base + _CHUNK)
+                self.flow(stop, self._inputs_until(self.base, stop))
+            return
+        # The noise of the next chunk is drawn while this one runs.
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(self._inputs_until, self.base, self.base + _CHUNK)
+            while self.base < end:
+                stop = min(end, self.base + _CHUNK)
+                tick_inputs = coming.result()
+                if stop < end:
+                    coming = pool.submit(self._inputs_until, stop, min(end, stop + _CHUNK))
+                self.flow(stop, tick_inputs)
+
+    def _inputs_until(self, base: int, end: int) -> TickInputs:
+        """Inputs of the ticks from one base step up to another."""
+        return self.tick_inputs(-(-base // self.tick_every), -(-end // self.tick_every))
 
     def flow(self, end: int, tick_inputs: TickInputs) -> None:
         """Advance to a base step; `tick_inputs` covers the ticks on the way, while the gap's cubic stays the same."""

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_pieces
 from servotwin.simulation.ensemble import Cases, check_constants, samples_of
 from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
+from servotwin.simulation.sampled_members import SampledResults
 
 LARGEST_DELAY = 64
 OUTPUTS = ("error", "voltage", "position", "theta_m", "theta_d")
@@ -48,28 +47,6 @@ class SampledCases(NamedTuple):
     friction: ArrayLike = 0.0
     delay: ArrayLike = 0
     resolution: ArrayLike = 0.0
-
-
-@dataclass(frozen=True)
-class SampledMembers:
-    """All members, flat; `shape` is what servos, controllers and constants broadcast to."""
-
-    shape: tuple[int, ...]
-    servos: list[Servo]
-    controllers: list[Controller]
-    constants: dict[str, Array]
-
-
-@dataclass(frozen=True)
-class SampledSpan:
-    """Time and outputs of the runs: shape of the reference over time, samples, their rate (Hz), names of the outputs,
-    and the number of samples in the last part."""
-
-    shape: PiecewiseCubic
-    samples: int
-    rate: float
-    outputs: tuple[str, ...]
-    last: int
 
 
 def summarise_sampled(
@@ -119,21 +96,30 @@ def summarise_sampled(
         A controller without a sample rate or with one that does not fit, a constant out of its range, an output that
         does not exist, limits of an output that is not listed, or a `last` longer than the run.
     """
-    members = sampled_members(servos, controllers, cases)
-    span = _span(duration, sample_rate, outputs, last, shape)
+    members, span = sampled_members(servos, controllers, cases), _span(duration, sample_rate, outputs, last, shape)
+    bounds = _bounds(members, limits or {}, outputs)
+    values = np.empty((len(bounds), len(outputs), len(Figures._fields)))
+    for group in groups_of(members, span):
+        results = SampledResults(
+            np.empty((1, len(outputs), span.samples)), np.empty((len(group.which), *values.shape[1:]))
+        )
+        run_group(group, span, bounds[group.which], results, threads)
+        values[group.which] = results.figures
+    for k, traces in _ticked(members, span, threads):
+        for o, trace in enumerate(traces):
+            figures_of(trace, bounds[k, o], span.last, values[k, o])
+    by_output = np.moveaxis(values, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
+    return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
+
+
+def _bounds(members: SampledMembers, limits: Mapping[str, ArrayLike], outputs: Sequence[str]) -> Array:
+    """(K, O) absolute values beyond which a sample is outside."""
     bounds = np.full((len(members.servos), len(outputs)), np.inf)
-    for name, limit in (limits or {}).items():
+    for name, limit in limits.items():
         if name not in outputs:
             raise InvalidInput(f"limits name {name!r}, which is none of the outputs {', '.join(outputs)}")
         bounds[:, outputs.index(name)] = np.broadcast_to(limit, members.shape).ravel()
-
-    def summarise(member: int) -> Array:
-        return _figures(_run(members, member, span), bounds[member], span.last)
-
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        values = np.array(list(pool.map(summarise, range(len(members.servos)))))
-    by_output = np.moveaxis(values, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
-    return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
+    return bounds
 
 
 def simulate_sampled(
@@ -164,9 +150,16 @@ def simulate_sampled(
         As `summarise_sampled`.
     """
     members, span = sampled_members(servos, controllers, cases), _span(duration, sample_rate, outputs, 0.0, shape)
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        runs = np.array(list(pool.map(lambda member: _run(members, member, span), range(len(members.servos)))))
-    return {name: runs[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
+    traces = np.empty((len(members.servos), len(outputs), span.samples))
+    for group in groups_of(members, span):
+        results = SampledResults(
+            np.empty((len(group.which), *traces.shape[1:])), np.empty((0, len(outputs), len(Figures._fields)))
+        )
+        run_group(group, span, np.zeros((len(group.which), len(outputs))), results, threads)
+        traces[group.which] = results.traces
+    for k, run in _ticked(members, span, threads):
+        traces[k] = run
+    return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
 
 def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> SampledMembers:
@@ -207,6 +200,13 @@ def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: flo
     return SampledSpan(as_pieces(shape, duration), samples, sample_rate, tuple(outputs), max(last_samples, 1))
 
 
+def _ticked(members: SampledMembers, span: SampledSpan, threads: int | None) -> Iterator[tuple[int, Array]]:
+    """Members that do not advance in blocks, with their (O, N) outputs, tick by tick."""
+    which = [k for k in range(len(members.servos)) if not in_blocks(members, k, span)]
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        yield from zip(which, pool.map(lambda k: _run(members, k, span), which), strict=True)
+
+
 def _run(members: SampledMembers, member: int, span: SampledSpan) -> Array:
     """(O, N) outputs of one member."""
     here = {name: float(values[member]) for name, values in members.constants.items()}
@@ -237,11 +237,3 @@ def _channel(engine: SampledEngine, name: str, samples: int) -> Array:
     if name != "error":
         return engine.channel(name, 0, samples)
     return engine.inputs.reference.on(engine.inputs.times(0, samples)) - engine.channel("position", 0, samples)
-
-
-def _figures(traces: Array, limits: Array, last: int) -> Array:
-    """(O, number of figures) of one member."""
-    figures = np.empty((len(traces), len(Figures._fields)))
-    for o, trace in enumerate(traces):
-        figures_of(trace, limits[o], last, figures[o])
-    return figures

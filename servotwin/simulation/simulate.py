@@ -15,6 +15,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.inputs import RunInputs, quantised, spliced
+from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
 
@@ -276,8 +277,20 @@ def simulate(
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
+    if noise is None and (run := _run_in_blocks(simulation, theta_d0)) is not None:
+        return run
     simulation.advance(simulation.samples - 1)
     return simulation.run()
+
+
+def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:
+    """The whole run without noise in blocks of ticks; None where they do not fit or do not pay."""
+    servo, law, inputs, samples = simulation.servo, simulation.controller, simulation.inputs, simulation.samples
+    if not advances_in_blocks(servo, law, inputs, samples):
+        return None
+    engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
+    engine.advance(samples - 1)
+    return Run(servo, inputs, samples, engine.channel, engine.events)
 
 
 def _described(sample_rate: float | None) -> str:

@@ -180,6 +180,17 @@ def test_cutting_a_run_changes_no_bit() -> None:
     assert np.array_equal(whole.run().events, cut.run().events)
 
 
+def test_noise_drawn_ahead_is_the_same_noise() -> None:
+    """A long run draws it chunk by chunk beside the ticks, a run in short pieces when it is due."""
+    options = COMMON | {"controller": PAPER.controller.replace(sample_rate=5e3), "noise": Noise(std=1e-6), "seed": 7}
+    whole, cut = (Simulation(PAPER, 15.0, **options) for _ in range(2))
+    whole.advance(75_000)
+    for index in range(2500, 75_001, 2500):
+        cut.advance(index)
+    for name in ("position", "voltage", "measured_position"):
+        assert np.array_equal(getattr(whole.run(), name), getattr(cut.run(), name)), name
+
+
 def test_sensors_give_whole_counts() -> None:
     servo = PAPER.replace(position_resolution=2e-6, encoder_resolution=2.0 * np.pi / 4096)
     run = sampled(5e3, servo=servo, **COMMON, noise=Noise(std=1e-5))

@@ -18,7 +18,7 @@ from servotwin.plant.servo import Servo
 Range = tuple[float, float]
 LARGEST_DELAY = 64
 """Longest delay that is simulated, samples."""
-PARAMETERS = ("k", "c", "k_B", "m", "k_T")
+PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
@@ -114,6 +114,9 @@ class Uncertainty:
     k_T: Annotated[
         float,
         key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the torque gain, relative to the model's."),
+    ] = 0.0
+    p: Annotated[
+        float, key("pitch_percent", minimum=0.0, below=1.0, help="Half-width of the pitch, relative to the model's.")
     ] = 0.0
     delay: Annotated[
         int,

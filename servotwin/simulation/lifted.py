@@ -1,0 +1,253 @@
+"""The compiled sampled loop without noise: blocks of ticks where nothing switches, the tick where something may."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.control import law
+from servotwin.control.law import LawState
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.flow import Scratch
+from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
+from servotwin.hybrid.lifted import COARSE, FINE, advance_ticks
+from servotwin.hybrid.tables import Tables
+from servotwin.simulation.lifted_tables import (
+    LIMITED,
+    LINEAR,
+    RATE_LIMITED,
+    LiftedLoop,
+    LiftedMemory,
+    Place,
+    Places,
+    slot_of,
+)
+
+tick = verbatim(law.tick)
+
+UNFILLED = 3
+"""Status of a run that needs the tables of the mode and branch where it is."""
+TICKED = -1
+"""Slot of a segment that is one tick, its state taken after it."""
+
+
+class Segments(NamedTuple):
+    """Growing record: starts of blocks and single ticks; ``size[0]`` are filled, and `size[1]` changes of the dead
+    zone."""
+
+    size: NDArray[np.int64]
+    tick: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    state: Array
+    change_tick: NDArray[np.int64]
+    change_active: NDArray[np.bool_]
+    change_error: Array
+
+
+def new_segments(states: int, room: int) -> Segments:
+    """An empty record."""
+    return Segments(
+        np.zeros(2, dtype=np.int64),
+        np.empty(room, dtype=np.int64),
+        np.empty(room, dtype=np.int64),
+        np.empty((room, states)),
+        np.empty(room, dtype=np.int64),
+        np.empty(room, dtype=bool),
+        np.empty(room),
+    )
+
+
+def more_segments(segments: Segments) -> Segments:
+    """A copy with twice the room."""
+    larger = new_segments(segments.state.shape[1], 2 * len(segments.tick))
+    for old, new in zip(segments, larger, strict=True):
+        new[: len(old)] = old
+    return larger
+
+
+@inlined
+def set_reference(places: Places, coefficients: Array, elapsed: float, z: Array) -> None:
+    """Value and derivatives of the reference's cubic after a time in it."""
+    c0, c1, c2, c3 = coefficients[0], coefficients[1], coefficients[2], coefficients[3]
+    at = places.reference
+    z[at] = ((c3 * elapsed + c2) * elapsed + c1) * elapsed + c0
+    if places.degree > 0:
+        z[at + 1] = (3.0 * c3 * elapsed + 2.0 * c2) * elapsed + c1
+    if places.degree > 1:
+        z[at + 2] = 6.0 * c3 * elapsed + 2.0 * c2
+    if places.degree > 2:
+        z[at + 3] = 6.0 * c3
+
+
+@bare
+def take_tick(loop: LiftedLoop, places: Places, z: Array, place: Place) -> float:
+    """The edge's tick on the state; return the error that was measured."""
+    p, y = loop.parameters, z[places.position]
+    last = z[places.waiting + places.delay - 1] if places.delay > 0 else z[places.voltage]
+    filtered = z[places.filtered] if places.filtered >= 0 else y
+    active = 1.0 if place.at[2] == 1 else 0.0
+    state = LawState(z[places.integral], z[places.derivative], filtered, last, active, 0.0)
+    new = tick(p, state, z[places.reference], y)
+    z[places.integral], z[places.derivative] = new.integral, new.derivative
+    if places.filtered >= 0:
+        z[places.filtered] = new.filtered
+    if places.delay > 0:
+        z[places.voltage] = z[places.waiting]
+        for i in range(places.waiting, places.waiting + places.delay - 1):
+            z[i] = z[i + 1]
+        z[places.waiting + places.delay - 1] = new.voltage
+    else:
+        z[places.voltage] = new.voltage
+    error = z[places.reference] - new.filtered
+    place.at[2] = 1 if new.active > 0.5 else 0
+    # The side of the error counts only where the loop is about to open.
+    place.at[4] = (1 if error > 0.0 else -1) if loop.dead_zone and place.at[2] == 1 else 0
+    place.at[3], place.sign[0] = LINEAR, 0.0
+    if places.rate >= 0 and (new.voltage == last + p.rate_step or new.voltage == last - p.rate_step):
+        place.at[3], place.sign[0] = RATE_LIMITED, (1.0 if new.voltage > last else -1.0)
+        z[places.rate] = place.sign[0] * p.rate_step
+    elif new.voltage == p.voltage_limit or new.voltage == -p.voltage_limit:
+        place.at[3], place.sign[0] = LIMITED, (1.0 if new.voltage > 0.0 else -1.0)
+    return z[places.reference] - y
+
+
+@inlined
+def set_bounds(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory: LiftedMemory) -> int:
+    """Bounds of the watches where the run is; return their number."""
+    p, low, high, slack = loop.parameters, memory.low, memory.high, memory.slack
+    count, kind, sign = t.guard_count[place.at[1]], place.at[3], place.sign[0]
+    for g in range(count):
+        low[g], high[g], slack[g] = -np.inf, 0.0, 1.0
+    if loop.dead_zone:
+        if place.at[2] == 0:
+            low[count], high[count] = -p.leave, p.leave
+        elif place.at[4] > 0:
+            low[count], high[count] = p.enter, np.inf
+        else:
+            low[count], high[count] = -np.inf, -p.enter
+        slack[count] = -1.0
+        count += 1
+    if p.voltage_limit < np.inf:
+        low[count], high[count], slack[count] = -p.voltage_limit, p.voltage_limit, -1.0
+        if kind == LIMITED:
+            low[count] = p.voltage_limit if sign > 0.0 else -np.inf
+            high[count] = np.inf if sign > 0.0 else -p.voltage_limit
+        elif kind == RATE_LIMITED:
+            low[count], high[count] = -np.inf, np.inf
+        count += 1
+    if places.rate >= 0:
+        step, room = p.rate_step, p.voltage_limit - p.rate_step
+        low[count], high[count], slack[count] = -step, step, -1.0
+        low[count + 1], high[count + 1], slack[count + 1] = -np.inf, np.inf, -1.0
+        if kind == RATE_LIMITED:
+            low[count], high[count] = (step, np.inf) if sign > 0.0 else (-np.inf, -step)
+            low[count + 1] = -np.inf if sign > 0.0 else -room
+            high[count + 1] = room if sign > 0.0 else np.inf
+        elif kind == LIMITED:
+            low[count], high[count] = -np.inf, np.inf
+        count += 2
+    return count
+
+
+@inlined
+def note(segments: Segments, k: int, slot: int, z: Array) -> None:
+    """Record the start of a block, of a rest, or a tick."""
+    at = segments.size[0]
+    segments.tick[at], segments.slot[at] = k, slot
+    for i in range(np.uint64(z.size)):
+        segments.state[at, i] = z[i]
+    segments.size[0] = at + 1
+
+
+@bare
+def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segments, memory: LiftedMemory) -> int:
+    """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced."""
+    slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
+    k = begin
+    while end - k >= 2 and segments.size[0] + 4 < len(segments.tick):
+        if place.at[5] >= FINE and end - k >= FINE:
+            wanted = min(COARSE, (end - k) // FINE)
+            note(segments, k, slot, z)
+            clean = advance_ticks(
+                lifted, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, z, memory.out,
+                memory.change,
+            )  # fmt: skip
+            k += clean * FINE
+            place.at[5] += clean * FINE
+            if clean == wanted:
+                continue
+            if clean == 0:
+                segments.size[0] -= 1
+        wanted = min(FINE, end - k)
+        note(segments, k, slot, z)
+        clean = advance_ticks(
+            lifted, slot, watches, FINE, wanted, memory.low, memory.high, memory.slack, z, memory.out, memory.change
+        )
+        k += clean
+        place.at[5] += clean
+        if clean == 0:
+            segments.size[0] -= 1
+        if clean < wanted:
+            break
+    place.at[0] = k
+    return k - begin
+
+
+@bare
+def run_lifted(
+    t: Tables,
+    loop: LiftedLoop,
+    places: Places,
+    coefficients: Array,
+    origin: float,
+    rate: float,
+    z: Array,
+    place: Place,
+    end: int,
+    segments: Segments,
+    record: RunRecord,
+    scratch: Scratch,
+    memory: LiftedMemory,
+) -> int:
+    """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
+    FULL where a record must grow, and UNFILLED where `fill_here` is due."""
+    at, x = place.at, z[: places.plant]
+    room = len(record.event_step) - 2 * EVENTS_PER_STEP
+    while at[0] < end:
+        if segments.size[0] + 8 > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
+            return FULL
+        if record.size[1] > room:
+            return FULL
+        set_reference(places, coefficients, at[0] / rate - origin, z)
+        if at[5] > 0 and end - at[0] >= 2:
+            if memory.filled[slot_of(at[1], at[2] == 1, at[3])] == 0:
+                return UNFILLED
+            watches = set_bounds(t, loop, places, place, memory)
+            if advance_block(z, place, watches, end, segments, memory) > 0:
+                if at[0] >= end:
+                    break
+                set_reference(places, coefficients, at[0] / rate - origin, z)
+        active, mode, side, kind, sign = at[2], at[1], at[4], at[3], place.sign[0]
+        error = take_tick(loop, places, z, place)
+        # The first tick finds the zone that holds at the start.
+        if at[2] != active and at[0] > 0:
+            change = segments.size[1]
+            segments.change_tick[change], segments.change_active[change] = at[0], at[2] == 1
+            segments.change_error[change] = error
+            segments.size[1] = change + 1
+        note(segments, at[0], TICKED, z)
+        step = at[0] * loop.searches
+        for _ in range(loop.searches):
+            at[1] = step_once(t, at[1], x, step, record, scratch)
+            step += 1
+            record.size[0] = 0
+            if at[1] < 0:
+                return ZENO
+        # Another branch may hold for one tick only: blocks begin after two alike.
+        alike = at[1] == mode and at[2] == active and at[4] == side and at[3] == kind and place.sign[0] == sign
+        at[5] = at[5] + 1 if alike else 0
+        at[0] += 1
+    return DONE

@@ -1,0 +1,238 @@
+"""Members of a sampled ensemble by structure, and the threads that run them in blocks of ticks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.control.controller import Controller
+from servotwin.control.law import LawParameters
+from servotwin.hybrid.automaton import Array, shared_flows, speeds
+from servotwin.hybrid.build import new_workspace, numbers_of
+from servotwin.hybrid.flow import new_scratch
+from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
+from servotwin.hybrid.lifted import BLOCK
+from servotwin.hybrid.tables import divisors, empty_tables
+from servotwin.hybrid.trajectory import ZenoError
+from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation.ensemble import starts_of
+from servotwin.simulation.lifted import more_segments, new_segments
+from servotwin.simulation.lifted_engine import new_memory, places_of, watches_of
+from servotwin.simulation.lifted_tables import KINDS, Place, Places
+from servotwin.simulation.sampled_members import (
+    SampledFamily,
+    SampledResults,
+    SampledStarts,
+    SampledWorker,
+    run_sampled,
+)
+
+_PARTS_PER_WORKER = 8
+_ROOM = 1 << 13
+
+
+@dataclass(frozen=True)
+class SampledMembers:
+    """All members, flat; `shape` is what servos, controllers and constants broadcast to."""
+
+    shape: tuple[int, ...]
+    servos: list[Servo]
+    controllers: list[Controller]
+    constants: dict[str, Array]
+
+
+@dataclass(frozen=True)
+class SampledSpan:
+    """Time and outputs of the runs: shape of the reference over time, samples, their rate (Hz), names of the outputs,
+    and the number of samples in the last part."""
+
+    shape: PiecewiseCubic
+    samples: int
+    rate: float
+    outputs: tuple[str, ...]
+    last: int
+
+
+@dataclass(frozen=True)
+class SampledGroup:
+    """Members of one structure: `which` are their indices among all members."""
+
+    which: NDArray[np.int64]
+    loop: ServoAutomaton
+    places: Places
+    watches: int
+    family: SampledFamily
+    starts: SampledStarts
+
+
+def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
+    """True for members that advance in blocks: an ideal sensor, and ticks at every sample of the output."""
+    ratio = (members.controllers[member].sample_rate or 0.0) / span.rate
+    whole = round(ratio)
+    return members.constants["resolution"][member] == 0.0 and whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
+
+
+def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
+    """Members that advance in blocks, by structure."""
+    by_structure: dict[object, list[int]] = {}
+    for member in range(len(members.servos)):
+        if in_blocks(members, member, span):
+            by_structure.setdefault(_structure_of(members, member), []).append(member)
+    return [_group(members, span, np.array(which)) for which in by_structure.values()]
+
+
+def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
+    servo, law = members.servos[member], members.controllers[member]
+    here = {name: float(values[member]) for name, values in members.constants.items()}
+    limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None, law.feedforward == 0.0
+    switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
+    return servo.n, servo.rigid, *limits, *switches
+
+
+def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
+    constants = {name: values[which] for name, values in members.constants.items()}
+    bias, friction = constants["input_bias"][0] != 0.0, constants["friction"][0] > 0.0
+    dead_zone, delay = bool(constants["tolerance"][0] > 0.0), int(constants["delay"][0])
+    servos, laws = ([values[member] for member in which] for values in (members.servos, members.controllers))
+    law_places: dict[Controller, int] = {}
+    law = np.array([law_places.setdefault(each, len(law_places)) for each in laws])
+    plant_places: dict[tuple[Servo, float], int] = {}
+    plant = np.array(
+        [
+            plant_places.setdefault((servo, each.sample_rate or 0.0), len(plant_places))
+            for servo, each in zip(servos, laws, strict=True)
+        ]
+    )
+    loops = [sampled_plant(servo, 0, bool(bias), bool(friction)) for servo, _ in plant_places]
+    places = places_of(loops[0], laws[0], delay, degree(span.shape))
+    states = np.zeros((len(which), places.states))
+    for k, (servo, _) in enumerate(plant_places):
+        chosen = np.flatnonzero(plant == k)
+        here = {name: values[chosen] for name, values in constants.items()}
+        states[chosen, : places.plant] = starts_of(servo, loops[k], here)
+    if places.filtered >= 0:
+        states[:, places.filtered] = states[:, places.position]
+    if places.feedforward >= 0:
+        states[:, places.feedforward] = [each.feedforward for each in laws]
+    family = _family(loops, list(plant_places), list(law_places), places, span, dead_zone)
+    thresholds = [each.thresholds(float(t)) for each, t in zip(laws, constants["tolerance"], strict=True)]
+    enter, leave = np.array(thresholds).T.copy()
+    order = np.lexsort((law, plant))
+    limits = np.zeros((len(which), len(span.outputs)))
+    starts = SampledStarts(order, plant, law, states, constants["reference"], enter, leave, limits)
+    return SampledGroup(which, loops[0], places, watches_of(loops[0], laws[0], dead_zone), family, starts)
+
+
+def _family(
+    loops: list[ServoAutomaton],
+    plants: list[tuple[Servo, float]],
+    laws: list[Controller],
+    places: Places,
+    span: SampledSpan,
+    dead_zone: bool,
+) -> SampledFamily:
+    guards = max(len(mode.guards) for mode in loops[0].automaton.modes)
+    numbers = [numbers_of(loop.automaton, guards) for loop in loops]
+    period = np.array([1.0 / rate for _, rate in plants])
+    searches = divisors(*speeds(np.array([loop.automaton.flows for loop in loops])), period)
+    return SampledFamily(
+        np.array([each.flows for each in numbers]),
+        np.array([each.rows for each in numbers]),
+        np.array([each.resets for each in numbers]),
+        period / searches,
+        searches,
+        np.array([tuple(law.law(None)) for law in laws], dtype=float).reshape(-1, len(LawParameters._fields)),
+        np.array([law.sample_rate for law in laws], dtype=float),
+        np.array([_row(loops[0], name, places) for name in span.outputs]),
+        span.shape.times,
+        span.shape.coeffs,
+        dead_zone,
+        loops[0].mode("held"),
+        len(loops[0].automaton.modes),
+    )
+
+
+def _row(loop: ServoAutomaton, name: str, places: Places) -> Array:
+    """The output as a row of the state after the tick."""
+    row = np.zeros(places.states)
+    row[: places.plant] = loop.rows["position" if name == "error" else name][0]
+    if name == "error":
+        row = -row
+        row[places.reference] += 1.0
+    return row
+
+
+def run_group(
+    group: SampledGroup, span: SampledSpan, limits: Array, results: SampledResults, threads: int | None
+) -> None:
+    """Fill `results`; each worker takes the next part when it has finished one.
+
+    Raises
+    ------
+    ZenoError
+        Naming the member.
+    """
+    starts, count = group.starts._replace(limits=limits), len(group.which)
+    workers = max(1, min(threads or os.cpu_count() or 1, count))
+    size = max(1, count // (_PARTS_PER_WORKER * workers))
+    parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
+    with ThreadPoolExecutor(workers) as pool:
+        stuck = list(pool.map(lambda _: _run_parts(group, starts, span, results, parts), range(workers)))
+    if zeno := [int(group.which[place]) for each in stuck for place in each]:
+        raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
+
+
+def _run_parts(
+    group: SampledGroup,
+    starts: SampledStarts,
+    span: SampledSpan,
+    results: SampledResults,
+    parts: Iterator[tuple[int, int]],
+) -> list[int]:
+    """Run parts as one worker while there are any; return the members with Zeno behaviour."""
+    worker, n = _new_worker(group), group.places.states
+    segments, record = new_segments(n, _ROOM), new_record(group.places.plant)
+    if len(results.figures):
+        # Figures need the samples of one member at a time: every worker has its own buffer for them.
+        results = results._replace(traces=np.empty_like(results.traces))
+    zeno = []
+    for first, last in parts:
+        while first < last:
+            status, first = run_sampled(
+                group.family, starts, results, group.places, span.rate, first, last, span.last, worker, segments, record
+            )
+            if status == ZENO:
+                zeno.append(int(starts.order[first]))
+                break
+            if status != DONE:
+                if record.size[1] > len(record.event_step) - 2 * EVENTS_PER_STEP - CHANGES_AT_ONCE:
+                    record = grown(record)
+                else:
+                    segments = more_segments(segments)
+    return zeno
+
+
+def _new_worker(group: SampledGroup) -> SampledWorker:
+    structure, family, n = group.loop.automaton, group.family, group.places.states
+    flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
+    tables = empty_tables(structure, shared_flows(flows))
+    slots, outputs = family.modes * 2 * KINDS, len(family.rows)
+    return SampledWorker(
+        tables,
+        new_workspace(tables),
+        new_memory(group.places, family.modes, group.watches),
+        new_scratch(tables),
+        np.zeros(n),
+        Place(np.zeros(6, dtype=np.int64), np.zeros(1)),
+        np.full(2, -1),
+        np.zeros(4),
+        np.zeros((outputs, slots), dtype=np.int8),
+        np.zeros((outputs, slots * BLOCK * n)),
+    )

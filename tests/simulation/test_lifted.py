@@ -1,0 +1,152 @@
+"""Sampled loops in blocks of ticks: the same runs as tick by tick, and nothing missed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from random_sampled import DEGREE, SampledCase, largest_difference, random_case
+
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic, SquareWave, as_pieces
+from servotwin.simulation import Simulation, simulate
+from servotwin.simulation.inputs import RunInputs
+from servotwin.simulation.lifted import TICKED
+from servotwin.simulation.lifted_engine import LiftedEngine
+
+PAPER = Servo.preset("paper")
+ZONE = ("enter", "leave")
+
+
+def share_of_ticks(engine: LiftedEngine) -> float:
+    """Share of ticks taken one by one."""
+    slots = engine.segments.slot[: engine.segments.size[0]]
+    return float(np.mean(slots == TICKED) * slots.size / ((engine.samples - 1) * engine.every))
+
+
+@pytest.mark.parametrize("first", range(0, 300, 50))
+def test_random_loops_are_those_of_the_ticks(first: int) -> None:
+    """Same events, switching ticks to the bit, states to 1e-9 of their range."""
+    for seed in range(first, first + 50):
+        case = random_case(seed)
+        ticked, blocks = case.ticked(), case.in_blocks()
+        assert largest_difference(case, ticked, blocks) < 1e-9, seed
+        expected, found = ticked.events(), blocks.events()
+        zones = [[event for event in events if event[1] in ZONE] for events in (expected, found)]
+        assert zones[0] == zones[1], seed
+        # At a gap of zero, and where a gap jumps, rounding decides on pairs of events that move nothing.
+        if np.all(case.inputs.gap.coeffs[:, 0] > 0.0) and case.inputs.gap.jumps.size == 0:
+            assert [event[1:] for event in expected] == [event[1:] for event in found], seed
+            times = np.array([[a[0], b[0]] for a, b in zip(expected, found, strict=True)]).reshape(-1, 2)
+            assert np.all(np.abs(np.diff(times)) < 1e-7), seed
+
+
+def test_most_ticks_are_advanced_in_blocks() -> None:
+    law = PAPER.controller.replace(sample_rate=5e3)
+    wave = as_pieces(SquareWave(1e-3, 4.0), 20.0)
+    inputs = RunInputs(wave, PiecewiseCubic.constant(10.0 * DEGREE), None, 5e3)
+    case = SampledCase(PAPER, law, inputs, 0.0, 100_001, 0)
+    assert share_of_ticks(case.in_blocks()) < 0.01
+    calm = law.replace(Ki=0.0, voltage_limit=24.0)
+    inputs = RunInputs(PiecewiseCubic.constant(1e-3), PiecewiseCubic.constant(0.0), None, 5e3)
+    resting = SampledCase(PAPER, calm, inputs, 0.0, 500_001, 1).in_blocks()
+    assert share_of_ticks(resting) < 0.01
+    assert resting.segments.slot[resting.segments.size[0] - 2] != TICKED
+
+
+@pytest.mark.parametrize("rate", [1e3, 5e3])
+@pytest.mark.parametrize("excess", [1e-5, 1e-8, 1e-11])
+def test_a_touch_shorter_than_a_tick_is_not_missed(rate: float, excess: float) -> None:
+    """The widest gap that is still crossed: a little narrower, and the contact lasts a small part of a tick."""
+    law = PAPER.controller.replace(sample_rate=rate, Ki=0.0)
+
+    reference = PiecewiseCubic.held([0.0, 0.5, 0.53], [1e-3, 0.2e-3, 1.2e-3])  # turns back inside the gap
+
+    def touch(gap: float, block: bool) -> float:
+        """How long the other flank is touched, s; 0: not at all."""
+        options = {"controller": law, "reference": reference, "gap": gap, "sample_rate": rate}
+        simulation = Simulation(PAPER, 0.6, **options)
+        engine: Any = simulation.engine
+        if block:
+            engine = LiftedEngine(PAPER, law, simulation.inputs, 0.0, simulation.samples)
+        engine.advance(simulation.samples - 1)
+        touching = [event for event in engine.events() if event[0] > 0.5 and event[2] == -1]
+        assert [kind for _, kind, _, _ in touching] in ([], ["contact", "release"])
+        return touching[1][0] - touching[0][0] if touching else 0.0
+
+    low, high = 1.0 * DEGREE, 4.0 * DEGREE
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if touch(middle, False) > 0.0 else (low, middle)
+    narrow = low * (1.0 - excess)
+    assert touch(high * (1.0 + excess), True) == 0.0
+    assert 0.0 < touch(narrow, True) < (1.0 if excess > 1e-7 else 0.2) * 10.0 / rate
+    assert touch(narrow, True) == pytest.approx(touch(narrow, False), rel=1e-2)
+
+
+def scaled_run(factor: float, law_changes: dict[str, float]) -> LiftedEngine:
+    law = PAPER.controller.replace(sample_rate=5e3, **law_changes)
+    inputs = RunInputs(
+        as_pieces(SquareWave(factor * 1e-3, 1.0), 4.0),
+        PiecewiseCubic.constant(factor * 6.0 * DEGREE),
+        PiecewiseCubic.constant(factor * PAPER.tolerance_for(4.0 * DEGREE)),
+        1e3,
+        factor * 0.02,
+    )
+    return SampledCase(PAPER, law, inputs, factor * 0.01, 4001, 1).in_blocks()
+
+
+@pytest.mark.parametrize("power", [-20, -3, 2])
+def test_scaling_everything_by_a_power_of_two_scales_every_bit(power: int) -> None:
+    """No threshold is absolute: neither in metres nor in volts."""
+    limits = {"voltage_limit": 2.0, "rate_limit": 200.0}
+    factor = 2.0**power
+    one = scaled_run(1.0, limits)
+    other = scaled_run(factor, {name: factor * value for name, value in limits.items()})
+    for name in ("position", "theta_m", "theta_d", "voltage"):
+        assert np.array_equal(factor * one.channel(name, 0, 4001), other.channel(name, 0, 4001))
+    assert one.events() == other.events()
+
+
+@pytest.mark.parametrize("factor", [2.0**-8, 0.1, 1000.0])
+def test_a_slower_machine_runs_slower(factor: float) -> None:
+    """Time scaled in plant, law and inputs: the same samples with the same effort."""
+    slow = PAPER.replace(
+        m=PAPER.m * factor**2, c=PAPER.c * factor, J=PAPER.J * factor**2, L=PAPER.L * factor, k_B=PAPER.k_B * factor
+    )
+    law = PAPER.controller.replace(sample_rate=5e3, rate_limit=200.0, loop_filter_hz=300.0, Ki=500.0)
+    slow_law = law.replace(
+        Ki=law.Ki / factor,
+        Kd=law.Kd * factor,
+        Tf=law.Tf * factor,
+        sample_rate=5e3 / factor,
+        rate_limit=200.0 / factor,
+        loop_filter_hz=300.0 / factor,
+    )
+    runs = []
+    for servo, controller, scale in ((PAPER, law, 1.0), (slow, slow_law, factor)):
+        inputs = RunInputs(
+            as_pieces(SquareWave(1e-3, scale), 2.0 * scale),
+            PiecewiseCubic.constant(6.0 * DEGREE),
+            PiecewiseCubic.constant(2e-5),
+            1e3 / scale,
+        )
+        runs.append(SampledCase(servo, controller, inputs, 0.01, 2001, 0).in_blocks())
+    for name in ("position", "theta_m", "voltage"):
+        a, b = (run.channel(name, 0, 2001) for run in runs)
+        assert np.abs(a - b).max() < 1e-8 * np.abs(a).max()
+    assert [event[1:] for event in runs[0].events()] == [event[1:] for event in runs[1].events()]
+    assert abs(share_of_ticks(runs[0]) - share_of_ticks(runs[1])) < 0.002
+
+
+def test_long_runs_without_noise_are_made_in_blocks() -> None:
+    """`simulate` and a `Simulation`, which is always tick by tick, agree."""
+    law = PAPER.controller.replace(sample_rate=5e3, loop_filter_hz=50.0)
+    options = {"reference": SquareWave(1e-3, 2.0), "gap": 7.0 * DEGREE, "tolerance": 2e-5, "sample_rate": 1e3}
+    simulation = Simulation(PAPER, 8.0, law, **options)
+    simulation.advance(8000)
+    ticked, run = simulation.run(), simulate(PAPER, 8.0, controller=law, **options)
+    for name in ("q", "theta_m", "theta_d", "voltage", "measured_position"):
+        expected = getattr(ticked, name)
+        assert not np.array_equal(getattr(run, name), expected)
+        assert np.abs(getattr(run, name) - expected).max() < 1e-9 * np.abs(expected).max()
+    assert run.events.kind.tolist() == ticked.events.kind.tolist()
