@@ -214,7 +214,7 @@ class CertifiedPolicy:
 
 # Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
 # leaves out does not average away with the windows.
-_LEAST_K, _LEAST_C = 0.005, 0.02
+_LEAST_K, _LEAST_C = 0.002, 0.01
 
 
 @dataclass(frozen=True)
