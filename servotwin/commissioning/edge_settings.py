@@ -25,8 +25,10 @@ from servotwin.messages import Gains, Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
+from servotwin.redesign.certified.uncertainty import PARAMETERS
 from servotwin.redesign.dead_zones import HysteresisPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.runtime.retry import Retry
@@ -141,7 +143,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
 def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
     own, demands = policy.servo.controller, policy.demands_within_band()
-    laws = [setting.controller for setting in candidates_of(policy.servo, policy.uncertainty, demands, True, False)]
+    laws = _candidates(policy, demands)
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
     factor = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values()) * _ROUNDING
@@ -154,6 +156,14 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
         patience_s=PATIENCE,
     )
     return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)
+
+
+def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[Controller]:
+    """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
+    exact = policy.uncertainty.replace(**dict.fromkeys(PARAMETERS, 0.0))
+    known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
+    pairs = ((policy.uncertainty, demands), (exact, known))
+    return [each.controller for pair in pairs for each in candidates_of(policy.servo, *pair, True, False)]
 
 
 def _range(values: list[float]) -> tuple[float, float]:

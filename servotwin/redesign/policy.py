@@ -13,7 +13,7 @@ from servotwin.estimation.trend import Trend
 from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.uncertainty import Region
+from servotwin.redesign.certified.uncertainty import LearntFactors, Region
 
 NOT_OBSERVED = nothing_known(float("nan"), "not observed")
 
@@ -36,6 +36,8 @@ class Evidence:
         rad, gap of the last redesign; None before the first.
     why_not : str
         Reason against using the estimate, such as that it does not fit the trend; empty where it may be used.
+    learnt : LearntFactors, optional
+        Posterior of the plant's parameters; None: nothing was learnt.
     """
 
     estimate: GapEstimate
@@ -44,6 +46,7 @@ class Evidence:
     setting: Setting | None = None
     tuned_for: float | None = None
     why_not: str = ""
+    learnt: LearntFactors | None = None
 
     @property
     def gains(self) -> Gains | None:

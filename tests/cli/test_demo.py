@@ -1,6 +1,7 @@
 """`servotwin demo`: the twin settles the steps that the servo alone does not, and the report shows it."""
 
 import io
+import re
 
 import pytest
 from rich.console import Console
@@ -58,5 +59,6 @@ def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_publish
 def test_the_report_shows_what_was_sent_and_on_how_many_machines_it_was_tried(shown):
     text = shown[0].read_text()
     assert "What the certified twin sent" in text
-    assert "256 machines" in text
-    assert "-50.0" in text.replace("\u2212", "-")
+    assert "300 machines" in text
+    # The feedforward in mV, against a bias of 50 mV that each window shows to some 0.1 mV.
+    assert re.search(r"-(49\.[5-9]|50\.[0-5])", text.replace("\u2212", "-"))

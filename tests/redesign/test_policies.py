@@ -10,7 +10,7 @@ from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -170,7 +170,9 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
-    laws = [s.controller for s in candidates_of(policy.servo, policy.uncertainty, Demands(), True, True)]
+    exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0)
+    sets = ((policy.uncertainty, Demands()), (exact, Demands(beyond=Beyond(k_T=0.0))))
+    laws = [s.controller for pair in sets for s in candidates_of(policy.servo, *pair, True, True)]
     for law in laws:
         for fed in (-0.1, 0.1):
             assert limits.allows_gains(gains_of(law.replace(feedforward=fed)), own)

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from servotwin.commissioning.edge_settings import guarding
 from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
@@ -18,7 +21,8 @@ from servotwin.redesign.certified.assess import assess, stillness
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify, confirm
-from servotwin.redesign.certified.margins import widened
+from servotwin.redesign.certified.margins import loop_margins, unfed, widened
+from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import (
     PARAMETERS,
@@ -29,7 +33,9 @@ from servotwin.redesign.certified.uncertainty import (
     extreme_plants,
 )
 from servotwin.redesign.design import Design
+from servotwin.redesign.policy import Evidence
 from servotwin.simulation import simulate
+from servotwin.twin.settings import TwinSettings
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
@@ -165,7 +171,7 @@ def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> N
     wide, narrow = (len(candidates_of(SERVO, each, Demands(), False, False)) for each in (Uncertainty(), known))
     assert narrow > wide
     assert extreme_plants(SERVO, known, 4, 0)[0] == SERVO
-    with pytest.raises(InvalidInput, match="each must be one of k, c, k_B, m, k_T"):
+    with pytest.raises(InvalidInput, match="each must be one of k, c, k_B, m, k_T, p"):
         LearntFactors(("mass",), (0.0,), ((1.0,),))
     with pytest.raises(InvalidInput, match="symmetric and positive semidefinite"):
         LearntFactors(("k",), (0.0,), ((-1.0,),))
@@ -181,6 +187,27 @@ def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     members = draw_independently(servo, known, 2048, 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
+
+
+def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
+    policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5, 0.7, 1.0)))
+    learnt = LearntFactors(("k", "c", "m"), (0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 0.0)))
+    gap, spread = 10.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    rest = Disturbance(0.0, 1e-5, 0.0, 0.3, 0.0)
+    before, after = (policy.redesign(Evidence(estimate, rest, learnt=each)) for each in (None, learnt))
+    assert before.certificate is not None
+    assert after.certificate is not None
+    assert after.setting is not None
+    stated = loop_margins(
+        SERVO, widened(policy.uncertainty, policy.demands), unfed(after.certificate.setting.controller)
+    )
+    assert stated.Ms_worst > 2.2
+    assert after.certificate.cost < before.certificate.cost
+    box = guarding(SERVO, TwinSettings(demands=policy.demands))
+    assert box is not None
+    assert after.setting.gains is not None
+    assert box.limits.allows_gains(after.setting.gains, box.middle)
 
 
 # --- demands
@@ -211,6 +238,11 @@ def test_the_certificate_says_what_was_tried_and_what_leaving_out_integral_actio
     assert found.error_per_volt == pytest.approx(1.0 / law.Kp)
     assert "verified on 16 simulated machines in continuous time" in found.tried
     assert found.not_tried.startswith("not tried: measurement noise")
+    assert found.ramp is not None
+    assert found.ramp.settled == 1.0
+    # A loop that lags by so much of a second is off by that on a ramp of twelve periods; the gap adds to it.
+    lag = found.lag / (12.0 * trial_for(SERVO, NARROW, SMALL).unit)
+    assert lag < found.ramp.error < 2.0 * lag
     speed = 1e-3
     ramp = PiecewiseCubic(np.array([0.0]), np.array([[0.0, speed, 0.0, 0.0]]))
     run = simulate(SERVO, 20.0, controller=law, reference=ramp, sample_rate=100.0)
@@ -275,7 +307,7 @@ def test_a_slower_or_faster_servo_has_a_fallback_set(time: float) -> None:
 def test_a_certificate_of_the_version_before_is_read() -> None:
     found = certify(SERVO, NARROW, SMALL)
     assert isinstance(found, Certificate)
-    new = ("settled_least", "confidence", "loop", "beyond", "rate", "delay", "error_per_volt", "lag")
+    new = ("settled_least", "confidence", "loop", "beyond", "ramp", "rate", "delay", "error_per_volt", "lag")
     document = {name: value for name, value in msgspec.to_builtins(found).items() if name not in new}
     read = msgspec.convert(document, Certificate)
     assert read.loop is None

@@ -198,6 +198,24 @@ class BeyondResult:
 
 
 @dataclass(frozen=True)
+class RampResult:
+    """Result of a setting on a ramp, its reversal and a stop.
+
+    Attributes
+    ----------
+    machines : int
+    settled : float
+        Share of them that settled after the stop.
+    error : float
+        Largest error on the way, relative to the length of the ramp, which takes twelve periods of 1 / crossover.
+    """
+
+    machines: int
+    settled: float
+    error: float
+
+
+@dataclass(frozen=True)
 class Certificate:
     """A setting and its results on the simulated machines.
 
@@ -236,6 +254,8 @@ class Certificate:
         Margins over all plants; None in certificates of versions that had none.
     beyond : BeyondResult, optional
         Result in ranges beyond the stated ones.
+    ramp : RampResult, optional
+        Result on a ramp and its reversal.
     rate : float, optional
         Hz, at which the law was simulated; None: in continuous time.
     delay : int
@@ -272,6 +292,7 @@ class Certificate:
     confidence: float = 0.95
     loop: LoopMargins | None = None
     beyond: BeyondResult | None = None
+    ramp: RampResult | None = None
     rate: float | None = None
     delay: int = 0
     error_per_volt: float = 0.0
@@ -291,6 +312,8 @@ class Certificate:
         )
         if self.loop is not None:
             text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
+        if self.ramp is not None:
+            text += f"; a ramp and its reversal on {self.ramp.machines} machines"
         if self.beyond is not None:
             extra = self.beyond
             text += (

@@ -22,6 +22,7 @@ from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess,
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import BeyondResult, Certificate, Demands, LoopMargins, NotVerified
 from servotwin.redesign.certified.margins import laws_within, loop_margins, unfed, widened, with_margins
+from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently
 from servotwin.redesign.design import Design
@@ -175,7 +176,7 @@ class _Search:
         """Candidates that meet the demands on a few machines first, then by cost."""
         demands = self.demands
         members = draw(self.servo, self.uncertainty, demands.screened, demands.conditions, demands.seed)
-        measures = assess([self._quick(setting) for setting in candidates], members, self.trial)
+        measures = assess([self._quick(setting) for setting in candidates], members, self.trial.half)
 
         def rank(k: int) -> tuple[bool, float]:
             few = measures[k]
@@ -232,6 +233,7 @@ class _Search:
             confidence=demands.confidence,
             loop=loop,
             beyond=self._beyond(setting, seed),
+            ramp=follow_ramp(self.servo, known, setting, self.trial, demands.seed),
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
             error_per_volt=0.0 if law.Ki else 1.0 / abs(law.Kp),
@@ -257,6 +259,9 @@ class _Search:
             return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * allowed:.3g} mm are allowed"
         if tried.overshoot > demands.overshoot:
             return f"overshoots by {100.0 * tried.overshoot:.0f} %, and {100.0 * demands.overshoot:.0f} % are allowed"
+        if tried.ramp is not None and tried.ramp.settled < 1.0:
+            share = 100.0 * tried.ramp.settled
+            return f"settles after a ramp and its reversal on {share:.0f} % of {tried.ramp.machines} machines only"
         if tried.beyond is not None and tried.beyond.settled < 1.0:
             share = 100.0 * tried.beyond.settled
             return f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only"

@@ -113,17 +113,20 @@ def laws_within(
     ]
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     laws: list[Controller] = []
-    closest = math.inf
+    delays = delays_of(servo.controller, uncertainty)
+    peaks: dict[Controller, float] = {}
     for law in dict.fromkeys(scaled):
-        peaks = np.array([plants.peaks(law, delay) for delay in delays_of(law, uncertainty)])
-        stable = all(plants.decays(law, delay).min() > 0.0 for delay in delays_of(law, uncertainty))
-        closest = min(closest, float(peaks.max())) if stable else closest
-        if stable and peaks[0, 0] <= demands.Ms * _ROUNDED and peaks.max() <= demands.Ms_worst * _ROUNDED:
+        each = np.array([plants.peaks(law, delay) for delay in delays])
+        peaks[law] = float(each.max())
+        within = each[0, 0] <= demands.Ms * _ROUNDED and peaks[law] <= demands.Ms_worst * _ROUNDED
+        # A small peak alone says nothing: that of an unstable loop may be small.
+        if within and _stable(plants, law, delays):
             laws.append(law)
     if not laws:
         rate = servo.controller.sample_rate
         at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
-        found = f"; the least that any has is {closest:.3g}" if math.isfinite(closest) else "; none is stable there"
+        stable = [peak for law, peak in peaks.items() if _stable(plants, law, delays)]
+        found = f"; the least that any has is {min(stable):.3g}" if stable else "; none is stable there"
         raise InvalidInput(
             f"no candidate has Ms <= {demands.Ms:g} on this servo and <= {demands.Ms_worst:g} on every plant of the "
             f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
@@ -132,6 +135,10 @@ def laws_within(
     # A loop with a fraction of the gain that another one may have is slower, and only that.
     least = _WORTH_TRYING * max(abs(law.Kp) for law in laws)
     return tuple(law for law in laws if abs(law.Kp) >= least)
+
+
+def _stable(plants: PlantSet, law: Controller, delays: tuple[int, ...]) -> bool:
+    return all(plants.decays(law, delay).min() > 0.0 for delay in delays)
 
 
 def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share: float) -> Controller:

@@ -126,7 +126,7 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         feedforward, input_bias = self._input_bias(evidence)
-        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence))
+        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence), evidence.learnt)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)

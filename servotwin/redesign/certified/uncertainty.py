@@ -18,7 +18,7 @@ from servotwin.plant.servo import Servo
 Range = tuple[float, float]
 LARGEST_DELAY = 64
 """Longest delay that is simulated, samples."""
-PARAMETERS = ("k", "c", "k_B", "m", "k_T")
+PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
@@ -115,6 +115,9 @@ class Uncertainty:
         float,
         key("k_t_percent", minimum=0.0, below=1.0, help="Half-width of the torque gain, relative to the model's."),
     ] = 0.0
+    p: Annotated[
+        float, key("pitch_percent", minimum=0.0, below=1.0, help="Half-width of the pitch, relative to the model's.")
+    ] = 0.0
     delay: Annotated[
         int,
         key(
@@ -155,6 +158,8 @@ class Region:
         V, N m.
     noise : float
         m rms of the measured position; 0 where it is unknown.
+    learnt : LearntFactors, optional
+        Posterior of the plant; None: the stated half-widths count.
     """
 
     gap: Range
@@ -162,10 +167,12 @@ class Region:
     input_bias: Range
     friction: Range
     noise: float
+    learnt: LearntFactors | None = None
 
     def within(self, known: Uncertainty) -> Uncertainty:
         """Prior knowledge narrowed to the region."""
-        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction)
+        learnt = self.learnt or known.learnt
+        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction, learnt=learnt)
 
     @property
     def largest_bias(self) -> float:
