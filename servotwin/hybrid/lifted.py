@@ -28,8 +28,8 @@ _ROUNDING = 0.01
 
 
 class LiftedTables(NamedTuple):
-    """Flat tables of `S` slots, `N` states, `W` watches each; rows of a level: per watch the values at its ends, the
-    thirds of the slopes at the beginnings and at the ends of its intervals, then the deviations' matrices."""
+    """Flat tables of `S` slots, `N` states, `W` watches each; rows of a level: per watch the values at the
+    ends, the thirds of the slopes at the beginnings and at the ends of its intervals, and its deviation's matrix."""
 
     states: int
     watches: int
@@ -203,7 +203,7 @@ def _fill_level(t: LiftedTables, table: Array, slot: int, watch: int, intervals:
     stride = _stride(t, intervals)
     length = 1 if intervals == FINE else FINE
     powers = 0 if intervals == FINE else FINE * n * n
-    at = slot * n * stride + watch * (3 * intervals + 1)
+    at = slot * n * stride + watch * (3 * intervals + 1 + n)
     for i in range(intervals + 1):
         _rows_at(n, watch, length, powers, w, i)
         for j in range(n):
@@ -215,7 +215,7 @@ def _fill_level(t: LiftedTables, table: Array, slot: int, watch: int, intervals:
                 table[column + intervals + 1 + i] = w.rows[9 * n + j]
             if i > 0:
                 table[column + 2 * intervals + i] = w.rows[18 * n + j]
-    square = slot * n * stride + t.watches * (3 * intervals + 1) + watch * n
+    square = at + 3 * intervals + 1
     for i in range(n):
         for j in range(n):
             table[square + j * stride + i] = w.sums[i * n + j]
@@ -286,13 +286,13 @@ def clean_part(
     """Number of intervals, at most `wanted`, before the first in which some watch may leave its bounds."""
     clean, n = wanted, np.uint64(t.states)
     for watch in range(watches):
-        square, at = 0.0, np.uint64(t.watches * (3 * intervals + 1) + watch * t.states)
+        square, at = 0.0, np.uint64(watch * (3 * intervals + 1 + t.states) + 3 * intervals + 1)
         for i in range(n):
             square += out[at + i] * z[i]
         size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
         room = slack[watch] * (SIGNIFICANT * size) - math.sqrt(max(square, 0.0))
         top, bottom = high[watch] + room, low[watch] - room
-        a = np.uint64(watch * (3 * intervals + 1))
+        a = np.uint64(watch * (3 * intervals + 1 + t.states))
         b = a + np.uint64(intervals + 1)
         c = b + np.uint64(intervals)
         beyond = 0
@@ -320,10 +320,11 @@ def advance_ticks(
     """Advance through the first intervals of a block, at most `wanted`, in which no watch may leave its bounds; return
     their number."""
     stride = _stride(t, intervals)
+    used = (watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
     if intervals == FINE:
-        tall_product(t.fine, slot * t.states * stride, stride, stride, z, out)
+        tall_product(t.fine, slot * t.states * stride, stride, used, z, out)
     else:
-        tall_product(t.coarse, slot * t.states * stride, stride, stride, z, out)
+        tall_product(t.coarse, slot * t.states * stride, stride, used, z, out)
     clean = clean_part(t, slot, watches, intervals, wanted, low, high, slack, z, out)
     if clean > 0:
         n2 = t.states * t.states

@@ -10,10 +10,11 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.trend import Trend
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.uncertainty import LearntFactors, Region
+from servotwin.redesign.certified.uncertainty import Region
 
 NOT_OBSERVED = nothing_known(float("nan"), "not observed")
 
@@ -36,8 +37,8 @@ class Evidence:
         rad, gap of the last redesign; None before the first.
     why_not : str
         Reason against using the estimate, such as that it does not fit the trend; empty where it may be used.
-    learnt : LearntFactors, optional
-        Posterior of the plant's parameters; None: nothing was learnt.
+    machine : FactorPrior or None
+        The machine's numbers over the model's, as learnt from the windows; None: the model is all that is known.
     """
 
     estimate: GapEstimate
@@ -46,7 +47,7 @@ class Evidence:
     setting: Setting | None = None
     tuned_for: float | None = None
     why_not: str = ""
-    learnt: LearntFactors | None = None
+    machine: FactorPrior | None = None
 
     @property
     def gains(self) -> Gains | None:

@@ -18,6 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.trend import Trend
+from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess, nearness, stillness
@@ -379,3 +380,19 @@ def test_wear_until_the_horizon_widens_the_range_of_gaps(horizon: float) -> None
     for one, most in ((replace(policy, horizon=horizon), high), (replace(policy, horizon=0.0), gap_range(last)[1])):
         reason = one.redesign(Evidence(last, trend=trend)).reason
         assert f"to {math.degrees(most):.3g} deg" in reason
+
+
+@pytest.mark.slow
+def test_a_learnt_machine_is_verified_on_what_was_learnt() -> None:
+    """Damping at half the model's: candidates are judged on that machine, and the fallback set stays."""
+    known = Uncertainty(gap=gaps(2, 4), step=(5e-4, 1e-3))
+    policy = CertifiedPolicy(SERVO, known, SMALL, SHORT)
+    factors = np.log([1.0, 0.5, 1.0, 1.0])
+    learnt = FactorPrior(factors, np.diag(np.square([1e-3, 5e-3, 1e-3, 1e-3])))
+    redesign = policy.redesign(Evidence(estimated(3.0), machine=learnt))
+    assert redesign.certificate is not None
+    law = redesign.certificate.setting.controller.replace(feedforward=0.0, enter=1.0, leave=1.0)
+    machine = adapted(SERVO, factors)
+    assert redesign.certificate.Ms == pytest.approx(machine.margins(law).Ms, rel=1e-9)
+    assert redesign.certificate.Ms != pytest.approx(SERVO.margins(law).Ms, rel=1e-3)
+    assert policy.fallback().gap == known.gap

@@ -14,6 +14,7 @@ from servotwin.commissioning.edge_settings import guarding
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
@@ -191,11 +192,11 @@ def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
 
 def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5, 0.7, 1.0)))
-    learnt = LearntFactors(("k", "c", "m"), (0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 0.0)))
+    learnt = FactorPrior(np.zeros(4), np.diag(np.square([1e-3, 1e-2, 1e-3, 1e-3])))
     gap, spread = 10.0 * DEG, 0.02 * DEG
     estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
     rest = Disturbance(0.0, 1e-5, 0.0, 0.3, 0.0)
-    before, after = (policy.redesign(Evidence(estimate, rest, learnt=each)) for each in (None, learnt))
+    before, after = (policy.redesign(Evidence(estimate, rest, machine=each)) for each in (None, learnt))
     assert before.certificate is not None
     assert after.certificate is not None
     assert after.setting is not None

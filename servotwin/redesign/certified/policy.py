@@ -9,16 +9,19 @@ from functools import lru_cache
 from time import perf_counter
 from typing import ClassVar, Protocol
 
+import numpy as np
+
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.trend import Trend
+from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
+from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
@@ -111,7 +114,7 @@ class CertifiedPolicy:
         the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
-        return self.decide(evidence, self)
+        return self.decide(evidence, self if evidence.machine is None else _LearntVerifier(self, evidence.machine))
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
@@ -126,7 +129,7 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         feedforward, input_bias = self._input_bias(evidence)
-        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence), evidence.learnt)
+        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence))
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
@@ -207,6 +210,41 @@ class CertifiedPolicy:
         return low, max(
             high, left * self.servo.k_T / self.servo.R
         ) if left > _BIAS_MOVED * self.smallest_answer else high
+
+
+# Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
+# leaves out does not average away with the windows.
+_LEAST_K, _LEAST_C = 0.002, 0.01
+
+
+@dataclass(frozen=True)
+class _LearntVerifier:
+    """Verification by simulation on what was learnt of the machine, in place of the model's stated error.
+
+    Its numbers are those of k/m and c/m: the masses are taken as the model's. The fallback set stays that of the stated
+    ranges.
+    """
+
+    policy: CertifiedPolicy
+    machine: FactorPrior
+    provisional: ClassVar[bool] = False
+
+    def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
+        policy, covariance = self.policy, self.machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2])
+        spread = tuple(tuple(row) for row in covariance.tolist())
+        learnt = LearntFactors(("k", "c"), (0.0, 0.0), spread)
+        return certify(
+            adapted(policy.servo, self.machine.mean),
+            region.within(policy.uncertainty).replace(learnt=learnt, m=0.0),
+            policy.demands_within_band(),
+            policy.simulations,
+            region.feedforward,
+            region.noise,
+            policy.clock,
+        )
+
+    def fallback(self) -> Certificate:
+        return self.policy.fallback()
 
 
 def _noise(evidence: Evidence) -> float:

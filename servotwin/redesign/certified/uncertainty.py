@@ -158,8 +158,6 @@ class Region:
         V, N m.
     noise : float
         m rms of the measured position; 0 where it is unknown.
-    learnt : LearntFactors, optional
-        Posterior of the plant; None: the stated half-widths count.
     """
 
     gap: Range
@@ -167,12 +165,10 @@ class Region:
     input_bias: Range
     friction: Range
     noise: float
-    learnt: LearntFactors | None = None
 
     def within(self, known: Uncertainty) -> Uncertainty:
         """Prior knowledge narrowed to the region."""
-        learnt = self.learnt or known.learnt
-        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction, learnt=learnt)
+        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction)
 
     @property
     def largest_bias(self) -> float:
