@@ -162,7 +162,9 @@ class CertifiedPolicy:
         """Demands with the fallback set's band as a bound; a dead zone must open the loop inside of that band."""
         certificate, leave = self.fallback(), max((leave for _, leave in self.demands.hysteresis), default=1.0)
         tolerance = min(self.demands.tolerance, band_of(certificate).error / leave)
-        return replace(self.demands, tail=min(self.demands.tail, certificate.tail), tolerance=tolerance)
+        # Less than what counts as arrived for the smallest step is no error.
+        tail = max(certificate.tail, NEAR * self.uncertainty.step[0])
+        return replace(self.demands, tail=min(self.demands.tail, tail), tolerance=tolerance)
 
     def fallback(self) -> Certificate:
         """Certificate of the setting for every gap and bias of the stated range, whatever is estimated.
