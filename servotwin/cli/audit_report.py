@@ -150,6 +150,7 @@ _REMARKS = {
     "estimate": "",
     "disturbance": "",
     "trend": "trend: {}",
+    "machine": "",
     "redesign": "{}",
     "excitation": "",
 }
@@ -168,6 +169,8 @@ def _remark(one: JsonObject) -> Iterator[str]:
         yield f"version {version} " + (
             f"FAILED its verification: {status}" if status else "is verified for this evidence"
         )
+    elif kind == "alarm":
+        yield f"ALARM: {status}"
     elif kind == "withdrawn":
         yield f"version {version} WITHDRAWN: {status}"
     else:

@@ -41,10 +41,10 @@ class LearningSettings:
     ] = 0.01
     k_drift: Annotated[
         float,
-        key("k_drift_percent_per_sqrt_day", minimum=0.0, help="Random walk of the stiffness over the masses."),
+        key("k_drift_per_sqrt_day", minimum=0.0, help="Random walk of the stiffness over the masses, relative."),
     ] = 0.001
     c_drift: Annotated[
-        float, key("c_drift_percent_per_sqrt_day", minimum=0.0, help="Random walk of the damping over the masses.")
+        float, key("c_drift_per_sqrt_day", minimum=0.0, help="Random walk of the damping over the masses, relative.")
     ] = 0.01
     k_floor: Annotated[
         float,

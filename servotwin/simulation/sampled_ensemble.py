@@ -100,9 +100,8 @@ def summarise_sampled(
     bounds = _bounds(members, limits or {}, outputs)
     values = np.empty((len(bounds), len(outputs), len(Figures._fields)))
     for group in groups_of(members, span):
-        results = SampledResults(
-            np.empty((1, len(outputs), span.samples)), np.empty((len(group.which), *values.shape[1:]))
-        )
+        figures = np.empty((len(group.which), *values.shape[1:]))
+        results = SampledResults(np.empty((1, len(outputs), span.samples)), figures)
         run_group(group, span, bounds[group.which], results, threads)
         values[group.which] = results.figures
     for k, traces in _ticked(members, span, threads):

@@ -15,6 +15,7 @@ from msgspec import Struct
 
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, MachineReading
+from servotwin.estimation.machine import LearntMachine
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import (
@@ -72,6 +73,13 @@ class TrendRecord(NamedTuple):
     trend: Trend | None
 
 
+class MachineRecord(NamedTuple):
+    """The machine as learnt, after a window that told of it."""
+
+    window: WindowMessage
+    machine: LearntMachine
+
+
 class RedesignRecord(NamedTuple):
     """A redesign, or the reason why there is none."""
 
@@ -101,8 +109,8 @@ class WithdrawalRecord(NamedTuple):
 
 
 Record = (
-    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | RedesignRecord | ExcitationRecord
-    | VerificationRecord | WithdrawalRecord | VerificationRequest
+    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | RedesignRecord
+    | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
     | Update | Request | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
 """Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
@@ -120,6 +128,7 @@ class EvidenceLog:
     estimates: dict[WindowId, GapEstimate] = field(default_factory=dict)
     disturbances: dict[WindowId, Disturbance] = field(default_factory=dict)
     trends: dict[WindowId, Trend | None] = field(default_factory=dict)
+    machines: dict[WindowId, LearntMachine] = field(default_factory=dict)
     redesigns: dict[WindowId, Redesign] = field(default_factory=dict)
     excitations: dict[WindowId, Decision] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
@@ -153,6 +162,8 @@ class EvidenceLog:
                 self.disturbances[window.identity] = disturbance
             case TrendRecord(window, trend):
                 self.trends[window.identity] = trend
+            case MachineRecord(window, machine):
+                self.machines[window.identity] = machine
             case RedesignRecord(window, redesign):
                 self.redesigns[window.identity] = redesign
             case ExcitationRecord(window, decision):
@@ -253,6 +264,8 @@ def _row(record: Record) -> EvidenceRecord | None:
                 return None
             numbers, reasons = TrendState.of(trend), "; ".join(trend.reasons)
             return _made("trend", numbers, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
+        case MachineRecord(_, machine):
+            return _made("alarm" if machine.alarm else "machine", machine, machine.alarm)
         case RedesignRecord(_, redesign):
             return _made("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
         case ExcitationRecord(_, decision):

@@ -36,6 +36,7 @@ from servotwin.twin.evidence import (
     ExcitationRecord,
     GapEstimateRecord,
     GlanceRecord,
+    MachineRecord,
     Record,
     RedesignRecord,
     TrendRecord,
@@ -156,12 +157,14 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
     # A stale window is estimated for the record, but moves nothing: windows may come in any order.
     stale = not state.versions.admits(message)
-    rejection = _STALE
+    rejection, learnt = _STALE, state.wear.machine
     if not stale:
         wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning)
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records.append(TrendRecord(message, trend))
+    if state.wear.machine is not None and state.wear.machine != learnt:
+        records.append(MachineRecord(message, state.wear.machine))
     if model.triage is not None and state.triage is not None and not stale:
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
         state = replace(state, triage=triage)

@@ -28,9 +28,9 @@ _SERVOS, _MESSAGES = 16, 16
 """Servos in one job, and messages of each."""
 _MAX_STEPS = 64
 """Results that one lock-step request may lead to."""
-QUIET = ("glance", "trend", "disturbance", "excitation")
+QUIET = ("glance", "trend", "machine", "disturbance", "excitation")
 """Evidence of every window: logged at level debug."""
-ALARMS = ("failed", "fallback", "withdrawn")
+ALARMS = ("failed", "fallback", "withdrawn", "alarm")
 """Evidence that somebody should look at: logged as warnings."""
 
 

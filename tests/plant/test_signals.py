@@ -158,7 +158,7 @@ def test_signals_are_values() -> None:
         (lambda: SquareWave(1.0, -2.0), "period = -2.0 s must be positive"),
         (lambda: Samples([0.0, 0.0], [1.0, 2.0]), "must increase"),
         (lambda: Samples([0.0], [1.0, 2.0]), "one value for each time, not 2 for 1"),
-        (lambda: as_pieces("gap", 1.0), "'gap' is no signal"),  # type: ignore[arg-type]
+        (lambda: as_pieces("gap", 1.0), "'gap' is not a signal"),  # type: ignore[arg-type]
         (lambda: as_pieces(math.inf, 1.0), "must be finite"),
     ],
 )

@@ -116,7 +116,7 @@ def test_continuous_noise_is_held_and_reproducible() -> None:
         ({"duration": np.inf}, "duration = inf s"),
         ({"duration": 0.0}, r"duration = 0\.0 s"),
         ({"theta_d0": np.nan}, "theta_d0 = nan rad"),
-        ({"reference": "up"}, "'up' is no signal"),
+        ({"reference": "up"}, "'up' is not a signal"),
         ({"reference": np.nan}, "finite"),
         ({"controller": PAPER.controller.replace(rate_limit=1.0)}, "rate_limit needs a sampled controller"),
         ({"controller": SAMPLED, "sample_rate": 3000.0}, "whole multiple"),

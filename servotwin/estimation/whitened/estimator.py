@@ -159,12 +159,14 @@ def fit(
         blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
         return WindowFit(window, servo, prior, settings, blank, window.theta_m, None)
     angle = motor_angle(window, servo.encoder_resolution, settings)
-    channels = (angle, window.position, window.sample_rate)
+    position, rate = window.position, window.sample_rate
     if machine is not None:
-        learnt = learn_and_fit(*channels, servo, _start(prior), settings, machine)
+        learnt = learn_and_fit(angle, position, rate, servo, _start(prior), settings, machine)
         return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt)
-    _, points = look_around(*channels, servo, _start(prior), settings)
-    return WindowFit(window, servo, prior, settings, blank, angle, align_and_fit(*channels, servo, points, settings))
+    _, points = look_around(angle, position, rate, servo, _start(prior), settings)
+    return WindowFit(
+        window, servo, prior, settings, blank, angle, align_and_fit(angle, position, rate, servo, points, settings)
+    )
 
 
 def _check(window: Window) -> None:

@@ -1,0 +1,59 @@
+"""What a twin records of the machine that it learns, and its alarm where the machine is another one."""
+
+import numpy as np
+from twin_messages import window_message
+
+from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
+from servotwin.estimation.machine import LearntMachine
+from servotwin.plant.servo import Servo
+from servotwin.twin.estimating import Expectation
+from servotwin.twin.evidence import MachineRecord, StoredExpectation, rows
+from servotwin.twin.model import TwinModel
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import decode_state, encode_state
+from servotwin.twin.step import WindowArrival, step
+
+SETTINGS = TwinSettings(policy="paper")
+
+
+def reading(k: float) -> MachineReading:
+    return MachineReading((k, 0.0, 0.0, 0.0), tuple(np.diag([1e-6] * 4).ravel().tolist()))
+
+
+def steps(factors: list[float]) -> list[tuple[LearntMachine, list[str]]]:
+    """Machine and kinds of its evidence after windows that show these stiffnesses; off the first one they mismatch."""
+    seen: list[Expectation] = []
+
+    def estimate(window, expected):
+        seen.append(expected)
+        factor, middle = factors[len(seen) - 1], window.start + 0.5 * window.duration
+        status = GapStatus.OK if factor == factors[0] else GapStatus.MODEL_MISMATCH
+        return GapEstimate(0.1, 1e-3, 1e-3, (0.098, 0.102), status, middle, machine=reading(factor))
+
+    model = TwinModel.of(Servo.preset("paper"), SETTINGS, estimator=estimate)
+    state, results = model.initial_state("axis"), []
+    for number in range(len(factors)):
+        result = step(model, state, WindowArrival(window_message(number, 10.0 * number), 10.0 * number), 10.0 * number)
+        state = decode_state("axis", encode_state(result.state))
+        records = [record for record in result.evidence if isinstance(record, MachineRecord)]
+        results.append((state.wear.machine, [row.kind for row in rows(records, 1, "")]))
+    assert seen[0].machine is None
+    assert all(one.machine is not None for one in seen[1:])
+    return results
+
+
+def test_a_changed_machine_raises_an_alarm_and_is_learnt_when_three_windows_agree() -> None:
+    (first, kinds), *others = steps([0.01, 0.2, 0.2, 0.2])
+    assert (first.factors[0], kinds) == (0.01, ["machine"])
+    assert [machine.factors[0] for machine, _ in others] == [0.01, 0.01, 0.2]
+    assert [kinds for _, kinds in others] == [["alarm"]] * 3
+    assert "learnt anew" in others[-1][0].alarm
+
+
+def test_an_expectation_is_stored_with_the_machine_bit_for_bit() -> None:
+    machine = steps([0.01])[0][0]
+    expected = Expectation(0.1, None, machine.prior(SETTINGS.learning, 5.0))
+    again = StoredExpectation.of(expected).expectation(SETTINGS.trend)
+    assert again.machine is not None
+    assert np.array_equal(again.machine.mean, expected.machine.mean)
+    assert np.array_equal(again.machine.covariance, expected.machine.covariance)
