@@ -14,10 +14,10 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
+from servotwin.redesign.certified import policy as certified_module
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
-from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.registry import certified_policy
 from servotwin.store.records import Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.lookups import VerificationRequest, decode_request
@@ -93,7 +93,7 @@ def failing(monkeypatch) -> None:
     def refuted(_policy, _region, _setting):
         return NotVerified("the setting settles on 3.0 % of the members, and 99 % are asked")
 
-    monkeypatch.setattr(CertifiedPolicy, "confirm", refuted)
+    monkeypatch.setattr(certified_module.CertifiedPolicy, "confirm", refuted)
 
 
 def begun(fleet: ModelRegistry) -> tuple[Queue, Update, Incoming]:
@@ -168,9 +168,9 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelR
     back = sent(queue.window(1, update.version))
     queue.applied(back)
     looked_up, made = [], []
-    plain, exact = TablePolicy.verify, CertifiedPolicy.verify
+    plain, exact = TablePolicy.verify, certified_module.certify
     monkeypatch.setattr(TablePolicy, "verify", lambda *given: looked_up.append(1) or plain(*given))
-    monkeypatch.setattr(CertifiedPolicy, "verify", lambda *given: made.append(1) or exact(*given))
+    monkeypatch.setattr(certified_module, "certify", lambda *given: made.append(1) or exact(*given))
     outcome = queue.window(2, back.version, reason="asked for")
     assert "redesign" in kinds(outcome)
     assert (len(looked_up), len(made)) == (0, 1)

@@ -13,6 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.machine import LearningSettings
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.twin.estimating import Expectation, Wear, decode_window
 from servotwin.twin.settings import TwinSettings
@@ -133,11 +134,14 @@ def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2023, 2024, 2025])
-def test_in_the_papers_noise_what_is_accepted_is_right(seed):
-    loop = cosimulate(ours(Scenario.preset("fig16")).replace(seed=seed))
+@pytest.mark.parametrize(("seed", "learn", "worst"), [(2023, False, 0.01), (2024, False, 0.01), (2025, True, 0.02)])
+def test_in_the_papers_noise_what_is_accepted_is_right(seed, learn, worst):
+    """With a model that is exact, and with one that is learnt on the way, which costs the first windows accuracy."""
+    scenario = ours(Scenario.preset("fig16")).replace(seed=seed)
+    twin = scenario.twin.replace(learning=LearningSettings(learn=learn))
+    loop = cosimulate(scenario.replace(twin=twin))
     assert sum(e.ok for e in loop.estimates) >= 9
-    assert np.max(np.abs(errors_deg(loop))) < 0.01
+    assert np.max(np.abs(errors_deg(loop))) < worst
     assert {update.data_time for update in loop.updates} <= {e.time - 0.4999 for e in loop.estimates if e.ok}
 
 
