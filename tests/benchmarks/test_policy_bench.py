@@ -64,7 +64,7 @@ def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
 
 def test_constants_are_all_different_and_hold_the_calm_one() -> None:
     found = constants(MODEL, KNOWN)
-    assert len(set(found.values())) == len(found) > 20
+    assert len(set(found.values())) == len(found) > 15
     assert CALM in found.values()
 
 

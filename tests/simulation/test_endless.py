@@ -96,7 +96,7 @@ def test_what_is_forgotten_is_not_given() -> None:
         machine.simulation.run()
     with pytest.raises(InvalidInput, match=r"keep = 0 samples"):
         endless(worn(20.0), keep=0)
-    with pytest.raises(InvalidInput, match="needs a sampled controller"):
+    with pytest.raises(InvalidInput, match="must be a number in Hz"):
         endless(Scenario.preset("fig15"), keep=100)
 
 

@@ -92,7 +92,7 @@ def test_the_present_sample_has_the_new_reference_and_the_past_keeps_its_own() -
 
 
 def test_what_is_no_signal_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="no signal"):
+    with pytest.raises(InvalidInput, match="is not a signal"):
         Simulation(PAPER, 1.0).set_reference("up")  # type: ignore[arg-type]
 
 
