@@ -24,13 +24,14 @@ from servotwin.plant.signals import Array
 _SIZE = len(FACTORS)
 _DAY_S = 86400.0
 _AGREEMENT = 4.0  # standard deviations, of the distance of two readings with as many degrees of freedom as factors
+_LEAST_SHOWN = 1e-2  # of the prior's variance: along directions that shrink by less, the window shows nothing
 _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
 
 
 @settings("learning")
 @dataclass(frozen=True)
 class LearningSettings:
-    """How the twin learns the machine's stiffness, damping and pitch.
+    """Settings of the learning of the machine's stiffness, damping, pitch and mass ratio.
 
     How far they may be off at first is stated by `k_percent`, `c_percent` and `m_percent` of the uncertainty.
     """
@@ -79,7 +80,7 @@ class LearningSettings:
 
 
 class LearntMachine(Struct, frozen=True):
-    """What is known of a machine after some windows.
+    """Knowledge of a machine after some windows.
 
     Attributes
     ----------
@@ -92,7 +93,7 @@ class LearntMachine(Struct, frozen=True):
     alarm : str
         Sentence on a machine that is not what was learnt; empty without one.
     rival : LearntMachine or None
-        What windows since then say that contradict it.
+        Numbers of the windows since then that contradict it.
     """
 
     factors: tuple[float, ...]
@@ -103,7 +104,7 @@ class LearntMachine(Struct, frozen=True):
     rival: LearntMachine | None = None
 
     def prior(self, given: LearningSettings, now: float) -> FactorPrior:
-        """What is known at a time, s."""
+        """Prior of a window at a time, s: the factors, widened by their drift since then."""
         covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
         short = np.maximum(0.0, given.floor - np.diag(covariance))
         return FactorPrior(np.array(self.factors), covariance + np.diag(short))
@@ -125,7 +126,7 @@ def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPr
 def updated(
     before: LearntMachine | None, given: LearningSettings, estimate: GapEstimate, counts: bool, now: float
 ) -> LearntMachine | None:
-    """What is known after a window.
+    """Update what is known of the machine by a window.
 
     Parameters
     ----------
@@ -174,12 +175,13 @@ def _drift(known: FactorPrior, reading: MachineReading) -> str:
     The reading holds the prior, so that its move has the variance by which the prior's shrank.
     """
     moved = np.array(reading.factors) - known.mean
-    shrunk = known.covariance - np.array(reading.covariance).reshape(_SIZE, _SIZE)
+    # In units of the prior's own spreads: those of damping would drown a drift of the stiffness.
+    spread = np.sqrt(np.diag(known.covariance))
+    shrunk = (known.covariance - np.array(reading.covariance).reshape(_SIZE, _SIZE)) / np.outer(spread, spread)
     values, vectors = np.linalg.eigh(shrunk)
-    told = values > 1e-3 * np.trace(known.covariance) / 3.0
-    far = float(np.sum(np.square(vectors[:, told].T @ moved) / values[told])) if np.any(told) else 0.0
-    if far <= _DRIFT**2:
+    shown = values > _LEAST_SHOWN
+    if float(np.sum(np.square(vectors[:, shown].T @ (moved / spread)) / values[shown])) <= _DRIFT**2:
         return ""
-    index = int(np.argmax(np.abs(moved) / np.sqrt(np.diag(known.covariance))))
+    index = int(np.argmax(np.abs(moved) / spread))
     change = 100.0 * math.expm1(float(moved[index]))
     return f"the model drifts: {FACTORS[index]} moved by {change:+.2g} % in one window, beyond what is assumed of it"

@@ -167,6 +167,16 @@ def test_a_model_that_moves_beyond_its_drift_raises_an_alarm():
     assert moved.alarm.startswith("the model drifts: k/m")
 
 
+def test_a_drift_of_the_stiffness_shows_beside_a_damping_that_is_hardly_known():
+    """The wide spread of one factor must not hide what happens to another."""
+    wide, narrow = np.square([1e-3, 0.3, 1e-3, 0.1]), np.square([3e-4, 0.29, 1e-3, 0.1])
+    before, after = (tuple(np.diag(each).ravel().tolist()) for each in (wide, narrow))
+    machine = LearntMachine((0.0, 0.0, 0.0, 0.0), before, 0.0)
+    for k, alarm in ((8e-3, True), (1e-3, False)):
+        estimate = replace(reading_of((0.0, 0.0, 0.0, 0.0)), machine=MachineReading((k, 0.0, 0.0, 0.0), after))
+        assert updated(machine, GIVEN, estimate, True, 1.0).alarm.startswith("the model drifts: k/m") is alarm
+
+
 def test_the_nameplates_spread_is_that_of_the_stated_ranges():
     prior = nameplate(GIVEN, 0.15, 0.5, 0.1)
     spread = np.sqrt(np.diag(prior.covariance))

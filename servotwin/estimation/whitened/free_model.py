@@ -1,8 +1,9 @@
 """Fit of gap, place and the model's own numbers to a whitened window, and the hypothesis of a single contact.
 
-A machine is never quite its model. Its stiffness and damping over the masses and its pitch are free here, within what
-is known of them beforehand, beside the gap and the screw's place in it; a compliance of the screw is a nuisance. The
-model's factors enter nonlinearly and are iterated (Levenberg-Marquardt), unlike the tangents of `gate.model_shift`.
+A machine is never quite its model. Its stiffness and damping over the masses, its pitch and its mass ratio are free
+here, within what is known of them beforehand, beside the gap and the screw's place in it; a compliance of the screw may
+be a nuisance. The model's factors enter nonlinearly and are iterated (Levenberg-Marquardt), unlike the tangents of
+`gate.model_shift`.
 
 The same fit with a gap that is too wide for the motor to cross says how well one contact alone explains the window. A
 fit of two contacts may bend a wrong model into any gap: two are believed only where one explains significantly less.
@@ -32,10 +33,8 @@ _STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
 _SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
 _FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
-_EVALUATIONS, _GAIN = (
-    12,
-    1e-4,
-)  # of a fit; of the cost, in a whitened window far below one standard deviation of anything
+_EVALUATIONS = 12  # of a fit
+_GAIN = 1e-4  # of the cost: in a whitened window far below one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
 _ANY = (0.0, math.inf)
 
@@ -55,7 +54,7 @@ class FactorPrior:
 
     @classmethod
     def of_spreads(cls, k: float, c: float, pitch: float, ratio: float = 0.03) -> FactorPrior:
-        """Independent factors about 1, with relative standard deviations."""
+        """Make a prior of independent factors about 1, with relative standard deviations."""
         return cls(np.zeros(4), np.diag(np.square([k, c, pitch, ratio])))
 
     @property

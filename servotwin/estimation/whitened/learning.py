@@ -1,4 +1,4 @@
-"""Fit of a window to a machine whose stiffness, damping and pitch are known roughly, or from earlier windows.
+"""Fit of a window to a machine whose own numbers are known roughly, or from earlier windows.
 
 The fit of gap and place in the window's own noise (`fit`) and that of the model's factors (`free_model`) take turns:
 the noise is estimated from the residual of the adapted model, and the factors in this noise. Where the factors are
@@ -55,7 +55,9 @@ class LearntFit:
         for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
             if not least < factor < most:
                 off = 100.0 * math.expm1(factor)
-                return f"{name} would have to be {off:+.3g} % off the model, {LARGEST:g} times its usual error"
+                return (
+                    f"{name} would have to be {off:+.3g} % off the model, {LARGEST:g} spreads from what is known of it"
+                )
         return ""
 
     def gap_std(self, calibration: float) -> float:
@@ -80,7 +82,7 @@ def learn_and_fit(
 ) -> LearntFit:
     """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz) with the factors free within what is known.
 
-    Parameters as for `fit.align_and_fit`; `machine` is what is known of the factors over those of `servo`.
+    `prior` (rad) is one of the gaps from which the search begins; `machine` is what is known of the factors on `servo`.
     """
     factors = machine.mean
     slow, points = look_around(theta_m, position, rate, adapted(servo, factors), prior, settings)
