@@ -39,6 +39,8 @@ class Evidence:
         Reason against using the estimate, such as that it does not fit the trend; empty where it may be used.
     machine : FactorPrior or None
         The machine's numbers over the model's, as learnt from the windows; None: the model is all that is known.
+    rests : tuple of float
+        V, input biases that the last windows before this one showed.
     """
 
     estimate: GapEstimate
@@ -48,6 +50,7 @@ class Evidence:
     tuned_for: float | None = None
     why_not: str = ""
     machine: FactorPrior | None = None
+    rests: tuple[float, ...] = ()
 
     @property
     def gains(self) -> Gains | None:

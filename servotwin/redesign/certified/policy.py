@@ -32,6 +32,8 @@ _SAME = 1e-3
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
+# Friction holds the motor at up to so much more than half the difference of two rests.
+_HOLDS = 1.25
 
 
 class Verifier(Protocol):
@@ -119,9 +121,10 @@ class CertifiedPolicy:
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None:
+        if estimate is None and not self._shows_disturbance(evidence):
             return Redesign(None, math.nan, evidence.unusable)
-        gap = self._gap(estimate, evidence.trend)
+        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
+        best = math.nan if estimate is None else estimate.gap
         if gap[1] > self.uncertainty.gap[1]:
             low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
             reason = (
@@ -134,8 +137,8 @@ class CertifiedPolicy:
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
         if _in_force(result.setting, evidence, _SAME_FEEDFORWARD * self.smallest_answer):
-            return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=result)
-        redesign = _redesign(result, region.noise, estimate.gap, "")
+            return Redesign(None, best, "the verified setting is in force already", certificate=result)
+        redesign = _redesign(result, region.noise, best, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
@@ -196,16 +199,41 @@ class CertifiedPolicy:
         fed = gains.feedforward if gains is not None else 0.0
         if not math.isfinite(disturbance.bias_std):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * disturbance.bias_std, self.bias_floor)
+        bias, held = self._held(evidence)
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * disturbance.bias_std, self.bias_floor, 0.5 * held)
         # Only a significant change: every new feedforward is an update at the edge.
-        if abs(disturbance.bias + fed) > spread:
-            fed = min(max(-disturbance.bias, -limit), limit)
-        return fed, (disturbance.bias - spread, disturbance.bias + spread)
+        if abs(bias + fed) > spread:
+            fed = min(max(-bias, -limit), limit)
+        return fed, (bias - spread, bias + spread)
+
+    def _held(self, evidence: Evidence) -> tuple[float, float]:
+        """Input bias, and the voltage (V) of the friction that holds the motor where the last rests differ; 0: none.
+
+        A bias is the same at every rest. Friction stops the motor at one end of what it can hold or at the other.
+        """
+        rests = (*evidence.rests, evidence.disturbance.bias)
+        half = 0.5 * (max(rests) - min(rests))
+        if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
+            return evidence.disturbance.bias, 0.0
+        return 0.5 * (max(rests) + min(rests)), half
+
+    def _shows_disturbance(self, evidence: Evidence) -> bool:
+        """True where a window tells more of bias and friction than the setting in force answers to."""
+        gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
+        if gains is None or not rested or evidence.estimate.ok:
+            return False
+        integrates = gains.Ki != 0.0
+        fed, _ = self._input_bias(evidence)
+        if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
+            return True
+        return integrates != (self._held(evidence)[1] > 0.0) and len(evidence.rests) > 0
 
     def _friction(self, evidence: Evidence) -> Range:
         """Range of friction torques (N m): as stated, widened to the torque that the last feedforward left at rest."""
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
+        if math.isfinite(disturbance.bias_std):
+            high = max(high, _HOLDS * self._held(evidence)[1] * self.servo.k_T / self.servo.R)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
