@@ -251,7 +251,7 @@ class Commissioning:
         """
         rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
         check_samples("window", self.recording.longest_window or self.window, rate)
-        needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
+        needed, why = shortest_window(self.twin.method, self.servo, self.recording.sample_rate, self.twin.estimator)
         if self.window < needed * (1.0 - 1e-9):
             raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")
 
