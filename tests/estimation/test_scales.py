@@ -152,6 +152,41 @@ def test_bias_and_noise_at_rest_are_the_same(units: Units) -> None:
         )
 
 
+BALL = 5e-3 / (2.0 * math.pi)
+"""Pitch of a ball screw with a lead of 5 mm, m/rad."""
+
+
+def ball_screw(lost_motion: float, step: float, counts: int, stated: bool = True) -> list[GapEstimate]:
+    """Estimates of three windows of a calm loop on a ball screw, with counts of 10 nm and so many per turn."""
+    law, count = SERVO.controller, 2.0 * math.pi / counts
+    servo = SERVO.replace(p=BALL, Kp=law.Kp * SERVO.p / BALL, Ki=0.0, Kd=law.Kd * SERVO.p / BALL)
+    run = simulate(servo, 8.0, reference=SquareWave(step, 4.0), gap=lost_motion / BALL, sample_rate=5000.0)
+    servo = servo.replace(encoder_resolution=count if stated else 0.0)
+    found = []
+    for start in (1.7, 3.7, 5.7):
+        window = Window.from_run(run, start, 2.0)
+        assert window.theta_m is not None
+        theta_m, position = np.round(window.theta_m / count) * count, np.round(window.position / 1e-8) * 1e-8
+        found.append(estimate_gap(window.replace(theta_m=theta_m, position=position), servo))
+    return found
+
+
+@pytest.mark.parametrize(("lost_motion", "step", "bits"), [(5e-6, 1e-4, 17), (5e-6, 1e-4, 20), (0.7e-6, 2e-5, 20)])
+def test_a_ball_screw_shows_its_lost_motion_where_the_encoder_does(lost_motion: float, step: float, bits: int) -> None:
+    """Of 5 um, 0.36 deg, and of 0.7 um, 0.05 deg: the screw turns by 0.3 deg and by 0.06 deg the other way."""
+    for found in ball_screw(lost_motion, step, 2**bits):
+        assert found.ok, found
+        assert found.gap == pytest.approx(lost_motion / BALL, abs=math.radians(0.002))
+        assert found.interval[0] < lost_motion / BALL < found.interval[1]
+
+
+def test_without_a_stated_resolution_half_a_degree_of_contact_is_needed() -> None:
+    for found in ball_screw(5e-6, 1e-4, 2**20, stated=False):
+        assert not found.ok
+        assert "0.5 deg are needed" in found.reasons[0]
+    assert not any(found.ok for found in ball_screw(5e-6, 1e-4, 2**14))
+
+
 def test_the_papers_numbers_are_the_defaults_on_its_servo() -> None:
     assert paper.PaperSettings().times(1.0) == (40.0, 0.25, 0.1)
     assert paper.PaperSettings(alpha=80.0, settle_s=0.1, rest_speed=0.2).times(1e3) == (80.0, 0.1, 0.2)
