@@ -81,7 +81,8 @@ class Demands:
     machines : int
         Machines of the verification, drawn independently of one another and of those that rank.
     attempts : int
-        Candidates that are verified before the search gives up, each on machines of its own.
+        Candidates that are verified before the search gives up, each on machines of its own; then as many without
+        integral action and dead zone.
     """
 
     Ms: Annotated[

@@ -114,10 +114,9 @@ def confirm(
 
 
 def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
-    """The first candidates; the best one without integral action and dead zone, which settles most surely, is among
-    them."""
-    plain = next((k for k, setting in enumerate(ranked) if not setting.controller.Ki and not setting.tolerance), 0)
-    return ranked[:attempts] if plain < attempts else [*ranked[: attempts - 1], ranked[plain]]
+    """The first candidates, then as many without integral action and dead zone, which settle most surely."""
+    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
+    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
