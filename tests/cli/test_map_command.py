@@ -149,20 +149,14 @@ def test_processes_give_the_same_bytes(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bytes(tmp_path, finished):
-    pytest.importorskip("distributed")
-    with Cluster(tmp_path) as (address, _):
-        process = started("paper", *SMALL, "--out", tmp_path / "out", "--scheduler", address)
-        _, stderr = process.communicate(timeout=120)
-    assert process.returncode == 0, stderr
-    assert same_files(finished, tmp_path / "out")
-
-
-@pytest.mark.slow
-def test_a_dask_cluster_that_is_lost_keeps_what_is_finished(tmp_path):
+def test_a_dask_cluster_gives_the_same_bytes_and_when_it_is_lost_keeps_what_is_finished(tmp_path, finished):
     pytest.importorskip("distributed")
     long = ("--tolerance", "0.5:3:30", "--amplitude", "1:100:30:log", "--members", "16", "--out", tmp_path / "out")
     with Cluster(tmp_path) as (address, scheduler):
+        process = started("paper", *SMALL, "--out", tmp_path / "small", "--scheduler", address)
+        _, stderr = process.communicate(timeout=120)
+        assert process.returncode == 0, stderr
+        assert same_files(finished, tmp_path / "small")
         process = started("paper", *long, "--scheduler", address)
         chunks = tmp_path / "out" / "chunks"
         while not list(chunks.glob("0*.npz")) and process.poll() is None:

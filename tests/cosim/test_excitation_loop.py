@@ -152,7 +152,7 @@ def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
         assert {answer.outcome for answer in loop.answers} == {RequestOutcome.TAKEN}
         assert len(set(loop.answers)) == len({answer.serial for answer in loop.answers})
         assert loop.windows[-1].samples == 10_000
-        assert loop.digest() == cosimulate(loop.scenario).digest()
+    assert loop.digest() == cosimulate(loop.scenario).digest()
 
 
 TOML = """

@@ -185,7 +185,7 @@ def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, 2048, 99)
+    members = draw_independently(servo, known, 1024, 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 

@@ -180,8 +180,8 @@ def test_the_chapter_stands_after_the_papers_figures(biased):
 
 
 @pytest.mark.slow
-def test_one_figure_is_reproduced_with_its_numbers(tmp_path, monkeypatch):
-    figure = replace(policies.FIGURES[0], data=policies.data_of(CLEAN, SHORT))
+def test_one_figure_is_reproduced_with_its_numbers(tmp_path, monkeypatch, biased):
+    figure = replace(policies.FIGURES[0], data=lambda _: biased)
     monkeypatch.setattr(figures, "FIGURES", (figure,))
     reproduce.reproduce(tmp_path, only=("policies",), console=Console(file=io.StringIO()))
     names = ["beyond.json", "claims.json", "policies.png", "policies.svg", "report.html"]

@@ -100,8 +100,8 @@ def probed() -> Scenario:
 
 
 SCENARIOS = {
-    "fig15": lambda: Scenario.preset("fig15").replace(duration=90.0),
-    "certified": lambda: Scenario.preset("certified").replace(duration=62.0),
+    "fig15": lambda: Scenario.preset("fig15").replace(duration=50.0),
+    "certified": lambda: Scenario.preset("certified").replace(duration=45.0),
     "probed": probed,
 }
 

@@ -14,6 +14,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
+from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as certified_module
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
@@ -26,15 +27,19 @@ from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
 DEG = math.pi / 180.0
-SCENARIO = Scenario.preset("certified").replace(gap=12.0 * DEG, duration=145.0, name="axis")
 GRID = Grid(finest=30.0 * DEG, biases=(1e-2,), noises=(0.0,))
 SETTINGS = TwinSettings(demands=Demands(machines=16, conditions=4, screened=2, settled=0.8), triage=TriageSettings())
-SERVO = SCENARIO.model
+SERVO = Servo.preset("paper")
+
+
+@cache
+def scenario() -> Scenario:
+    return Scenario.preset("certified").replace(gap=12.0 * DEG, duration=45.0, name="axis")
 
 
 @cache
 def windows() -> tuple[WindowMessage, ...]:
-    return cosimulate(SCENARIO).windows
+    return cosimulate(scenario()).windows
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(file: Path) -> ModelRegistry:
-    start = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
+    start = Setting(scenario().start_tolerance, gains_of(scenario().start_law))
     return ModelRegistry((ServoModel("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
 
 

@@ -110,7 +110,8 @@ def loop_of(name: str, **changes: object) -> Loop:
 
 
 def ours(scenario: Scenario, fine_angle: bool = True, **changes: object) -> Scenario:
-    """A packaged scenario with the default estimator."""
+    """A packaged scenario with the default estimator; with 16 bits for the angle only its first half."""
+    scenario = scenario if fine_angle else scenario.replace(duration=105.0)
     twin = scenario.twin.replace(method="whitened", estimator=None, **changes)
     return scenario.replace(twin=twin, recording=replace(scenario.recording, fine_angle=fine_angle))
 
