@@ -153,7 +153,7 @@ def glance(
         The encoder's offset from earlier windows, mean and standard deviation, rad.
     settings : TriageSettings, optional
     """
-    settings, skipped = settings or TriageSettings(), in_vain(message, state)
+    settings, skipped = settings or TriageSettings().on(servo), in_vain(message, state)
     if skipped:
         return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:
@@ -186,10 +186,10 @@ def _moved(result: Glance, state: TriageState, settings: TriageSettings) -> str:
     if not off <= allowed(math.hypot(result.std, state.std), settings):
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
-    if not result.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
+    if not result.misfit <= settings.misfit * max(state.misfit, settings.misfit_limit):
         return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
     spread = settings.deviations * math.hypot(result.bias_std, state.bias_std)
-    if abs(result.bias - state.bias) > max(settings.bias, spread):
+    if abs(result.bias - state.bias) > max(settings.bias_limit, spread):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
     return ""
 

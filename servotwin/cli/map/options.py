@@ -34,9 +34,9 @@ class MapOptions:
     members: int = 16
     motion: float = 1.0
     seed: int = 0
-    duration: float = 120.0
-    window: float = 40.0
-    still_um: float = 1.0
+    duration: float | None = None
+    window: float | None = None
+    still_um: float | None = None
 
     def settings(self) -> MapSettings:
         """Settings of the map.
@@ -47,8 +47,10 @@ class MapOptions:
             An option is outside its range, or the two kinds of axes are mixed.
         """
         servo = Servo.resolve(self.servo)
-        changes = {key: value for key, value in (("enter", self.enter), ("leave", self.leave)) if value is not None}
-        law = servo.controller.replace(sample_rate=None, rate_limit=None, **changes)
+        own = servo.controller
+        enter = own.enter if self.enter is None else self.enter
+        leave = own.leave if self.leave is None else self.leave
+        law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)
         axes = self._axes()
         _check_drawable(axes.shape)
         return MapSettings(
@@ -60,7 +62,7 @@ class MapOptions:
             seed=self.seed,
             duration=self.duration,
             window=self.window,
-            still=self.still_um * 1e-6,
+            still=None if self.still_um is None else self.still_um * 1e-6,
         )
 
     def _axes(self) -> Axes:
