@@ -69,6 +69,7 @@ def test_the_files_hold_the_map(finished):
     assert image.imread(finished / "map.png").shape == (1170, 1080, 4)
 
 
+@pytest.mark.slow
 def test_the_table_agrees_with_the_cells(finished):
     settings = REQUEST.settings()
     whole = StabilityMap(settings, measured(settings, range(settings.count)))
@@ -123,6 +124,7 @@ def test_a_damaged_piece_is_computed_again(finished, tmp_path):
     assert same_files(finished, out)
 
 
+@pytest.mark.slow
 def test_another_map_s_folder_is_refused(finished):
     before = {path: path.read_bytes() for path in finished.rglob("*.npz")}
     for change, message in (

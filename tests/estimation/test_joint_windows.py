@@ -74,7 +74,6 @@ def test_windows_of_two_machines_contradict_each_other(stiffer):
     assert "the machine is not the same" in reasons
 
 
-@pytest.mark.slow
 def test_a_useless_window_harms_no_other():
     good = window_of(10.0)
     still = Window(good.position, theta_m=np.full(good.position.size, 0.3), sample_rate=RATE)
@@ -138,7 +137,6 @@ def test_the_residual_is_the_noise():
         assert estimate_jointly(window, DESCRIBED).gap.rms == pytest.approx(noise, rel=0.05, abs=1e-9)
 
 
-@pytest.mark.slow
 def test_a_lower_bound_is_one_number():
     """Where one way's travel is not enough: value and interval agree, and the bound is one."""
     window = window_of(10.0)

@@ -97,6 +97,7 @@ def test_without_noise_the_factors_come_out_exactly():
     assert fitted.concluded().gap == pytest.approx(math.radians(10.0), abs=math.radians(1e-3))
 
 
+@pytest.mark.slow
 def test_with_noise_the_spreads_hold_what_they_promise():
     """Squared distances of the factors, in standard deviations, are chi-squared with four degrees of freedom."""
     distances, errors = [], []

@@ -131,7 +131,6 @@ def two_oscillators(slow: float, fast: float, level: float) -> Automaton:
     return Automaton((below, above), ("x", "v", "y", "u", "one"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.2, 0.6, 1.3, 2.5])
 def test_no_event_of_undamped_oscillations_is_missed(turn: float) -> None:
     """Two undamped oscillators reach a level now and then, however coarse the samples: `turn` is radians per sample."""

@@ -85,6 +85,7 @@ def test_a_loop_that_its_rate_makes_unstable_is_refused_in_a_sentence() -> None:
     assert "is unstable at 50 Hz" in found.reason
 
 
+@pytest.mark.slow
 def test_a_slower_setting_is_verified_at_the_rate_of_the_axis() -> None:
     found = certify(inert_axis(50.0), NARROW, replace(SMALL, scales=(0.05, 0.1, 1.0), shapes=((1.0, 1.0),)))
     assert isinstance(found, Certificate)
@@ -123,6 +124,7 @@ def test_a_sampled_setting_is_simulated_with_its_ticks_counts_and_limits() -> No
 # --- the worst plant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 200.0])
 def test_no_plant_of_the_stated_set_exceeds_the_worst_Ms(rate: float | None) -> None:
     servo = SERVO.replace(sample_rate=rate)
@@ -247,6 +249,7 @@ def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() 
 # --- no units
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("time", "length", "voltage"),
     [(1e-3, 1.0, 1.0), (1e3, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1e6, 1.0), (1.0, 1.0, 1e-2), (10.0, 1e-3, 1e2)],

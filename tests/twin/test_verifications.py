@@ -122,6 +122,7 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: M
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
 
+@pytest.mark.slow
 def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRegistry) -> None:
     queue, update, queued = begun(fleet)
     before = queue.state
@@ -136,12 +137,14 @@ def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRe
     assert not outcome.outgoing
 
 
+@pytest.mark.slow
 def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: ModelRegistry) -> None:
     one, other = begun(fleet), begun(fleet)
     assert one[2] == other[2]
     assert one[0].give(one[2]) == other[0].give(other[2])
 
 
+@pytest.mark.slow
 def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
@@ -182,6 +185,7 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelR
     assert not outcome.enqueue
 
 
+@pytest.mark.slow
 def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry, monkeypatch) -> None:
     queue, _, queued = begun(fleet)
     question = decode_request(queued.body)
@@ -195,6 +199,7 @@ def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry,
     assert queue.state == before
 
 
+@pytest.mark.slow
 def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegistry) -> None:
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
@@ -208,6 +213,7 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegist
     assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
 
 
+@pytest.mark.slow
 def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: ModelRegistry, monkeypatch) -> None:
     queue = Queue(fleet)
     outcome = queue.window(0)
@@ -218,6 +224,7 @@ def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Mod
     assert after.wake is None
 
 
+@pytest.mark.slow
 def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, queued = begun(fleet)
     before = queue.state
@@ -226,6 +233,7 @@ def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     assert queue.state == before
 
 
+@pytest.mark.slow
 def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, queued = begun(fleet)
     model = replace(fleet.models[0], settings=SETTINGS)
@@ -233,6 +241,7 @@ def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     assert "the twin uses no table any more" in queue.give(queued).evidence[0].status
 
 
+@pytest.mark.slow
 def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:
     _, _, queued = begun(fleet)
     question = decode_request(queued.body)

@@ -71,6 +71,7 @@ def receipt(update: Update, reason=Reason.APPLIED, in_force=None) -> Receipt:
     return Receipt("axis", update.version, reason is Reason.APPLIED, 10, reason, in_force, update.window[0])
 
 
+@pytest.mark.slow
 def test_a_window_becomes_evidence_and_an_update():
     outcome = work(fleet(), claim(windows()[1], serial=4), 100.0)
     assert (outcome.servo, outcome.serial, outcome.done, outcome.wake) == ("axis", 4, (1,), 105.0)
@@ -108,6 +109,7 @@ def test_infinities_and_nan_are_kept():
     assert math.copysign(1.0, found["d"][1]) == -1.0
 
 
+@pytest.mark.slow
 def test_equal_claims_give_equal_outcomes():
     sent = claim(*windows(), b"rubbish")
     assert work(fleet(), sent, 7.0) == work(fleet(), sent, 7.0)
@@ -137,6 +139,7 @@ def test_and_in_another_process():
     assert len(seen) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2])
 def test_how_messages_are_split_into_claims_does_not_matter(size):
     sent = [m.message for m in loop().messages if m.direction == "up"]
@@ -196,6 +199,7 @@ def test_no_bytes_make_it_fail(body, encoding):
     assert statuses(outcome)[0].startswith("failed: ")
 
 
+@pytest.mark.slow
 def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkeypatch):
     good, right = stepping._draft, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
 
@@ -257,6 +261,7 @@ def test_a_backlog_sends_nothing_twice():
     assert outcome.wake == 1e6 + 5.0
 
 
+@pytest.mark.slow
 def test_what_passed_between_two_boots_is_taken_from_when_windows_came():
     """Not from when they were processed: a backlog of an hour is an hour."""
     reborn = msgspec.structs.replace(windows()[2], boot="boot-2")

@@ -27,9 +27,18 @@ def finish(fleet: Fleet) -> None:
     """One update at least, which on a busy machine comes after the kills; no more windows; all end well."""
     until(lambda: check_updates(fleet) > 0, lambda: logs(fleet))
     fleet.stop_machines()
+    deliver(fleet)
+    while pending(fleet) > 0:  # what was on its way to the disk when the edges were asked to end
+        for edge in fleet.edges.values():
+            edge.start()
+        deliver(fleet)
+    assert fleet.twin.end() == 0
+
+
+def deliver(fleet: Fleet) -> None:
+    """Wait until nothing is left to send, and end the edges."""
     until(lambda: pending(fleet) == 0, lambda: logs(fleet))
     assert set(end_all(fleet.edges.values())) == {0}
-    assert fleet.twin.end() == 0
 
 
 def check(fleet: Fleet, sufficient: int, killer: Killer, counts: dict[str, int]) -> None:
