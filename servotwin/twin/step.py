@@ -176,7 +176,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, triage=triage)
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
-    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine)
+    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, state.wear.motor)
     state, redesign = _redesign(model, state, evidence, stale)
     records.append(RedesignRecord(message, redesign))
     requests: tuple[Message, ...] = ()
