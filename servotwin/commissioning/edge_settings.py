@@ -239,13 +239,28 @@ class Commissioning:
             return window
         usual, second = CALM_WINDOW if self.calm else WINDOW, scales(self.servo).time
         # A fast machine needs short windows only, but the estimator needs some samples.
-        return usual * second if second >= 1.0 else max(usual * second, min(usual, self._shortest_window[0]))
+        needed = 0.0 if second >= 1.0 else min(usual, self._shortest_window[0])
+        return self._whole(max(usual * second, needed))
+
+    def with_longest(self, window: float, pre_trigger: float) -> Commissioning:
+        """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds."""
+        second = scales(self.servo).time
+        longest = (
+            max(self._whole(window * second), self.window),
+            max(self._whole(pre_trigger * second), self.pre_trigger),
+        )
+        recording = dataclasses.replace(self.recording, longest_window=longest[0], longest_pre_trigger=longest[1])
+        return dataclasses.replace(self, recording=recording)
+
+    def _whole(self, seconds: float) -> float:
+        """A time in whole samples, s."""
+        return round(seconds * self.recording.sample_rate) / self.recording.sample_rate
 
     @property
     def pre_trigger(self) -> float:
         """Part of a window before the change of the reference, s."""
         pre_trigger = self.recording.pre_trigger
-        calm = CALM_PRE_TRIGGER * scales(self.servo).time
+        calm = self._whole(CALM_PRE_TRIGGER * scales(self.servo).time)
         fits = self.calm and self.window > 2.0 * calm
         return pre_trigger if pre_trigger is not None else (calm if fits else 0.0)
 

@@ -9,7 +9,7 @@ from scaling import Units, scaled
 from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.estimation.trend_settings import TrendSettings
 from servotwin.plant.servo import PRESETS, Servo
-from servotwin.redesign.excitation import ExcitationSettings
+from servotwin.redesign.excitation import ExcitationSettings, long_enough
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 
@@ -65,3 +65,18 @@ def test_windows_are_in_the_servos_own_time_but_hold_enough_samples() -> None:
     assert edge(scaled(SERVO, time=1e-3), sample_rate=5e6).window == pytest.approx(1e-3)
     calm = Commissioning(scaled(SERVO, time=8.0), SERVO.controller.replace(Ki=0.0), SETTINGS)
     assert (calm.window, calm.pre_trigger) == pytest.approx((16.0, 2.4))
+
+
+def test_windows_are_whole_samples_and_the_twin_may_request_longer_ones() -> None:
+    slow = edge(SERVO.replace(k=7e3)).with_longest(4.0, 0.3)
+    agent = slow.agent_settings("axis", "boot-1")
+    second = math.sqrt(1e4 / 7e3)
+    assert agent.window_s == pytest.approx(second, abs=2e-4)
+    assert agent.longest_window_s == pytest.approx(4.0 * second, abs=2e-4)
+    request = SETTINGS.on(SERVO.replace(k=7e3)).excitation
+    assert request is not None
+    samples = round(5000.0 * request.times.window)
+    assert samples <= agent.longest_samples
+    assert long_enough(samples / 5000.0, round(5000.0 * request.times.pre_trigger) / 5000.0, request)
+    fast = edge(scaled(SERVO, time=1e-3)).with_longest(4.0, 0.3)
+    assert fast.agent_settings("axis", "boot-1").longest_window_s == fast.window
