@@ -180,12 +180,13 @@ class MotorLearning:
         rows = motor_rows(window, self.servo)
         if rows is None:
             return before
-        mean, covariance = self._nameplate(rows) if before is None else before.predicted(self._walks, now)
+        delay = _delay_as_lag(self.servo, window.sample_rate)
+        mean, covariance = self._nameplate(rows, delay) if before is None else before.predicted(self._walks, now)
         made = _posterior(rows, mean, covariance)
         if made is None:
             return before
         least = self.settings.motor_floor
-        floor = np.array([least, math.hypot(least, _delay_as_lag(self.servo, window.sample_rate)), 0.0, 0.0])
+        floor = np.array([least, math.hypot(least, delay), 0.0, 0.0])
         short = np.diag(np.maximum(0.0, floor**2 - np.diag(made[1])))
         fresh = LearntMotor(tuple(made[0].tolist()), tuple((made[1] + short).ravel().tolist()), now)
         if before is None:
@@ -203,9 +204,9 @@ class MotorLearning:
         anew = self.updated(None, window, now)
         return anew and replace(anew, alarm=f"{alarm}; it is learnt anew after {count} such windows")
 
-    def _nameplate(self, rows: MotorRows) -> tuple[Array, Array]:
+    def _nameplate(self, rows: MotorRows, delay: float) -> tuple[Array, Array]:
         wide = _WIDE * float(np.sqrt(np.mean(rows.voltage**2)))
-        return np.zeros(4), np.diag(np.square([self.back_emf, self.lag, wide, wide]))
+        return np.zeros(4), np.diag(np.square([self.back_emf, math.hypot(self.lag, delay), wide, wide]))
 
     @property
     def _walks(self) -> Array:

@@ -209,7 +209,12 @@ def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_fr
     torque = SERVO.k_T / SERVO.R
     stated, sticky, smooth, unsure = (
         policy.redesign(Evidence(estimate, rest, motor=each)).certificate
-        for each in (None, motor(-0.07, 0.045, 0.03, 5e-4), motor(-0.07, 0.0, 0.05, 5e-4), motor(-0.07, 0.045, 0.03, 1.0))
+        for each in (
+            None,
+            motor(-0.07, 0.045, 0.03, 5e-4),
+            motor(-0.07, 0.0, 0.05, 5e-4),
+            motor(-0.07, 0.045, 0.03, 1.0),
+        )
     )
     assert stated is not None
     assert sticky is not None

@@ -66,19 +66,20 @@ def test_an_expectation_is_stored_with_the_machine_bit_for_bit() -> None:
 
 
 def motor_window(number: int, factor: float) -> WindowMessage:
-    """Window of a motor that swings, with `factor` times the model's back EMF and hardly any lag."""
+    """Window of a motor that swings, with `factor` times the model's back EMF."""
     servo, time = Servo.preset("paper"), np.arange(2000) / 1000.0
-    angle, speed = np.sin(9.0 * time), 9.0 * np.cos(9.0 * time)
+    lag, middle = servo.J * servo.R / servo.k_T, 9.0 * (time + 0.5e-3)  # of the time in which a voltage is held
+    volts = factor * servo.k_B * 9.0 * np.cos(middle) - lag * 81.0 * np.sin(middle)
     channels = tuple(
         pack_channel(name, unit, values)
         for name, unit, values in (
             ("position", "m", np.zeros(2000)),
-            ("theta_m", "rad", angle),
-            ("voltage", "V", servo.k_B * factor * (speed - 4.5e-3 * 9.0 * angle)),
+            ("theta_m", "rad", np.sin(9.0 * time)),
+            ("voltage", "V", volts),
         )
     )
     return msgspec.structs.replace(
-        window_message(number, 10.0 * number, channels=channels), sample_rate=1000.0, checksum=checksum(channels)
+        window_message(number, 10.0 * number, channels=channels), rate=1000.0, crc=checksum(channels)
     )
 
 
