@@ -127,11 +127,25 @@ def certify(
     out: Annotated[
         Path | None, typer.Option(help="File of the table; the one that the key `table` names by default.")
     ] = None,
-    finest_deg: Annotated[float, typer.Option(help="Width of the narrowest cells of gaps.")] = 4.0,
+    finest_deg: Annotated[
+        float | None, typer.Option(help="Width of the narrowest cells of gaps; 4 by default.", show_default=False)
+    ] = None,
     bias_mv: Annotated[
-        str, typer.Option(help="Largest input bias beside the feedforward: VALUE,VALUE,...")
-    ] = "1,10,50",
-    noise_um: Annotated[str, typer.Option(help="Noise for which settings are ranked, rms: VALUE,...")] = "0,10",
+        str | None,
+        typer.Option(
+            help="Largest input bias beside the feedforward: VALUE,VALUE,...; 1,10,50 in the servo's own volts by "
+            "default.",
+            show_default=False,
+        ),
+    ] = None,
+    noise_um: Annotated[
+        str | None,
+        typer.Option(
+            help="Noise for which settings are ranked, rms: VALUE,...; none and a tenth of the smallest stated step by "
+            "default.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Verify settings beforehand, for twins that look them up; an interrupted run continues where it stopped."""
     from servotwin.cli.certify import certify as run

@@ -19,6 +19,7 @@ from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.messages import Gains, Setting
@@ -40,6 +41,7 @@ PATIENCE = 1.0
 """Longest time that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+_ERROR_FLOORS = 10.0  # to a smallest step
 _MOST_SAMPLES = 1e8  # some 10 GB of signals
 
 # Widens a box so that rounding does not exclude its own corner.
@@ -130,11 +132,28 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     policy = certified_policy(servo, settings)
     verified = policy.fallback()
     gains, band = gains_of(verified.setting.controller), band_of(verified, noise)
-    supervision = Supervision(FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon))
+    fallback = FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon)
+    supervision = supervision_of(servo, settings, fallback)
     sent = policy_of(servo, settings)
     return Guarding(
         supervision, *(_hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else _certified_box(policy))
     )
+
+
+def supervision_of(servo: Servo, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
+    """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on."""
+    usual, period = WatchSettings(), Supervision().period_s
+    second, _, volt = scales(servo)
+    watch = dataclasses.replace(
+        usual,
+        slot_s=usual.slot_s * second,
+        window_s=usual.window_s * second,
+        settling_s=usual.settling_s * second,
+        persist_s=usual.persist_s * second,
+        error_floor=settings.uncertainty.step[0] / _ERROR_FLOORS,
+        effort_floor=usual.effort_floor * volt,
+    )
+    return Supervision(fallback, watch, period * second)
 
 
 def start_of(fallback: FallbackSet) -> Parameters:

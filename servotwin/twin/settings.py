@@ -22,7 +22,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.registry import POLICIES
 
-_LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m and V on the preset `paper`
+_LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
 
 
 @settings("triage")
@@ -53,8 +53,8 @@ class TriageSettings:
         key(
             "least_misfit_um",
             above=0.0,
-            help="Smallest misfit that counts as unusual; where absent 0.1 um on the preset paper, and as much of "
-            "another's pitch.",
+            help="Smallest misfit that counts as unusual; where absent a thousandth of the smallest stated step, "
+            "0.1 um by default.",
         ),
     ] = None
     bias: Annotated[
@@ -63,7 +63,7 @@ class TriageSettings:
             "bias_mv",
             above=0.0,
             help="A smaller change of the input bias needs no estimate; where absent 2 mV on the preset paper, and as "
-            "much of another's own voltage.",
+            "much of another's own volt.",
         ),
     ] = None
     every: Annotated[int, key(minimum=1, help="Largest number of windows from one estimate to the next.")] = 50
@@ -72,11 +72,11 @@ class TriageSettings:
     def __post_init__(self) -> None:
         check(self)
 
-    def on(self, servo: Servo) -> TriageSettings:
-        """The settings with what is absent derived for a servo."""
-        units = scales(servo)
-        misfit = _LEAST_MISFIT * units.length if self.least_misfit is None else self.least_misfit
-        bias = _BIAS * units.voltage if self.bias is None else self.bias
+    def on(self, volt: float, step: float) -> TriageSettings:
+        """The settings for a servo whose own volt (`plant.scales`) is so many V, and a smallest step (m)."""
+        usual = _LEAST_MISFIT * (step / Uncertainty().step[0])
+        misfit = usual if self.least_misfit is None else self.least_misfit
+        bias = _BIAS * volt if self.bias is None else self.bias
         return replace(self, least_misfit=misfit, bias=bias)
 
     @property
@@ -218,12 +218,13 @@ class TwinSettings:
 
         A trend that differs from the default one was stated, and stays.
         """
-        second = scales(servo).time
+        second, _, volt = scales(servo)
+        step = self.uncertainty.step[0]
         return replace(
             self,
             trend=TrendSettings.on(second) if self.trend == TrendSettings() else self.trend,
             excitation=None if self.excitation is None else self.excitation.on(second),
-            triage=None if self.triage is None else self.triage.on(servo),
+            triage=None if self.triage is None else self.triage.on(volt, step),
         )
 
     def initial_tolerance(self, servo: Servo) -> float:

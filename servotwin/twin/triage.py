@@ -153,7 +153,7 @@ def glance(
         The encoder's offset from earlier windows, mean and standard deviation, rad.
     settings : TriageSettings, optional
     """
-    settings, skipped = settings or TriageSettings().on(servo), in_vain(message, state)
+    settings, skipped = settings or TriageSettings(), in_vain(message, state)
     if skipped:
         return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:

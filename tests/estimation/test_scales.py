@@ -33,6 +33,7 @@ ELSEWHERE = [
     Units(voltage=2.0**-7),
     Units(8.0, 2.0**-6, 4.0),
     Units(1e3, 1e-6, 1e2),
+    Units(1e-3, 1e6, 1e-2),
 ]
 
 

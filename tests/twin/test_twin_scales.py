@@ -6,9 +6,13 @@ from dataclasses import replace
 import pytest
 from scaling import Units, scaled
 
-from servotwin.commissioning.edge_settings import Commissioning, Recording
+from servotwin.commissioning.edge_settings import Commissioning, Recording, supervision_of
+from servotwin.edge.parameters import FallbackSet
+from servotwin.edge.settings import Supervision
 from servotwin.estimation.trend_settings import TrendSettings
+from servotwin.messages import Setting
 from servotwin.plant.servo import PRESETS, Servo
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings, long_enough
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
@@ -28,13 +32,14 @@ def test_the_presets_keep_the_papers_numbers(name: str) -> None:
     assert found.excitation is not None
     assert found.excitation.times == ExcitationSettings().times == (2.0, 0.3, 60.0, 0.85)
     assert found.triage is not None
-    assert found.triage.bias == 2e-3
+    assert (found.triage.bias, found.triage.least_misfit) == (2e-3, 1e-7)
     assert edge(Servo.preset(name)).window == 1.0
 
 
 @pytest.mark.parametrize("units", [Units(time=1e3), Units(2.0**-6, 2.0**-20, 2.0**7)])
 def test_what_a_file_leaves_out_is_in_the_machines_own_units(units: Units) -> None:
-    model = TwinModel.of(scaled(SERVO, *units), SETTINGS)
+    steps = Uncertainty(step=(units.length * 1e-4, units.length * 1e-3))
+    model = TwinModel.of(scaled(SERVO, *units), SETTINGS.replace(uncertainty=steps))
     found = model.settings
     assert found.trend.rate_std_rad_per_s * units.time == pytest.approx(math.radians(0.2))
     assert found.trend.rate_walk_rad_per_s_per_sqrt_s * units.time**1.5 == pytest.approx(math.radians(0.015))
@@ -44,6 +49,22 @@ def test_what_a_file_leaves_out_is_in_the_machines_own_units(units: Units) -> No
     assert found.triage.bias_limit / units.voltage == pytest.approx(2e-3)
     assert found.triage.misfit_limit / units.length == pytest.approx(1e-7)
     assert found.on(scaled(SERVO, *units)) == found
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_presets_are_supervised_with_the_papers_numbers(name: str) -> None:
+    fallback = FallbackSet(Setting(1e-5))
+    assert supervision_of(Servo.preset(name), TwinSettings(), fallback) == Supervision(fallback)
+
+
+def test_the_edge_watches_in_the_machines_own_units() -> None:
+    steps = Uncertainty(step=(1e-10, 2.5e-9), input_bias=(-10.0, 10.0))
+    servo, fallback = scaled(SERVO, 8.0, 1e-6, 1e2), FallbackSet(Setting(1e-11))
+    found = supervision_of(servo, TwinSettings(uncertainty=steps), fallback)
+    assert found.period_s == pytest.approx(0.4)
+    assert found.watch is not None
+    assert (found.watch.slot_s, found.watch.window_s, found.watch.settling_s) == pytest.approx((0.08, 16.0, 24.0))
+    assert (found.watch.error_floor, found.watch.effort_floor) == pytest.approx((1e-11, 2.0))
 
 
 def test_what_a_file_states_counts() -> None:
