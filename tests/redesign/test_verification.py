@@ -15,6 +15,7 @@ from servotwin.commissioning.edge_settings import guarding
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
@@ -193,6 +194,44 @@ def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     assert box is not None
     assert after.setting.gains is not None
     assert box.limits.allows_gains(after.setting.gains, box.middle)
+
+
+def motor(back_emf: float, friction: float, bias: float, std: float) -> LearntMotor:
+    """Learnt motor; friction and bias in V."""
+    spreads = np.square([1e-3, 0.08, std, std])
+    return LearntMotor((back_emf, 0.0, friction, bias), tuple(np.diag(spreads).ravel().tolist()), 0.0)
+
+
+def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_friction_hides() -> None:
+    policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5,)))
+    gap, spread = 10.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    # Friction of 45 mV holds the motor where 20 mV more than the bias push it.
+    rest = Disturbance(0.05, 1e-5, 0.0, 0.3, 0.0)
+    torque = SERVO.k_T / SERVO.R
+    stated, sticky, smooth, unsure = (
+        policy.redesign(Evidence(estimate, rest, motor=each)).certificate
+        for each in (
+            None,
+            motor(-0.07, 0.045, 0.03, 5e-4),
+            motor(-0.07, 0.0, 0.05, 5e-4),
+            motor(-0.07, 0.045, 0.03, 1.0),
+        )
+    )
+    assert stated is not None
+    assert sticky is not None
+    assert smooth is not None
+    assert unsure is not None
+    assert stated.setting.controller.feedforward == smooth.setting.controller.feedforward == -0.05
+    assert unsure.setting.controller.feedforward == -0.05
+    assert sticky.setting.controller.feedforward == -0.03
+    assert smooth.loop is not None
+    assert stated.loop is not None
+    # The margins are those of machines near the learnt one, not of all of the stated range.
+    assert smooth.loop.Ms_worst < stated.loop.Ms_worst
+    assert policy._friction(Evidence(estimate, rest, motor=motor(0.0, 0.045, 0.03, 5e-4))) == pytest.approx(
+        ((0.045 - 9.8e-4) * torque, (0.045 + 9.8e-4) * torque), rel=1e-3
+    )
 
 
 # --- demands

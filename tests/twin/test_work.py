@@ -75,7 +75,7 @@ def receipt(update: Update, reason=Reason.APPLIED, in_force=None) -> Receipt:
 def test_a_window_becomes_evidence_and_an_update():
     outcome = work(fleet(), claim(windows()[1], serial=4), 100.0)
     assert (outcome.servo, outcome.serial, outcome.done, outcome.wake) == ("axis", 4, (1,), 105.0)
-    assert kinds(outcome, 1) == ["estimate", "disturbance", "trend", "redesign", "update"]
+    assert kinds(outcome, 1) == ["estimate", "disturbance", "trend", "motor", "redesign", "update"]
     (sent,) = map(decode, outcome.outgoing)
     assert isinstance(sent, Update)
     assert (sent.version, sent.base_version) == (windows()[1].parameter_version + 1, windows()[1].parameter_version)
@@ -294,7 +294,7 @@ def test_a_state_that_cannot_be_read_is_stored_and_the_twin_begins_anew():
     assert (first.message, first.kind) == (0, "estimate")
     assert first.status.startswith("failed: the state of servo 'axis' is not understood")
     assert msgspec.msgpack.decode(first.body)["state"] == b"\x81\xa4typeonce"
-    assert [row.kind for row in rest] == ["estimate", "disturbance", "trend", "redesign", "update"]
+    assert [row.kind for row in rest] == ["estimate", "disturbance", "trend", "motor", "redesign", "update"]
     assert decode(outcome.outgoing[0]).version == 41
 
 
