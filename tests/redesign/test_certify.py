@@ -318,12 +318,12 @@ def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -
 
 
 def test_rests_that_differ_indicate_friction_and_the_bias_between_them(policy: CertifiedPolicy) -> None:
-    """Friction stops the motor at 0.04 V below the bias or above it; so the setting integrates, and stops near."""
-    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.06), rests=(-0.02, 0.055)))
+    """Friction stops the motor at 0.06 V below the bias of 0.04 V, or above it."""
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.1), rests=(-0.02, 0.055)))
     assert made.certificate is not None
-    assert made.setting.gains.feedforward == pytest.approx(-0.02)
+    assert made.setting.gains.feedforward == pytest.approx(-0.04)
     low, high = made.certificate.friction
-    assert (low, high) == pytest.approx((0.0, 1.25 * 0.04 * SERVO.k_T / SERVO.R))
+    assert (low, high) == pytest.approx((0.0, 1.25 * 0.06 * SERVO.k_T / SERVO.R))
     alike = policy.redesign(Evidence(estimated(10.0), at_rest(0.06), rests=(0.0595, 0.0603)))
     assert alike.certificate is not None
     assert alike.certificate.friction == (0.0, 0.0)
