@@ -23,6 +23,7 @@ def share_of_ticks(engine: LiftedEngine) -> float:
     return float(np.mean(slots == TICKED) * slots.size / ((engine.samples - 1) * engine.every))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 300, 50))
 def test_random_loops_are_those_of_the_ticks(first: int) -> None:
     """Same events, switching ticks to the bit, states to 1e-9 of their range."""
