@@ -10,13 +10,16 @@ from time import perf_counter
 from typing import ClassVar, Protocol
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
+from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LAG, LearntMotor
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.free_model import FactorPrior, adapted
+from servotwin.estimation.whitened.free_model import adapted
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
@@ -114,7 +117,8 @@ class CertifiedPolicy:
         the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
-        return self.decide(evidence, self if evidence.machine is None else _LearntVerifier(self, evidence.machine))
+        learnt = _learnt(self.servo, self.uncertainty, evidence)
+        return self.decide(evidence, self if learnt is None else _LearntVerifier(self, *learnt))
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
@@ -191,53 +195,67 @@ class CertifiedPolicy:
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
         leaves it as it is."""
-        disturbance = evidence.disturbance
+        bias, std = evidence.disturbance.bias, evidence.disturbance.bias_std
+        motor = self._motor(evidence)
+        if motor is not None and motor.friction[0] > 0.0:
+            # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
+            bias, std = motor.mean[BIAS], motor.std(BIAS)
         gains = evidence.gains
         fed = gains.feedforward if gains is not None else 0.0
-        if not math.isfinite(disturbance.bias_std):
+        if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * disturbance.bias_std, self.bias_floor)
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor)
         # Only a significant change: every new feedforward is an update at the edge.
-        if abs(disturbance.bias + fed) > spread:
-            fed = min(max(-disturbance.bias, -limit), limit)
-        return fed, (disturbance.bias - spread, disturbance.bias + spread)
+        if abs(bias + fed) > spread:
+            fed = min(max(-bias, -limit), limit)
+        return fed, (bias - spread, bias + spread)
+
+    def _motor(self, evidence: Evidence) -> LearntMotor | None:
+        """The learnt motor, where it tells friction and bias well enough to act on them."""
+        motor, small = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
+        known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= small
+        return motor if known else None
 
     def _friction(self, evidence: Evidence) -> Range:
-        """Range of friction torques (N m): as stated, widened to the torque that the last feedforward left at rest."""
+        """Range of friction torques (N m): as learnt, otherwise as stated or as the last feedforward left at rest."""
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
+        motor, torque = self._motor(evidence), self.servo.k_T / self.servo.R
+        if motor is not None:
+            least, most = motor.friction
+            # A range that begins at zero is none: the stated one may still narrow it.
+            return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
-        return low, max(
-            high, left * self.servo.k_T / self.servo.R
-        ) if left > _BIAS_MOVED * self.smallest_answer else high
+        return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
 
 
 # Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
 # leaves out does not average away with the windows.
 _LEAST_K, _LEAST_C = 0.002, 0.01
+# Of a stated half-width: a number of the motor that is not known better than that stays as stated.
+_TOLD = 0.5
 
 
 @dataclass(frozen=True)
 class _LearntVerifier:
     """Verification by simulation on what was learnt of the machine, in place of the model's stated error.
 
-    Its numbers are those of k/m and c/m: the masses are taken as the model's. The fallback set stays that of the stated
-    ranges.
+    The fallback set stays that of the stated ranges.
     """
 
     policy: CertifiedPolicy
-    machine: FactorPrior
+    servo: Servo
+    learnt: LearntFactors
     provisional: ClassVar[bool] = False
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
-        policy, covariance = self.policy, self.machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2])
-        spread = tuple(tuple(row) for row in covariance.tolist())
-        learnt = LearntFactors(("k", "c"), (0.0, 0.0), spread)
+        policy, known = self.policy, region.within(self.policy.uncertainty)
         return certify(
-            adapted(policy.servo, self.machine.mean),
-            region.within(policy.uncertainty).replace(learnt=learnt, m=0.0),
+            self.servo,
+            # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
+            known.replace(learnt=self.learnt, m=0.0 if "k" in self.learnt.names else known.m),
             policy.demands_within_band(),
             policy.simulations,
             region.feedforward,
@@ -247,6 +265,31 @@ class _LearntVerifier:
 
     def fallback(self) -> Certificate:
         return self.policy.fallback()
+
+
+def _learnt(servo: Servo, known: Uncertainty, evidence: Evidence) -> tuple[Servo, LearntFactors] | None:
+    """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
+
+    The motor's numbers count where the windows told more of them than was stated.
+    """
+    names, variances = list[str](), list[Array]()
+    machine, motor = evidence.machine, evidence.motor
+    if machine is not None:
+        servo = adapted(servo, machine.mean)
+        names += ["k", "c"]
+        variances.append(machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2]))
+    if motor is not None:
+        for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
+            relative = motor.std(index) / (1.0 + motor.mean[index])
+            if math.sqrt(3.0) * relative < _TOLD * width:
+                servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
+                names.append(name)
+                variances.append(np.array([[relative**2]]))
+    if not names:
+        return None
+    covariance = block_diag(*variances)
+    spread = tuple(tuple(row) for row in covariance.tolist())
+    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
 
 
 def _noise(evidence: Evidence) -> float:
