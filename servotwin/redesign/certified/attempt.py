@@ -20,7 +20,7 @@ from servotwin.redesign.certified.certificate import (
     LoopMargins,
     RampResult,
 )
-from servotwin.redesign.certified.margins import loop_margins, unfed, widened
+from servotwin.redesign.certified.margins import margins_in_every_zone, unfed, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
@@ -162,7 +162,7 @@ class Attempt:
     def _loop(self) -> LoopMargins:
         question = self.question
         known = widened(question.uncertainty, question.demands)
-        return loop_margins(question.servo, known, unfed(self.setting.controller))
+        return margins_in_every_zone(question.servo, known, self.setting.controller)
 
     @cached_property
     def _members(self) -> SimulatedMachines:

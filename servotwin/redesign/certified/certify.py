@@ -15,8 +15,9 @@ from time import perf_counter
 
 import numpy as np
 
+from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import assess
+from servotwin.redesign.certified.assess import COUNTS, assess
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
@@ -24,6 +25,8 @@ from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw
 from servotwin.redesign.design import Design
 
+# Gains with which integral action is tried: the best so many without it.
+_GAINS_WITH_INTEGRAL = 3
 # Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
 _FAST = 10.0
 
@@ -67,7 +70,7 @@ def certify(
     candidates = [with_feedforward(setting, feedforward) for setting in laws]
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     attempts: list[Attempt] = []
-    for setting in _shortlist(_ranked(question, candidates), demands.attempts):
+    for setting in _shortlist(_ranked_in_stages(question, candidates), demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -109,10 +112,9 @@ def confirm(
 
 
 def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
-    """The first candidates; the best one without integral action and dead zone, which settles most surely, is among
-    them."""
-    plain = next((k for k, setting in enumerate(ranked) if not setting.controller.Ki and not setting.tolerance), 0)
-    return ranked[:attempts] if plain < attempts else [*ranked[: attempts - 1], ranked[plain]]
+    """The first candidates, then as many without integral action and dead zone, which settle most surely."""
+    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
+    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
@@ -141,7 +143,8 @@ def candidates_of(
     """Every combination of scales, shapes, integral action and dead zone within the bounds on Ms.
 
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
-    candidates only where there is friction or bias, or noise.
+    candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
+    reference that stops the integral only.
 
     Raises
     ------
@@ -151,11 +154,37 @@ def candidates_of(
     integral = demands.integral if disturbed else (0.0,)
     laws = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = [Design(law) for law in laws]
+    plain += [stopped for law in laws if law.Ki for stopped in _stopped(servo, law, uncertainty.step[0], demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     hysteretic = [
         Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
     return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
+
+
+def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:
+    """A law with dead zones that stop its integral only, for a smallest step (m)."""
+    counts = COUNTS * servo.position_resolution
+    zones = [(share * step + counts, leave) for share, leave in demands.stops]
+    return [
+        Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
+        for tolerance, leave in zones
+        if tolerance <= demands.tolerance
+    ]
+
+
+def _gains(law: Controller) -> tuple[float, float, float]:
+    return law.Kp, law.Kd, law.Tf
+
+
+def _ranked_in_stages(question: Question, candidates: list[Design]) -> list[Design]:
+    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only."""
+    plain = [setting for setting in candidates if not setting.controller.Ki]
+    if not plain or len(plain) == len(candidates):
+        return _ranked(question, candidates)
+    gains = {_gains(setting.controller) for setting in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
+    with_integral = [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
+    return _ranked(question, plain + with_integral)
 
 
 def _ranked(question: Question, candidates: list[Design]) -> list[Design]:
