@@ -11,7 +11,7 @@ from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 
 _NUMERIC = "numpy", "scipy", "numba"
-_PLAIN = "rate", "direct", "static_gain", "unseen", "factor", "second", "encoder_resolution"
+_PLAIN, _OPTIONAL = ("rate", "direct", "static_gain", "unseen", "factor"), {"second": 1.0, "encoder_resolution": 0.0}
 
 
 class ResponseMode(NamedTuple):
@@ -105,12 +105,14 @@ def model_table(
 
 def _model_values(model: NoveltyModel) -> Values:
     """Keys and values that `model_table` reads as this model."""
+    # Files of the version before have neither.
+    changed = [name for name, usual in _OPTIONAL.items() if getattr(model, name) != usual]
     return {
         "decay_real": [mode.decay.real for mode in model.modes],
         "decay_imag": [mode.decay.imag for mode in model.modes],
         "gain_real": [mode.gain.real for mode in model.modes],
         "gain_imag": [mode.gain.imag for mode in model.modes],
-        **values_of(model, model_table, only=_PLAIN),
+        **values_of(model, model_table, only=(*_PLAIN, *changed)),
     }
 
 

@@ -42,6 +42,8 @@ class Evidence:
         The machine's numbers over the model's, as learnt from the windows; None: the model is all that is known.
     motor : LearntMotor or None
         The motor's numbers, friction and input bias, as learnt from the windows.
+    rests : tuple of float
+        V, input biases that the last windows before this one showed.
     """
 
     estimate: GapEstimate
@@ -52,6 +54,7 @@ class Evidence:
     why_not: str = ""
     machine: FactorPrior | None = None
     motor: LearntMotor | None = None
+    rests: tuple[float, ...] = ()
 
     @property
     def gains(self) -> Gains | None:

@@ -52,6 +52,10 @@ from servotwin.twin.versions import Attempts, noted_setting
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
+# Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
+_RESTS = 3
+
+
 class WindowArrival(NamedTuple):
     """A new window that the store has committed, and its arrival time (s, on the clock of `now`).
 
@@ -176,8 +180,12 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, triage=triage)
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
-    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, state.wear.motor)
+    evidence = Evidence(
+        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, state.wear.motor, state.rests
+    )
     state, redesign = _redesign(model, state, evidence, stale)
+    if disturbed.known and not stale:
+        state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     requests: tuple[Message, ...] = ()
     if model.requests is not None and state.requests is not None and not stale and estimate.method != UNUSABLE:

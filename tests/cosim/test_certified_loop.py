@@ -96,9 +96,12 @@ def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
     assert not alone.fallbacks
     error = np.abs(alone.run.reference - alone.run.position)
     settled = slice(round(55.0 * alone.run.sample_rate), -1)
-    left = scenario.input_bias / fallback_certificate.setting.controller.Kp
-    assert error[settled].max() == pytest.approx(left, rel=0.02)
-    assert left < fallback_certificate.tail < fallback_certificate.within
+    setting = fallback_certificate.setting
+    assert setting.controller.integral_only
+    # The integral takes the bias, but for the zone in which it stops; proportional action alone would leave more.
+    within = setting.controller.leave * setting.tolerance
+    assert error[settled].max() <= within < 0.5 * scenario.input_bias / setting.controller.Kp
+    assert fallback_certificate.tail < fallback_certificate.within
 
 
 @pytest.mark.slow

@@ -54,6 +54,12 @@ for law in (servo.controller, limited, *sampled):
     run = st.simulate(servo, 0.3, controller=law, reference=wave, gap=worn, tolerance=tolerance, noise=st.Noise(1e-5))
     assert len(run.events) > 5 and np.isfinite(run.q).all() and np.isfinite(run.voltage).all()
 assert simulate_ensemble(servo, 0.3, 1e-3, gap=[0.0, 0.1, 0.2], tolerance=[0.0, tolerance, tolerance]).shape == (3, 31)
+# Long enough for the vast scale of sampled loops in blocks.
+from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
+calm = sampled[1].replace(Ki=0.0, voltage_limit=24.0)
+assert np.isfinite(st.simulate(servo, 10.0, controller=calm, reference=st.Step(1e-3), gap=0.1).q).all()
+cases = SampledCases(1e-3, [0.0, 0.1], [0.0, tolerance], friction=[0.0, 1e-5], delay=[0, 2])
+assert np.isfinite(summarise_sampled(servo, calm, 10.0, cases, 2.0, sample_rate=50.0)["error"].mean).all()
 print("done")
 """
 

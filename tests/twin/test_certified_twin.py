@@ -103,10 +103,20 @@ def test_where_nothing_is_verified_the_fallback_set_is_sent_with_the_reason():
     assert update.setting.band == band_of(fallback_certificate)
 
 
-def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window():
-    sent, redesign = answer(status=GapStatus.UNIDENTIFIABLE)
-    assert sent == []
-    assert "unidentifiable" in redesign.reason
+def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window_unless_it_shows_a_bias():
+    unknown = Disturbance(math.nan, math.inf, math.nan, 0.0, 0.0)
+    for observed in (unknown, disturbed(0.0)):
+        sent, redesign = answer(status=GapStatus.UNIDENTIFIABLE, observed=observed)
+        assert sent == []
+        assert "unidentifiable" in redesign.reason
+
+
+def test_a_bias_is_cancelled_whatever_the_gap():
+    """Without a usable estimate the setting is verified for every gap of the stated range."""
+    (update,), redesign = answer(status=GapStatus.UNIDENTIFIABLE)
+    assert update.setting.gains.feedforward == -0.05
+    assert update.status == GapStatus.UNIDENTIFIABLE.value
+    assert redesign.certificate.gap == SETTINGS.uncertainty.gap
 
 
 @pytest.mark.slow

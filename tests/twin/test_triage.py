@@ -193,7 +193,8 @@ def test_a_bias_that_moved_is_seen() -> None:
     window = decode_window(message)
     told = {"boot": message.boot, "version": message.parameter_version, "time": message.middle, "bias_std": 1e-5}
     moved = glance(message, window, SERVO, watch_of(25.0 * DEG, bias=0.04, **told), OFFSET)
-    assert "the input bias moved: 0.05001 V, 0.04 V before" in moved.why
+    assert moved.bias == pytest.approx(0.05, abs=5e-5)
+    assert f"the input bias moved: {moved.bias:.4g} V, 0.04 V before" in moved.why
     assert not glance(message, window, SERVO, watch_of(25.0 * DEG, bias=0.049, **told), OFFSET).moved
 
 

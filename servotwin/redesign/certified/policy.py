@@ -35,6 +35,8 @@ _SAME = 1e-3
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
+# Friction holds the motor at up to so much more than half the difference of two rests.
+_HOLDS = 1.25
 
 
 class Verifier(Protocol):
@@ -123,9 +125,10 @@ class CertifiedPolicy:
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None:
+        if estimate is None and not self._shows_disturbance(evidence):
             return Redesign(None, math.nan, evidence.unusable)
-        gap = self._gap(estimate, evidence.trend)
+        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
+        best = math.nan if estimate is None else estimate.gap
         if gap[1] > self.uncertainty.gap[1]:
             low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
             reason = (
@@ -138,8 +141,8 @@ class CertifiedPolicy:
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
         if _in_force(result.setting, evidence, _SAME_FEEDFORWARD * self.smallest_answer):
-            return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=result)
-        redesign = _redesign(result, region.noise, estimate.gap, "")
+            return Redesign(None, best, "the verified setting is in force already", certificate=result)
+        redesign = _redesign(result, region.noise, best, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
@@ -195,20 +198,45 @@ class CertifiedPolicy:
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
         leaves it as it is."""
-        bias, std = evidence.disturbance.bias, evidence.disturbance.bias_std
-        motor = self._motor(evidence)
-        if motor is not None and motor.friction[0] > 0.0:
-            # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
-            bias, std = motor.mean[BIAS], motor.std(BIAS)
+        bias, std, held = self._rest(evidence)
         gains = evidence.gains
         fed = gains.feedforward if gains is not None else 0.0
         if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor)
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
         # Only a significant change: every new feedforward is an update at the edge.
         if abs(bias + fed) > spread:
             fed = min(max(-bias, -limit), limit)
         return fed, (bias - spread, bias + spread)
+
+    def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
+        """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
+
+        A bias is the same at every rest. Friction stops the motor at one end of what it can hold or at the other.
+        """
+        bias, std = evidence.disturbance.bias, evidence.disturbance.bias_std
+        motor = self._motor(evidence)
+        if motor is not None and motor.friction[0] > 0.0:
+            # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
+            return float(motor.mean[BIAS]), motor.std(BIAS), 0.0
+        if motor is not None or not math.isfinite(std):
+            return bias, std, 0.0
+        rests = (*evidence.rests, bias)
+        half = 0.5 * (max(rests) - min(rests))
+        if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
+            return bias, std, 0.0
+        return 0.5 * (max(rests) + min(rests)), std, half
+
+    def _shows_disturbance(self, evidence: Evidence) -> bool:
+        """True where a window tells more of bias and friction than the setting in force answers to."""
+        gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
+        if gains is None or not rested or evidence.estimate.ok:
+            return False
+        fed, _ = self._input_bias(evidence)
+        if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
+            return True
+        sticks = self._friction(evidence)[1] > 0.0
+        return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
         """The learnt motor, where it tells friction and bias well enough to act on them."""
@@ -225,6 +253,7 @@ class CertifiedPolicy:
             least, most = motor.friction
             # A range that begins at zero is none: the stated one may still narrow it.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
+        high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
