@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_RATE, Travel, polygon
+from servotwin.estimation.core.contacts import BY_RATE, Travel
 from servotwin.estimation.core.least_squares import LeastSquares, least_squares, orthonormal, project_out, spread
-from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.reduced import ReducedResponse
+from servotwin.estimation.core.variants import variants
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.estimation.paper.observer import LagFilter, observer
@@ -30,8 +31,8 @@ from servotwin.estimation.whitened.free_model import (
     FactorPrior,
     FreeProblem,
     contact_evidence,
-    motion_by,
 )
+from servotwin.estimation.whitened.nearby import Neighbour, motions
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
@@ -135,19 +136,19 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
 
     Whitening takes the error of a wrong model for noise; a free model takes it up itself.
     """
-    model, reduction = result.reduction.response, result.reduction
-    polygons = polygon(reduction.theta_m, result.point.screw(0.0, reduction.rate))
-    screw = polygons[:1]
-    weights = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients
-    neighbours = _neighbours(servo, 1.0 / model.interval)
-    motions = [motion_by(reduction, other, screw, weights) / step for other, step in neighbours]
-    motions.insert(2, reduction.decimation.rows(model.respond(screw))[0])
+    model, reduction = result.reduction.reduced, result.reduction
+    screw = reduction.traced(result.point)
+    table = reduction.tabulated(screw)
+    answer = reduction.position - table[RESIDUAL]
+    weights = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients[1 : len(reduction.fixed())]
+    moved = motions(model, _neighbours(servo, model), screw[:1], answer, weights)
+    free = np.insert(moved, 2, answer, axis=0)
     sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
-        motions.append(reduction.decimation.rows(model.respond(polygons[BY_RATE:]))[0])
-        sizes.append(GROWTH * model.interval)
-    free = np.array(motions) * np.array(sizes)[:, None]
-    table, size = np.vstack([reduction.table(result.point), free]), len(free)
+        free = np.vstack([free, model.respond(screw[BY_RATE:])])
+        sizes.append(GROWTH * model.response.interval)
+    free *= np.array(sizes)[:, None]
+    table, size = np.vstack([table, free]), len(free)
     shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
     noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
     rows = reduction.prepared(noise, table, CONSTANT)
@@ -179,16 +180,15 @@ def _words(shares: Array, deviations: Array) -> str:
 
 
 @lru_cache(maxsize=32)
-def _neighbours(servo: Servo, sample_rate: float) -> tuple[tuple[Response, float], ...]:
-    """Responses a step away from a servo's in stiffness, damping and the screw's compliance (of the structure's)."""
-    stiffer = servo.replace(k=tuple((1.0 + _STEP) * servo.stiffnesses))
-    damped = servo.replace(c=tuple((1.0 + _STEP) * servo.dampings))
-    stiffness = float(servo.stiffnesses.max())
-    soft = 1.0 / _STIFF if servo.rigid else stiffness / servo.k_d * (1.0 + _STEP)
-    softer = servo.replace(k_d=stiffness / soft)
-    step = soft - (0.0 if servo.rigid else stiffness / servo.k_d)
-    pairs = ((stiffer, _STEP), (damped, _STEP), (softer, step))
-    return tuple((response(other, sample_rate), size) for other, size in pairs)
+def _neighbours(servo: Servo, model: ReducedResponse) -> tuple[Neighbour, ...]:
+    """Neighbours of a servo's response in stiffness, damping and the screw's compliance (of the structure's)."""
+    rate, stiffness = 1.0 / model.response.interval, float(servo.stiffnesses.max())
+    own = 0.0 if servo.rigid else stiffness / servo.k_d
+    soft = 1.0 / _STIFF if servo.rigid else own * (1.0 + _STEP)
+    stiffer, damped = variants(servo, list(math.log1p(_STEP) * np.eye(4)[:2]), rate)
+    (softer,) = variants(servo, [np.zeros(4)], rate, [stiffness / soft])
+    steps = ((stiffer, _STEP), (damped, _STEP), (softer, soft - own))
+    return tuple(Neighbour.of(model, other, step, row) for row, (other, step) in enumerate(steps))
 
 
 def observer_shift(result: WhitenedFit, servo: Servo) -> tuple[float, float]:
