@@ -28,6 +28,7 @@ class ControllerChanges(TypedDict, total=False):
     tracking_time: float | None
     feedforward: float
     release_time: float
+    integral_only: bool
 
 
 @settings("controller")
@@ -95,6 +96,13 @@ class Controller:
             help="Time constant with which the voltage offset after a change of parameters (`LawState.offset`) fades.",
         ),
     ] = 0.5
+    integral_only: Annotated[
+        bool,
+        key(
+            help="Inside the dead zone only the integral stops; proportional and derivative action go on. Otherwise "
+            "the loop opens there (the paper's).",
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
         check(self)
@@ -180,4 +188,5 @@ class Controller:
             tracking_step=step / max(step, self.tracking),
             feedforward=float(self.feedforward),
             release_step=-expm1(-step / self.release_time),
+            acting_inside=1.0 if self.integral_only else 0.0,
         )

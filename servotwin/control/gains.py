@@ -10,7 +10,8 @@ from servotwin.messages import Gains
 
 def gains_of(controller: Controller) -> Gains:
     """The part of a controller that updates may set."""
-    return Gains(*(float(getattr(controller, name)) for name in Gains.__struct_fields__))
+    floats = {name: float(getattr(controller, name)) for name in Gains.__struct_fields__ if name != "integral_only"}
+    return msgspec.convert({**floats, "integral_only": controller.integral_only}, Gains)
 
 
 def with_gains(controller: Controller, gains: Gains | None) -> Controller:

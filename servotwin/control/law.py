@@ -36,6 +36,8 @@ class LawParameters(NamedTuple):
         Always added to the voltage, V.
     release_step : float
         1 - exp(-Ts / release time), the share of `LawState.offset` that fades per tick.
+    acting_inside : float
+        1.0: inside the dead zone only the integral stops; 0.0: the loop opens there.
     """
 
     Kp: float
@@ -50,6 +52,7 @@ class LawParameters(NamedTuple):
     tracking_step: float
     feedforward: float = 0.0
     release_step: float = 1.0
+    acting_inside: float = 0.0
 
 
 class LawState(NamedTuple):
@@ -66,7 +69,7 @@ class LawState(NamedTuple):
     voltage : float
         Voltage applied at the last tick, V.
     active : float
-        1.0: the loop is closed; 0.0: the error is inside the dead zone.
+        1.0: the error is outside the dead zone, the integral follows it; 0.0: inside.
     offset : float
         Voltage offset after a change of parameters, V: added to the voltage, inside the dead zone too; it fades
         exponentially.
@@ -103,8 +106,9 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     Notes
     -----
     Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and it gives no voltage
-    (erratum E16): what is left is the feedforward and the offset. With limits off the voltage equals the continuous
-    PIDF's driven by the held error. The limits act on the sum.
+    (erratum E16): what is left is the feedforward and the offset. A law with `acting_inside` stops its integral there
+    and nothing else. With limits off the voltage equals the continuous PIDF's driven by the held error. The limits act
+    on the sum.
     """
     filtered = measurement + (1.0 - parameters.loop_step) * (state.filtered - measurement)
     error = reference - filtered
@@ -116,9 +120,11 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
             active = 0.0
     elif size > parameters.leave:
         active = 1.0
-    driven = error * active
+    # Both factors are 0 or 1, so that nothing here rounds.
+    acting = active if active > parameters.acting_inside else parameters.acting_inside
+    driven = error * acting
     slope = driven - state.derivative
-    pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * active
+    pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
     wanted = pidf + (parameters.feedforward + state.offset)
     voltage = wanted
     if voltage > parameters.voltage_limit:
@@ -132,10 +138,15 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
         voltage = state.voltage - parameters.rate_step
     # Back-calculation (anti-windup); inside the dead zone the integral must hold.
     correction = parameters.tracking_step * (voltage - wanted) * active
-    integral = state.integral + parameters.integral_step * driven + correction
+    integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)
     return LawState(integral, derivative, filtered, voltage, active, offset)
+
+
+def replaced(integral: float, feedforward: float) -> float:
+    """Part of an integral (V) that an additional feedforward (V) supplies: at most all of it, never the other sign."""
+    return min(max(feedforward, min(integral, 0.0)), max(integral, 0.0))
 
 
 def transfer(old: LawParameters, new: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
@@ -159,11 +170,14 @@ def transfer(old: LawParameters, new: LawParameters, state: LawState, reference:
     Notes
     -----
     The integral is stored in volts. A law without integral action never changes it, so it would remain as a bias: it
-    becomes a part of the offset.
+    becomes a part of the offset. Where only the integral stops in the dead zone, a new feedforward replaces as much of
+    the integral as it supplies, for good: a law that hardly integrates would take long to give it up.
     """
     # With the old law's limits, so that a voltage that never reached the motor does not come back.
     voltage = tick(old, state, reference, measurement).voltage
     integral = state.integral if new.integral_step != 0.0 else 0.0
+    if new.acting_inside > 0.0:
+        integral -= replaced(integral, new.feedforward - old.feedforward)
     moved = state._replace(integral=integral, offset=0.0)
     unlimited = new._replace(voltage_limit=inf, rate_step=inf)
     return moved._replace(offset=voltage - tick(unlimited, moved, reference, measurement).voltage)

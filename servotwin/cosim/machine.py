@@ -10,12 +10,13 @@ from servotwin.simulation import Simulation, simulate
 from servotwin.simulation.endless import FOREVER, UnboundedSimulation, first_stretch
 
 
-def simulation_of(scenario: Scenario, plant: Servo | None = None) -> Simulation:
+def simulation_of(scenario: Scenario, plant: Servo | None = None, delay: int = 0) -> Simulation:
     """Make the simulation of a scenario's plant and controller.
 
-    `plant` replaces the scenario's servo where the machine differs from the model of twin and edge.
+    `plant` replaces the scenario's servo where the machine differs from the model of twin and edge, and `delay` is in
+    samples of its controller.
     """
-    return _simulation(scenario, scenario.servo if plant is None else plant)
+    return _simulation(scenario, scenario.servo if plant is None else plant, delay=delay)
 
 
 def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
@@ -38,7 +39,7 @@ def compile_ahead(scenario: Scenario) -> None:
     simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
 
 
-def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None) -> Simulation:
+def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None, delay: int = 0) -> Simulation:
     return Simulation(
         plant,
         scenario.duration if keep is None else FOREVER,
@@ -53,4 +54,5 @@ def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None) -> Si
         input_bias=scenario.input_bias,
         friction=scenario.friction,
         keep=keep,
+        delay=delay,
     )

@@ -15,6 +15,10 @@ from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECT
 # derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
 # two modes agree on the sign of the same quantity.
 SIGNIFICANT = 1e-13
+# A block lets a guard rise to this many times its rounding. A state that drifts by less than its last digit a step does
+# not move in one: with a bound of one rounding it stood just below it, and every later step was looked at by itself.
+# Beyond one rounding the next step's own search finds the guard, so that a run cannot stand still at either bound.
+LINGERING = 2.0
 
 
 class Scratch(NamedTuple):
@@ -152,7 +156,7 @@ def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wante
     """
     clean, thirds = wanted, t.guard_count[mode] * rows
     for g in range(t.guard_count[mode]):
-        least = rounding(t, mode, g, 0, x)
+        least = LINGERING * rounding(t, mode, g, 0, x)
         for k in range(clean):
             at = g * rows + k
             begin, end = out[at], out[at + 1]

@@ -18,6 +18,8 @@ class Gains(Struct, frozen=True):
         Thresholds of the dead zone, in tolerances.
     feedforward : float
         V.
+    integral_only : bool
+        True: inside the dead zone only the integral stops; otherwise the loop opens there.
     """
 
     Kp: float
@@ -27,6 +29,7 @@ class Gains(Struct, frozen=True):
     enter: float = 1.0
     leave: float = 1.0
     feedforward: float = 0.0
+    integral_only: bool = False
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:

@@ -189,7 +189,10 @@ class Zone:
 
 
 def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
-    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added."""
+    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added.
+
+    With `integral_only` the integral stops inside, and the rest goes on.
+    """
     # The feedforward and the offset act inside the dead zone too.
     always = basis.row("feedforward") + basis.row("offset")
     slope = error - basis.row("derivative")
@@ -208,8 +211,11 @@ def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, err
             GuardRow(s * error - controller.leave * tolerance, "+" if s > 0 else "-", None, "leave", s) for s in (1, -1)
         )
         zero = np.zeros(len(basis.names))
-        inside = Zone("inside", always, zero, -basis.row("derivative") / controller.Tf, leave)
-        zones += _saturated(inside, basis, 0.0) if always.any() else [inside]
+        if controller.integral_only:
+            inside = Zone("inside", unlimited, zero, slope / controller.Tf, leave)
+        else:
+            inside = Zone("inside", always, zero, -basis.row("derivative") / controller.Tf, leave)
+        zones += _saturated(inside, basis, 0.0) if inside.voltage.any() else [inside]
     return tuple(zones)
 
 

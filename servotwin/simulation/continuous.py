@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.control.controller import Controller
+from servotwin.control.law import replaced
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
@@ -249,6 +250,8 @@ def _with_states(
     offset."""
     common = {name: now.value(name) for name in now.loop.automaton.names if name != "offset"}
     common |= {"integral": 0.0} if controller.Ki == 0.0 else {}
+    if controller.integral_only:
+        common["integral"] -= replaced(common["integral"], controller.feedforward - common.get("feedforward", 0.0))
     # A loop filter that is new starts at the measurement: at zero it would show a jump of the position.
     common = {"filtered": now.output("measured_position")} | common | dict(values)
     state = np.array([common.get(name, 0.0) for name in loop.automaton.names])

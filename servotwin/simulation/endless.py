@@ -117,7 +117,7 @@ def _raised(pieces: PiecewiseCubic, offset: float) -> PiecewiseCubic:
 
 
 CHUNK = 4096
-_VOLTAGE_ONLY = LawParameters(0.0, 0.0, 0.0, 0.0, -1.0, -1.0, inf, inf, 1.0, 0.0, 0.0, 1.0)
+_VOLTAGE_ONLY = LawParameters(0.0, 0.0, 0.0, 0.0, -1.0, -1.0, inf, inf, 1.0, 0.0, 0.0, 1.0, 0.0)
 
 
 class OpenLoopPlant:

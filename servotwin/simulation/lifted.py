@@ -11,7 +11,7 @@ from servotwin.control import law
 from servotwin.control.law import LawState
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
-from servotwin.hybrid.flow import Scratch
+from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.lifted import COARSE, FINE, advance_ticks
 from servotwin.hybrid.tables import Tables
@@ -120,7 +120,7 @@ def set_bounds(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory
     p, low, high, slack = loop.parameters, memory.low, memory.high, memory.slack
     count, kind, sign = t.guard_count[place.at[1]], place.at[3], place.sign[0]
     for g in range(count):
-        low[g], high[g], slack[g] = -np.inf, 0.0, 1.0
+        low[g], high[g], slack[g] = -np.inf, 0.0, LINGERING
     if loop.dead_zone:
         if place.at[2] == 0:
             low[count], high[count] = -p.leave, p.leave

@@ -86,6 +86,7 @@ def _clear(row: Array) -> None:
 def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
     """Fill the tick's map; the rows of the error and of the voltage wanted remain in `change` and `sizes`."""
     p, n, m = loop.parameters, places.states, memory.tick_map
+    acting = active or p.acting_inside > 0.5
     error, wanted = memory.change, memory.sizes
     _clear(error)
     _clear(wanted)
@@ -96,7 +97,7 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
         error[places.filtered] -= 1.0 - p.loop_step
         m[places.filtered * n + places.position] = p.loop_step
         m[places.filtered * n + places.filtered] = -p.loop_step
-    if active:
+    if acting:
         for i in range(n):
             wanted[i] = (p.Kp + p.derivative_gain) * error[i]
         wanted[places.integral] += 1.0
@@ -115,6 +116,8 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
         for i in range(n):
             new = m[last * n + i] + (1.0 if i == last else 0.0)
             m[places.integral * n + i] += p.integral_step * error[i] + p.tracking_step * (new - wanted[i])
+    if acting:
+        for i in range(n):
             m[places.derivative * n + i] += p.filter_step * error[i]
     m[places.derivative * n + places.derivative] -= p.filter_step
     if places.delay > 0:

@@ -63,6 +63,8 @@ class Simulation:
         V, added to the voltage behind the controller and its limits.
     friction : float
         N m, Coulomb's on the motor's shaft, which sticks and slips; needs a rigid screw.
+    delay : int
+        Samples of a sampled controller from a measurement to the voltage that it gives.
     keep : int, optional
         Number of samples to store, at least one; needs a sampled controller. None: all samples, and the events.
 
@@ -87,6 +89,7 @@ class Simulation:
         input_bias: float = 0.0,
         friction: float = 0.0,
         keep: int | None = None,
+        delay: int = 0,
     ) -> None:
         _check_times(duration, sample_rate)
         _check_disturbances(input_bias, friction)
@@ -105,11 +108,15 @@ class Simulation:
         self.keep = keep
         self._check_keep()
         self.engine: Engine
+        if delay < 0 or (delay > 0 and self.controller.sample_rate is None):
+            raise InvalidInput(f"delay = {delay!r} samples: must be 0 or more, and 0 for a continuous controller")
         if self.controller.sample_rate is None:
             source = None if noise is None else noise.source(sample_rate, rng)
             self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0, noise=source)
         else:
-            self.engine = SampledEngine(servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng, keep)
+            self.engine = SampledEngine(
+                servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng, keep, delay
+            )
 
     @property
     def index(self) -> int:

@@ -74,6 +74,7 @@ def take_tick(
         parameters.tracking_step,
         parameters.feedforward,
         parameters.release_step,
+        parameters.acting_inside,
     )
     state = tick(now, state, tick_inputs.reference[k], y)
     if port.delayed.size == 0:

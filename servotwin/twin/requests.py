@@ -161,7 +161,9 @@ def _extent(window: WindowMessage) -> tuple[float, float]:
 
 
 def _slack(setting: Setting | None) -> float:
-    """Sum of both thresholds of the dead zone, m; NaN: not known."""
+    """Sum of both thresholds of the dead zone in which the loop opens, m; NaN: not known."""
     if setting is None or setting.gains is None:
         return math.nan
+    if setting.gains.integral_only:
+        return 0.0
     return (setting.gains.enter + setting.gains.leave) * setting.tolerance

@@ -119,5 +119,5 @@ def _upgraded(old: dict[str, Any]) -> dict[str, Any]:
 
 def _setting(old: dict[str, Any]) -> dict[str, Any]:
     law = old["controller"]
-    gains = None if law is None else {name: law[name] for name in Gains.__struct_fields__}
+    gains = None if law is None else {name: law[name] for name in Gains.__struct_fields__ if name in law}
     return {"tolerance": old["tolerance"], "gains": gains}

@@ -75,6 +75,41 @@ def test_inside_the_dead_zone_e16_holds() -> None:
     assert again.voltage == pytest.approx(PAPER.Kp * -2e-3 + before.integral + kick, rel=1e-12)
 
 
+def test_a_dead_zone_that_stops_the_integral_only() -> None:
+    """Inside, the law is the one without integral action plus the integral as it was; outside it is the plain one."""
+    errors = [2e-3] * 100 + [0.9e-3] * 400 + [-0.2e-3] * 300 + [-1.5e-3] * 200
+    law, plain = PAPER.replace(integral_only=True).law(1e-3), PAPER.law(None)
+    states = run(law, errors)
+    stopped = states[99].integral
+    assert {state.integral for state in states[100:800]} == {stopped}
+    held = run(PAPER.replace(Ki=0.0).law(None), errors)
+    inside = [state.voltage for state in states[100:800]]
+    assert inside == pytest.approx([state.voltage + stopped for state in held[100:800]], rel=1e-12)
+    assert states[:100] == run(plain, errors[:100])
+    assert states[800:] == run(plain, errors[800:], states[799])
+
+
+def test_outside_its_dead_zone_either_law_is_the_same() -> None:
+    errors = [2e-3, -3e-3, 5e-3] * 20
+    assert run(LIMITED.replace(integral_only=True).law(1e-3), errors) == run(LIMITED.law(1e-3), errors)
+
+
+@given(integral=st.floats(-5.0, 5.0), change=st.floats(-5.0, 5.0), error=st.floats(-3e-3, 3e-3))
+def test_a_new_feedforward_takes_over_what_the_integral_supplied(integral: float, change: float, error: float) -> None:
+    """The voltage does not jump, and what the feedforward supplies from now on the integral gives up for good."""
+    old = PAPER.replace(Ki=200.0, integral_only=True, feedforward=0.1)
+    new = old.replace(feedforward=0.1 + change)
+    state = start(0.0)._replace(integral=integral)
+    moved = transfer(old.law(1e-3), new.law(1e-3), state, error, 0.0)
+    before, after = (tick(law.law(1e-3), s, error, 0.0) for law, s in ((old, state), (new, moved)))
+    assert after.voltage == pytest.approx(before.voltage, abs=1e-9)
+    assert abs(moved.integral) <= abs(integral)
+    assert moved.integral * integral >= 0.0
+    if change * integral > 0.0 and abs(change) < abs(integral):
+        assert abs(moved.offset) < 1e-12
+        assert moved.integral + new.feedforward == pytest.approx(integral + old.feedforward, abs=1e-12)
+
+
 def test_the_boundary_belongs_to_the_dead_zone() -> None:
     law = PAPER.law(1e-3)
     assert run(law, [1e-3])[0].active == 0.0
@@ -224,12 +259,15 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
     return reference, lag + rng.normal(0.0, 3e-4, samples)
 
 
+STOPPED = LIMITED.replace(integral_only=True, Ki=300.0, voltage_limit=1.0, rate_limit=150.0)
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "controller", [PAPER, LIMITED, BIASED], ids=["paper", "limits, hysteresis, filter", "offset, feedforward"]
+    "controller",
+    [PAPER, LIMITED, BIASED, STOPPED],
+    ids=["paper", "limits, hysteresis, filter", "offset, feedforward", "integral only"],
 )
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
     law, samples = controller.law(1e-3), 1_000_000

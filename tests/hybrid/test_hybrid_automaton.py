@@ -245,3 +245,22 @@ def test_a_guard_that_is_zero_to_within_rounding_is_passed_in_whole_blocks() -> 
     run.advance(128 * 100)
     assert not run.events()
     assert run.record.size[0] < 200
+
+
+@pytest.mark.parametrize("half", np.linspace(0.5, 0.6, 8))
+def test_a_drift_below_the_last_digit_does_not_stand_still_at_the_bound_of_rounding(half: float) -> None:
+    """A motor that creeps onto its flank: within one step it does not move, and no block passed it either."""
+    flow = np.zeros((5, 5))
+    flow[0, 3], flow[0, 4] = 1.0, -1.0  # the rate is what is left of two large terms: it may be rounding
+    creeping = Mode(flow, (Guard(np.array([1.0, -1.0, -1.0, 0.0, 0.0]), 1, None, "touch"),))
+    screw, step, drive, drift = 5.4, 1e-3, 4.0, 4e-16
+    # Just below the bound, so that the next step would be beyond it.
+    rounding = 1e-13 * 2.0 * (screw + half + step * drive)
+    start = np.array([screw + half + rounding, screw, half, drive + drift / step, drive])
+    while start[0] - screw - half >= rounding:
+        start[0] = np.nextafter(start[0], 0.0)
+    assert start[0] + drift == start[0]
+    run = Trajectory(Automaton((creeping, Mode(np.zeros((5, 5)))), ("a", "b", "c", "drive", "load")), start, 0, step)
+    run.advance(128 * 100)
+    assert [event[1] for event in run.events()] == ["touch"]
+    assert run.record.size[0] < 400

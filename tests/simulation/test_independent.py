@@ -127,6 +127,28 @@ def test_the_presets_against_exponentials(preset: str) -> None:
     assert len(events) == np.count_nonzero(run.events.state_triggered) > 50
 
 
+@pytest.mark.slow
+def test_a_dead_zone_that_stops_the_integral_only_against_exponentials() -> None:
+    """Weak integral action, which the dead zone stops; the rest of the law acts on inside."""
+    compared = 0
+    for seed in range(40, 60):
+        drawn = random_case(seed)
+        own = drawn.servo.controller
+        law = own.replace(Ki=0.1 * own.Ki, integral_only=True)
+        case = replace(drawn, servo=drawn.servo.replace(controller=law))
+        if not case.tolerance or sensitivity(case) > SENSITIVE:
+            continue
+        (expected, events), run = by_exponentials(case), ours(case)
+        assert np.abs(run.position - expected(TIMES)).max() < 1e-8 * case.amplitude, seed
+        found = run.events[run.events.state_triggered]
+        assert [label for _, label in events] == list(found.kind), seed
+        assert np.abs(found.time - [time for time, _ in events]).max() < 1e-7, seed
+        compared += 1
+        if compared == 4:
+            return
+    raise AssertionError(f"only {compared} cases could be compared")
+
+
 def elastic_case(seed: int) -> Case:
     case = random_case(seed)
     return replace(case, servo=case.servo.replace(k_d=10.0 ** np.random.default_rng(seed).uniform(5.0, 6.5)))

@@ -54,6 +54,7 @@ def options_of(rate: float | None, **changes: object) -> dict:
     filters=st.tuples(*[st.sampled_from([None, 20.0])] * 2),
     friction=st.sampled_from([0.0, 0.003]),
     noisy=st.booleans(),
+    integral_only=st.booleans(),
 )
 def test_the_voltage_does_not_jump(
     at: int,
@@ -65,6 +66,7 @@ def test_the_voltage_does_not_jump(
     filters: tuple[float | None, float | None],
     friction: float,
     noisy: bool,
+    integral_only: bool,
 ) -> None:
     """Against the same run without the change, at the sample of the change: the inputs are identical there."""
     options = options_of(rate, friction=friction, noise=Noise(std=1e-5) if noisy else None)
@@ -76,6 +78,7 @@ def test_the_voltage_does_not_jump(
         Tf=factors[2] * OLD.Tf,
         leave=1.0 + factors[3],
         feedforward=feedforward,
+        integral_only=integral_only,
         sample_rate=rate,
         loop_filter_hz=filters[0] if rate else filters[1],
     )

@@ -30,6 +30,7 @@ STARTS = {
     "Since": (0, ua.VariantType.UInt64),
     "NewVersion": (0, ua.VariantType.Int64),
     "SetGains": (False, ua.VariantType.Boolean),
+    "IntegralOnly": (False, ua.VariantType.Boolean),
     "Commit": (0, ua.VariantType.UInt32),
     "Committed": (0, ua.VariantType.UInt32),
     "Refused": ("", ua.VariantType.String),
@@ -60,11 +61,12 @@ class Machine:
     async def offer(self, server: Server) -> None:
         place = await server.register_namespace(model.NAMESPACE)
         drive = await server.nodes.objects.add_object(place, self.options.get("node", model.OBJECT))
-        for name in model.EVERY:
+        every = (*model.EVERY, *([model.INTEGRAL_ONLY] if self.options.get("integral_only", True) else []))
+        for name in every:
             value, kind = STARTS.get(name, (0.0, ua.VariantType.Double))
             start = self.rings[0].tolist() if name in model.SIGNALS else value
             self.variables[name] = await drive.add_variable(place, name, start, kind)
-            if name in model.PARAMETERS or name == model.COMMIT:
+            if name in (*model.PARAMETERS, model.COMMIT, model.INTEGRAL_ONLY):
                 await self.variables[name].set_writable()
         await self.set("Rate", 5000.0)
         await self.set("Block", self.plant.block)
@@ -90,6 +92,8 @@ class Machine:
             return
         self.committed = commit
         version, tolerance, with_gains, *gains = [await self.variables[name].read_value() for name in model.PARAMETERS]
+        if model.INTEGRAL_ONLY in self.variables:
+            gains.append(await self.variables[model.INTEGRAL_ONLY].read_value())
         refused = ""
         try:
             self.plant.write(version, tolerance, Gains(*gains) if with_gains else None)

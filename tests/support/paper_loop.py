@@ -118,13 +118,14 @@ class Loop:
     def _law(self, A: Array, a: Array, zone: int) -> None:
         s, law = self.case.servo, self.case.servo.controller
         A[self.filtered, self.filtered] = -1.0 / law.Tf
-        if zone:
+        if zone or law.integral_only:
             direct = law.Kp + law.Kd / law.Tf
             A[CURRENT, self.last], a[CURRENT] = -direct / s.L, direct / s.L
             A[CURRENT, self.integral] = 1.0 / s.L
             A[CURRENT, self.filtered] = -law.Kd / law.Tf / s.L
-            A[self.integral, self.last], a[self.integral] = -law.Ki, law.Ki
             A[self.filtered, self.last], a[self.filtered] = -1.0 / law.Tf, 1.0 / law.Tf
+        if zone:
+            A[self.integral, self.last], a[self.integral] = -law.Ki, law.Ki
 
 
 def zone_of(case: Case, error: float) -> int:

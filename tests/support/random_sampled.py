@@ -119,7 +119,9 @@ def random_case(seed: int) -> SampledCase:
         0.05 * servo.k_T / servo.R if chance(0.2) and servo.rigid else 0.0,
     )
     delay = int(rng.choice([0, 0, 1, 2, 3]))
-    return SampledCase(servo, law, inputs, rng.uniform(-0.05, 0.05), int(duration * rate / every) + 1, delay)
+    theta_d0 = rng.uniform(-0.05, 0.05)
+    law = law.replace(integral_only=chance(0.4))
+    return SampledCase(servo, law, inputs, theta_d0, int(duration * rate / every) + 1, delay)
 
 
 def largest_difference(case: SampledCase, one: Any, other: Any) -> float:

@@ -47,8 +47,10 @@ class MapOptions:
             An option is outside its range, or the two kinds of axes are mixed.
         """
         servo = Servo.resolve(self.servo)
-        changes = {key: value for key, value in (("enter", self.enter), ("leave", self.leave)) if value is not None}
-        law = servo.controller.replace(sample_rate=None, rate_limit=None, **changes)
+        own = servo.controller
+        enter = own.enter if self.enter is None else self.enter
+        leave = own.leave if self.leave is None else self.leave
+        law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)
         axes = self._axes()
         _check_drawable(axes.shape)
         return MapSettings(

@@ -87,10 +87,14 @@ class OpcUaDrive:
     def write(self, parameters: Parameters) -> None:
         """Write all, commit, and wait for the drive's decision."""
         session = self._connected
-        before, committed = session.read((model.COMMIT, model.DECISION[0]))
         gains = parameters.setting.gains or Gains(0.0, 0.0, 0.0, 1.0)
+        if gains.integral_only and not session.has(model.INTEGRAL_ONLY):
+            raise DriveRefused(f"drive {self._settings.url}: has no variable {model.INTEGRAL_ONLY}")
+        before, committed = session.read((model.COMMIT, model.DECISION[0]))
         values = (parameters.version, parameters.setting.tolerance, parameters.setting.gains is not None)
-        session.write(dict(zip(model.PARAMETERS, (*values, *msgspec.structs.astuple(gains)), strict=True)))
+        *numbers, integral_only = msgspec.structs.astuple(gains)
+        written = dict(zip(model.PARAMETERS, (*values, *numbers), strict=True))
+        session.write(written | ({model.INTEGRAL_ONLY: integral_only} if session.has(model.INTEGRAL_ONLY) else {}))
         commit = (max(before, committed) + 1) % 2**32
         session.write({model.COMMIT: commit})
         self._wait_for(session, commit)

@@ -25,6 +25,9 @@ GAINS = ("Kp", "Ki", "Kd", "Tf", "Enter", "Leave", "Feedforward")
 PARAMETERS = ("NewVersion", "Tolerance", "SetGains", *GAINS)
 """Int64; Double, m; Boolean, whether the gains count too; the gains."""
 
+INTEGRAL_ONLY = "IntegralOnly"
+"""Boolean, whether the dead zone stops the integral only; a drive that lacks it cannot do that."""
+
 COMMIT = "Commit"
 """UInt32, another number each time."""
 

@@ -48,11 +48,12 @@ class OpcUaSession:
         try:
             from asyncua import ua
             from asyncua.client.client import Client
-            from asyncua.ua.uaerrors import UaError
+            from asyncua.ua.uaerrors import BadNoMatch, UaError
         except ModuleNotFoundError:
             raise missing_extra("asyncua", "drive kind opcua") from None
         self._ua, self._settings = ua, settings
         self._failures = (OSError, TimeoutError, NoAnswer, asyncio.CancelledError, UaError, ValueError)
+        self._missing = (BadNoMatch,)
         self._client = Client(settings.url, timeout=settings.silence_s)
         self._nodes: dict[str, Any] = {}
         self._types: dict[str, Any] = {}
@@ -84,6 +85,10 @@ class OpcUaSession:
             if not status.is_good():
                 raise DriveRefused(f"OPC UA variable {name} = {values[name]!r}: {status.name}")
 
+    def has(self, name: str) -> bool:
+        """True where the drive has a variable that not every drive has."""
+        return name in self._nodes
+
     def close(self) -> None:
         """End the session, the thread and its loop."""
         if self._loop.is_closed():
@@ -111,7 +116,9 @@ class OpcUaSession:
         place = await client.get_namespace_index(model.NAMESPACE)
         drive = await client.nodes.objects.get_child(f"{place}:{s.node}")
         self._nodes = {name: await drive.get_child(f"{place}:{name}") for name in model.EVERY}
-        for name in (*model.PARAMETERS, model.COMMIT):
+        with suppress(*self._missing):
+            self._nodes[model.INTEGRAL_ONLY] = await drive.get_child(f"{place}:{model.INTEGRAL_ONLY}")
+        for name in filter(self.has, (*model.PARAMETERS, model.COMMIT, model.INTEGRAL_ONLY)):
             self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
 
     def _typed(self, name: str, value: Any) -> Any:

@@ -12,7 +12,6 @@ from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.plants import SupervisedPlant
 from servotwin.drives.simulated.server import OnSample, ignore_sample
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
 
 _TRANSFER_S = 5.0
 """Longest time that a client may take to send the rest of a request or to receive a reply."""
@@ -102,7 +101,7 @@ class SuperviseServer:
         """Write parameters or begin a move, or reply with the reason of the refusal."""
         try:
             if request.kind == wire.WRITE:
-                gains = Gains(*request.gains) if request.with_gains else None
+                gains = wire.gains_of(request.gains) if request.with_gains else None
                 self._plant.write(request.number, request.tolerance, gains)
             elif request.kind == wire.MOVE:
                 self._plant.move(request.tolerance)

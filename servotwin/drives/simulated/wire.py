@@ -10,16 +10,19 @@ import socket
 import struct
 from typing import NamedTuple
 
-from servotwin.errors import InvalidInput
+from msgspec import convert
 
-MAGIC, VERSION = b"STDR", 1
+from servotwin.errors import InvalidInput
+from servotwin.messages import Gains
+
+MAGIC, VERSION = b"STDR", 2
 CONTROL, SUPERVISE = 1, 2
 ROLES = {"control": CONTROL, "supervise": SUPERVISE}
 HELLO = struct.Struct("<4sHBx")  # magic, version, role
 WELCOME = struct.Struct("<4sHB x8sd")  # magic, version, role; the machine's run, rate in Hz
 SAMPLE = struct.Struct("<qdddd")  # number, reference, theta_m, position, lag in s
 VOLTAGE = struct.Struct("<d")  # V; where it is not finite the last one holds
-REQUEST = struct.Struct("<BB2xIq8d")  # kind, with gains, most; number or version; tolerance or offset, gains
+REQUEST = struct.Struct("<BB2xIq9d")  # kind, with gains, most; number or version; tolerance or offset, gains
 REPLY = struct.Struct("<B3xIqqd")  # kind, count; first, version, lag in s
 READ, WRITE, MOVE = 1, 2, 3
 DONE, REFUSED, OVER = 0, 1, 2
@@ -41,6 +44,13 @@ class Address(NamedTuple):
 
     def __str__(self) -> str:
         return f"unix:{self.path}" if self.path is not None else f"{self.host}:{self.port}"
+
+
+def gains_of(numbers: tuple[float, ...]) -> Gains:
+    """Gains of the numbers of a request, which are doubles all of them."""
+    *floats, integral_only = numbers
+    named = dict(zip(Gains.__struct_fields__, floats, strict=False))
+    return convert({**named, "integral_only": integral_only > 0.5}, Gains)
 
 
 def parse_address(text: str) -> Address:

@@ -260,7 +260,8 @@ def _in_force(setting: Design, evidence: Evidence, small: float) -> bool:
     now, new = evidence.gains, setting.controller
     if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > small:
         return False
-    gains = ((getattr(now, name), getattr(new, name)) for name in ("Kp", "Ki", "Kd", "Tf", "enter", "leave"))
+    names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only")
+    gains = ((getattr(now, name), getattr(new, name)) for name in names)
     pairs = (*gains, (evidence.setting.tolerance, setting.tolerance))
     return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
 
