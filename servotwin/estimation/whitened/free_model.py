@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from servotwin.estimation.core.contacts import travel
-from servotwin.estimation.core.least_squares import least_squares, orthonormal, project_out
+from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
@@ -77,16 +77,24 @@ class FreeFit:
         Logarithms of `FACTORS` over the model's.
     cost : float
         Squared length of the whitened residual, prior included.
-    covariance : (6, 6) array
-        Of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal of what is not known.
+    rows : (6, M) array
+        Derivatives of the motion by gap (rad), place and factors, nuisances out.
+    movable : (6,) array of bool
+        Those that were free.
     evaluations : int
     """
 
     point: Point
     factors: Array
     cost: float
-    covariance: Array
+    rows: Array
+    movable: Flags
     evaluations: int
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(6, 6) of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal: not known."""
+        return _covariance(self.rows, self.movable)
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
@@ -177,7 +185,7 @@ class FreeProblem:
                     break
             else:
                 damping *= 10.0
-        return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, _covariance(rows, movable), count)
+        return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, rows, movable, count)
 
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
@@ -235,7 +243,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     variance = max(1.0, believed.cost / max(1, misfit.position.size))
     wide, allowed = problem.largest, BELIEVED * variance
     places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
-    order = np.argsort([misfit.cost(Point(wide, place)) for place in places], kind="stable")
+    order = np.argsort(misfit.costs([Point(wide, place) for place in places]), kind="stable")
     within = (believed.cost + _ENOUGH * allowed, believed.cost + _HOPELESS * allowed)
     fits = []
     for index in order[:_STARTS]:
@@ -279,7 +287,7 @@ def _step(residual: Array, rows: Array, movable: Array, q: Array, low: Array, hi
     return step
 
 
-def _covariance(rows: Array, movable: Array) -> Array:
+def _covariance(rows: Array, movable: Flags) -> Array:
     size = np.linalg.norm(rows, axis=1)
     use = np.flatnonzero(movable & (size > 0.0))
     covariance = np.zeros((rows.shape[0], rows.shape[0]))

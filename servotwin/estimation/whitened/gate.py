@@ -138,9 +138,8 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
     """
     model, reduction = result.reduction.reduced, result.reduction
     screw = reduction.traced(result.point)
-    table = reduction.tabulated(screw)
+    table, weights = result.table, result.shares[1 : len(reduction.fixed())]
     answer = reduction.position - table[RESIDUAL]
-    weights = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients[1 : len(reduction.fixed())]
     moved = motions(model, _neighbours(servo, model), screw[:1], answer, weights)
     free = np.insert(moved, 2, answer, axis=0)
     sizes = list(_TOLERANCES.values())
@@ -200,9 +199,8 @@ def observer_shift(result: WhitenedFit, servo: Servo) -> tuple[float, float]:
     interval = reduction.response.interval * reduction.decimation.factor
     model = observer(servo, _ALPHA)
     weight = LagFilter.sampled(model.denominator, model.order, _ALPHA, interval)
-    table = reduction.table(result.point)
-    rows = np.array([weight.respond(row) for row in table])
-    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, interval, table.shape[1])]))
+    rows = np.array([weight.respond(row) for row in result.table])
+    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, interval, rows.shape[1])]))
     left = project_out(basis, rows[[RESIDUAL, GAP]])
     information = float(left[1] @ left[1])
     if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
@@ -335,8 +333,8 @@ def _growing(result: WhitenedFit) -> str:
     reduction = result.reduction
     if reduction.growth is None:
         return ""
-    left = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients[len(reduction.fixed())]
-    rate, assumed = reduction.rate + float(left), _SIGMAS * reduction.growth.std
+    left = float(result.shares[len(reduction.fixed())])
+    rate, assumed = reduction.rate + left, _SIGMAS * reduction.growth.std
     if abs(rate) <= assumed:
         return ""
     per_s = 1.0 / reduction.response.interval

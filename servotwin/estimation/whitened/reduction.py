@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_RATE, Gap, polygon, trace
+from servotwin.estimation.core.contacts import BY_RATE, Gap, polygon
 from servotwin.estimation.core.decimation import Decimation, decimation
-from servotwin.estimation.core.least_squares import least_squares, orthonormal, remove
+from servotwin.estimation.core.least_squares import least_squares, orthonormal
 from servotwin.estimation.core.reduced import ReducedResponse, reduced_response
 from servotwin.estimation.core.response import Response
 from servotwin.estimation.core.whitening import Autoregression
-from servotwin.hybrid.compiled import bare
+from servotwin.estimation.whitened.descent import MisfitData, Room, evaluate_all, mix_places
 from servotwin.plant.signals import Array
 
 
@@ -66,40 +67,34 @@ class Misfit:
     extra: int = 0
     rate: float = 0.0
 
-    def respond(self, screw: Array) -> Array:
-        """(k, m) responses to angles (k, n) at the full rate, whitened."""
-        rows = self.reduced.respond(screw)
-        rows = rows if self.noise is None else self.noise.whiten(rows)
-        return np.hstack([rows, np.zeros((len(rows), self.extra))]) if self.extra else rows
+    @cached_property
+    def data(self) -> MisfitData:
+        """The same for compiled functions."""
+        readout, blocks = self.reduced.response.position, self.reduced.position
+        noise = self.noise or Autoregression.white(1.0)
+        return MisfitData(
+            self.theta_m,
+            self.position,
+            self.basis,
+            self.reduced.response.decay,
+            readout.gain,
+            readout.direct,
+            *(3 * (np.empty((0, 0)),) if blocks is None else (blocks.angles, blocks.decay, blocks.gain)),
+            noise.predictors,
+            noise.spread,
+            self.rate,
+        )
 
-    def cost(self, point: Point) -> float:
-        """Squared length of the residual."""
-        screw = np.empty((1, self.theta_m.size))
-        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
-        row = self.position - self.respond(screw)[0]
-        remove(self.basis, len(self.basis), row)
-        return float(row @ row)
+    @cached_property
+    def room(self) -> Room:
+        """Memory of its evaluations."""
+        return Room.of(self.data, self.position.size - self.extra)
 
-    def slopes(self, point: Point) -> MisfitSlopes:
-        """Residual and derivatives at a point."""
-        screw = np.empty((4, self.theta_m.size))
-        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
-        mix_places(screw, point.gap, point.place)
-        rows = self.respond(screw[:3])
-        rows[0] -= self.position
-        for row in rows:
-            remove(self.basis, len(self.basis), row)
-        np.negative(rows, out=rows)
-        return MisfitSlopes(rows[0], rows[1:], float(rows[0] @ rows[0]))
-
-
-@bare
-def mix_places(seen: Array, gap: float, place: float) -> None:
-    """Turn derivatives by gap at fixed theta_d0, and by theta_d0, into those by gap at fixed place, and by place."""
-    half = 0.5 * gap
-    for i in range(seen.shape[1]):
-        seen[1, i] += 0.5 * place * seen[2, i]
-        seen[2, i] *= half
+    def costs(self, points: Sequence[Point]) -> Array:
+        """(k,) squared lengths of the residual at points."""
+        costs = np.empty(len(points))
+        evaluate_all(self.data, self.room, np.array(points, dtype=float), costs)
+        return costs
 
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
@@ -228,7 +223,7 @@ class Reduction:
         basis = orthonormal(rows[1:])
         return Misfit(self.theta_m, rows[0], basis, self.reduced, noise, extra, self.rate)
 
-    def growing(self, noise: Autoregression, point: Point) -> Reduction:
+    def growing(self, noise: Autoregression, table: Array) -> Reduction:
         """Follow the screw at the rate of growth that a point and a noise make likely.
 
         The rate is linear only as long as no contact comes or goes with it: a motor that holds still in contact holds
@@ -236,7 +231,7 @@ class Reduction:
         """
         if self.growth is None:
             return self
-        rows = self.prepared(noise, self.table(point), CONSTANT)
+        rows = self.prepared(noise, table, CONSTANT)
         shares = least_squares(rows[GAP:], rows[RESIDUAL]).coefficients[CONSTANT - GAP :]
         most = _MOST_GROWTH * self.growth.std
         return replace(self, rate=min(max(self.rate + float(shares[len(self.fixed())]), -most), most))
