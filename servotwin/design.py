@@ -84,9 +84,9 @@ def stability_map(
     members: int = 16,
     motion: float = 1.0,
     seed: int = 0,
-    duration: float = 120.0,
-    window: float = 40.0,
-    still: float = 1e-6,
+    duration: float | None = None,
+    window: float | None = None,
+    still: float | None = None,
     threads: int | None = None,
 ) -> StabilityMap:
     """Simulate every cell of a grid from many initial states and measure which of them settle.
@@ -108,9 +108,9 @@ def stability_map(
         Initial states in each cell.
     motion, seed : float, int
         Extent of the motion that half of them start in; seed of the initial states.
-    duration, window, still : float
+    duration, window, still : float, optional
         Length of every run, s; end of it in which the position must rest, s; half the peak-to-peak below which it
-        rests, m.
+        rests, m. By default those of `MapSettings`, in the servo's own units.
     threads : int, optional
 
     Returns

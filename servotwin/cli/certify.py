@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -22,6 +25,8 @@ from servotwin.redesign.registry import certified_policy
 from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
 
+GridOf: TypeAlias = Callable[[CertifiedPolicy], Grid]
+
 
 @dataclass(frozen=True)
 class _TableJob:
@@ -36,7 +41,7 @@ def certify(
     file: Path,
     model: str | None = None,
     out: Path | None = None,
-    grid: Grid | None = None,
+    grid: Grid | GridOf | None = None,
     console: Console | None = None,
 ) -> tuple[CertifiedTable, ...]:
     """Verify the tables that a twin's file or a scenario names, or continue an interrupted verification.
@@ -48,7 +53,8 @@ def certify(
         Only this model of a twin's file; None: all that have a key `table`.
     out : Path, optional
         File of the table of one model; None: the one that `table` names.
-    grid : Grid, optional
+    grid : Grid or callable, optional
+        For all models, or CertifiedPolicy -> Grid; `Grid.of` by default.
     console : Console, optional
         Where progress and summary are shown.
 
@@ -61,19 +67,25 @@ def certify(
         Its message says how many cells are finished and how to continue.
     """
     console = console or Console()
-    return tuple(_verify(job, grid or Grid(), console) for job in _jobs(file, model, out))
+    grid_for = grid or Grid.of
+    return tuple(
+        _verify(job, grid_for if isinstance(grid_for, Grid) else grid_for(job.policy), console)
+        for job in _jobs(file, model, out)
+    )
 
 
-def grid_of(finest_deg: float, bias_mv: str, noise_um: str) -> Grid:
-    """The grid of the command's options.
+def grid_of(finest_deg: float | None, bias_mv: str | None, noise_um: str | None) -> GridOf:
+    """The grid of the command's options, for any model; None: the default.
 
     Raises
     ------
     InvalidInput
         An option is no number, or they make no grid.
     """
-    biases, noises = _numbers("--bias-mv", bias_mv, 1e-3), _numbers("--noise-um", noise_um, 1e-6)
-    return Grid(math.radians(finest_deg), biases, noises)
+    finest = None if finest_deg is None else math.radians(finest_deg)
+    biases = None if bias_mv is None else _numbers("--bias-mv", bias_mv, 1e-3)
+    noises = None if noise_um is None else _numbers("--noise-um", noise_um, 1e-6)
+    return partial(Grid.of, finest=finest, biases=biases, noises=noises)
 
 
 def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:

@@ -74,9 +74,24 @@ def map_(
     members: Annotated[int, typer.Option(help="Initial states in each cell.")] = 16,
     motion: Annotated[float, typer.Option(help="Extent of the motion in which half of them start.")] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
-    duration: Annotated[float, typer.Option(help="Length of every run, s.")] = 120.0,
-    window: Annotated[float, typer.Option(help="Last part of a run, in which it must rest, s.")] = 40.0,
-    still_um: Annotated[float, typer.Option(help="Rest: half the peak-to-peak is below this, um.")] = 1.0,
+    duration: Annotated[
+        float | None,
+        typer.Option(help="Length of every run, s; 120 of the servo's own by default.", show_default=False),
+    ] = None,
+    window: Annotated[
+        float | None,
+        typer.Option(
+            help="Last part of a run, in which it must rest, s; 40 of the servo's own by default.", show_default=False
+        ),
+    ] = None,
+    still_um: Annotated[
+        float | None,
+        typer.Option(
+            help="Rest: half the peak-to-peak is below this, um; by default 1 on the preset paper with a gap of 10 "
+            "deg, and as much of another screw and gap.",
+            show_default=False,
+        ),
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work: tcp://host:8786.")
@@ -112,11 +127,25 @@ def certify(
     out: Annotated[
         Path | None, typer.Option(help="File of the table; the one that the key `table` names by default.")
     ] = None,
-    finest_deg: Annotated[float, typer.Option(help="Width of the narrowest cells of gaps.")] = 4.0,
+    finest_deg: Annotated[
+        float | None, typer.Option(help="Width of the narrowest cells of gaps; 4 by default.", show_default=False)
+    ] = None,
     bias_mv: Annotated[
-        str, typer.Option(help="Largest input bias beside the feedforward: VALUE,VALUE,...")
-    ] = "1,10,50",
-    noise_um: Annotated[str, typer.Option(help="Noise for which settings are ranked, rms: VALUE,...")] = "0,10",
+        str | None,
+        typer.Option(
+            help="Largest input bias beside the feedforward: VALUE,VALUE,...; 1,10,50 in the servo's own volts by "
+            "default.",
+            show_default=False,
+        ),
+    ] = None,
+    noise_um: Annotated[
+        str | None,
+        typer.Option(
+            help="Noise for which settings are ranked, rms: VALUE,...; none and a tenth of the smallest stated step by "
+            "default.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Verify settings beforehand, for twins that look them up; an interrupted run continues where it stopped."""
     from servotwin.cli.certify import certify as run

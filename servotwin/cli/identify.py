@@ -19,11 +19,12 @@ from servotwin.estimation.passage import Passage
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import Wear, estimator_of
 from servotwin.twin.settings import TwinSettings
 
-WINDOW = 1.0  # s
+WINDOW = 1.0  # s of the servo's own
 _ROUNDING = 1e-6  # of a sample
 
 
@@ -75,10 +76,9 @@ def identify(options: IdentifyOptions) -> Identification:
     InvalidInput
         The log, the servo or an option is not valid, or no window fits into the log.
     """
-    settings = _settings(options)
-    log = read_log(options.log)
+    log, stated = read_log(options.log), _settings(options)
     servo = _servo(options, log)
-    windows = cut(log, options)
+    settings, windows = stated.on(servo), cut(log, options, servo)
     estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap)
     estimates = []
     for window in windows:
@@ -90,7 +90,7 @@ def identify(options: IdentifyOptions) -> Identification:
     return Identification(servo, windows, tuple(estimates), trend, until)
 
 
-def cut(log: Log, options: IdentifyOptions) -> tuple[Window, ...]:
+def cut(log: Log, options: IdentifyOptions, servo: Servo) -> tuple[Window, ...]:
     """Cut the window that the options name, or one after each change of the reference, as an edge does: no overlaps."""
     whole = log.whole
     if options.start is not None or options.duration is not None:
@@ -103,7 +103,7 @@ def cut(log: Log, options: IdentifyOptions) -> tuple[Window, ...]:
         raise InvalidInput(
             f"{whole.where}there is no column 'reference_m' to find the steps in: give --start and --duration"
         )
-    length = _option("window", options.window, log.metadata.get("window_s"), WINDOW)
+    length = _option("window", options.window, log.metadata.get("window_s"), WINDOW * scales(servo).time)
     before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
     if not 0.0 <= before < length:
         raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")

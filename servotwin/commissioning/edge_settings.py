@@ -19,11 +19,13 @@ from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
+from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import shortest_window
 from servotwin.messages import Gains, Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
@@ -34,10 +36,12 @@ from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.runtime.retry import Retry
 from servotwin.twin.settings import TwinSettings
 
+# Seconds here are the servo's own (`plant.scales`).
 PATIENCE = 1.0
-"""Longest time that a change of the dead zone waits for an instant at which it neither opens nor closes the loop, s."""
+"""Longest time that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+_ERROR_FLOORS = 10.0  # to a smallest step
 _MOST_SAMPLES = 1e8  # some 10 GB of signals
 
 # Widens a box so that rounding does not exclude its own corner.
@@ -128,11 +132,28 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     policy = certified_policy(servo, settings)
     verified = policy.fallback()
     gains, band = gains_of(verified.setting.controller), band_of(verified, noise)
-    supervision = Supervision(FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon))
+    fallback = FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon)
+    supervision = supervision_of(servo, settings, fallback)
     sent = policy_of(servo, settings)
     return Guarding(
         supervision, *(_hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else _certified_box(policy))
     )
+
+
+def supervision_of(servo: Servo, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
+    """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on."""
+    usual, period = WatchSettings(), Supervision().period_s
+    second, _, volt = scales(servo)
+    watch = dataclasses.replace(
+        usual,
+        slot_s=usual.slot_s * second,
+        window_s=usual.window_s * second,
+        settling_s=usual.settling_s * second,
+        persist_s=usual.persist_s * second,
+        error_floor=settings.uncertainty.step[0] / _ERROR_FLOORS,
+        effort_floor=usual.effort_floor * volt,
+    )
+    return Supervision(fallback, watch, period * second)
 
 
 def start_of(fallback: FallbackSet) -> Parameters:
@@ -153,7 +174,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
         gain_factor=factor,
         integral_factor=max(demands.integral, default=0.0) * _ROUNDING,
         feedforward=policy.feedforward_limit * _ROUNDING,
-        patience_s=PATIENCE,
+        patience_s=PATIENCE * scales(policy.servo).time,
     )
     return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)
 
@@ -173,7 +194,8 @@ def _range(values: list[float]) -> tuple[float, float]:
 def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
     own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
-    return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=PATIENCE), gains_of(own)
+    patience = PATIENCE * scales(policy.servo).time
+    return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=patience), gains_of(own)
 
 
 @dataclass(frozen=True)
@@ -232,14 +254,39 @@ class Commissioning:
     def window(self) -> float:
         """Length of a window, s."""
         window = self.recording.window
-        return window if window is not None else (CALM_WINDOW if self.calm else WINDOW)
+        if window is not None:
+            return window
+        usual, second = CALM_WINDOW if self.calm else WINDOW, scales(self.servo).time
+        # A fast machine needs short windows only, but the estimator needs some samples.
+        needed = 0.0 if second >= 1.0 else min(usual, self._shortest_window[0])
+        return self._whole(max(usual * second, needed))
+
+    def with_longest(self, window: float, pre_trigger: float) -> Commissioning:
+        """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds."""
+        second = scales(self.servo).time
+        longest = (
+            max(self._whole(window * second), self.window),
+            max(self._whole(pre_trigger * second), self.pre_trigger),
+        )
+        recording = dataclasses.replace(self.recording, longest_window=longest[0], longest_pre_trigger=longest[1])
+        return dataclasses.replace(self, recording=recording)
+
+    def _whole(self, seconds: float) -> float:
+        """A time in whole samples, s."""
+        return round(seconds * self.recording.sample_rate) / self.recording.sample_rate
 
     @property
     def pre_trigger(self) -> float:
         """Part of a window before the change of the reference, s."""
         pre_trigger = self.recording.pre_trigger
-        fits = self.calm and self.window > 2.0 * CALM_PRE_TRIGGER
-        return pre_trigger if pre_trigger is not None else (CALM_PRE_TRIGGER if fits else 0.0)
+        calm = self._whole(CALM_PRE_TRIGGER * scales(self.servo).time)
+        fits = self.calm and self.window > 2.0 * calm
+        return pre_trigger if pre_trigger is not None else (calm if fits else 0.0)
+
+    @property
+    def _shortest_window(self) -> tuple[float, str]:
+        twin = self.twin
+        return shortest_window(twin.method, self.servo, self.recording.sample_rate, twin.estimator)
 
     def check_window(self) -> None:
         """Refuse a window that does not fit into memory or is too short for the estimator.
@@ -251,7 +298,7 @@ class Commissioning:
         """
         rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
         check_samples("window", self.recording.longest_window or self.window, rate)
-        needed, why = shortest_window(self.twin.method, self.recording.sample_rate, self.twin.estimator)
+        needed, why = self._shortest_window
         if self.window < needed * (1.0 - 1e-9):
             raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")
 

@@ -20,9 +20,11 @@ from scipy.special import stdtrit
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
+from servotwin.plant.scales import Scales, scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
+# Seconds and volts are the servo's own (`plant.scales`).
 SHORTEST = 0.1  # s: shortest rest that counts
 _BATCH_S, _GROUPS = 0.025, 8  # s over which samples are averaged; most groups of means that a spread is computed from
 _CREEP = 0.1  # V of back EMF: a slower motor counts as at rest
@@ -85,11 +87,13 @@ def disturbance(window: Window, servo: Servo) -> Disturbance:
     missing = [name for name in ("reference", "voltage", "theta_m") if name not in window.channels]
     if missing:
         return nothing_known(effort, f"the window has no {' and no '.join(missing)}")
-    size = max(1, round(_BATCH_S * window.sample_rate))
-    rests = list(_rests(window, servo, size, _constant(window, size)))
+    units = scales(servo)
+    size, shortest = _sizes(window, units)
+    stretches = _constant(window, size, shortest)
+    rests = list(_rests(window, servo, size, stretches))
     if not rests:
-        return nothing_known(effort, _no_rest(window, size))
-    bias, std, first, last = _longest_good(rests)
+        return nothing_known(effort, _no_rest(bool(stretches), SHORTEST * units.time))
+    bias, std, first, last = _longest_good(rests, _FINE * units.voltage)
     noise = _noise(window.position[first:last], size)
     return Disturbance(bias, std, noise, (last - first) / window.sample_rate, effort)
 
@@ -101,24 +105,30 @@ def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
     """
     if any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
         return math.nan, math.inf
-    size = max(1, round(_BATCH_S * window.sample_rate))
-    ends = {last: first for first, last in reversed(_constant(window, size))}
+    size, least = _sizes(window, scales(servo))
+    ends = {last: first for first, last in reversed(_constant(window, size, least))}
     shortest = [(first, last) for last, first in reversed(ends.items())]
     bias, std, _, _ = next(_rests(window, servo, size, shortest), (math.nan, math.inf, 0, 0))
     return bias, std
 
 
-def _longest_good(rests: list[tuple[float, float, int, int]]) -> tuple[float, float, int, int]:
+def _sizes(window: Window, units: Scales) -> tuple[int, int]:
+    """Samples of a batch, and batches of the shortest rest."""
+    rate = window.sample_rate * units.time
+    size = max(1, round(_BATCH_S * rate))
+    return size, max(4, math.ceil(SHORTEST * rate / size - 1e-9))
+
+
+def _longest_good(rests: list[tuple[float, float, int, int]], fine: float) -> tuple[float, float, int, int]:
     """Select the longest of (bias, std, first, last) with little more than the least spread, which is partly chance."""
-    allowed = max(_NEAR * min(rest[1] for rest in rests), _FINE)
+    allowed = max(_NEAR * min(rest[1] for rest in rests), fine)
     return max((rest for rest in rests if rest[1] <= allowed), key=lambda rest: rest[3] - rest[2])
 
 
-def _constant(window: Window, size: int) -> list[tuple[int, int]]:
+def _constant(window: Window, size: int, shortest: int) -> list[tuple[int, int]]:
     """(first, last) of every stretch of whole batches that ends with a constant reference, and is long enough."""
     assert window.reference is not None
     edges = [0, *(np.flatnonzero(np.diff(window.reference)) + 1), window.reference.size]
-    shortest = max(4, math.ceil(SHORTEST * window.sample_rate / size - 1e-9))
     pairs = pairwise(edges)
     return [(int(b) - k * size, int(b)) for a, b in pairs for k in range(shortest, (b - a) // size + 1)]
 
@@ -157,9 +167,9 @@ def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
 
 def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
     """(bias, std) of the last `count` batches; None where something moves in them."""
-    per_sample = servo.k_B * window.sample_rate
+    per_sample, creep = servo.k_B * window.sample_rate, _CREEP * scales(servo).voltage
     angle, position = batches.angle[-count:], batches.position[-count:]
-    if not (_still(angle, size, per_sample) and _still(position, size, per_sample / servo.p)):
+    if not (_still(angle, size, per_sample / creep) and _still(position, size, per_sample / creep / servo.p)):
         return None
     speed = per_sample * np.diff(batches.ends[-count - 1 :]) / size
     drive = batches.voltage[-count:] - speed
@@ -167,9 +177,9 @@ def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches
     return -float(np.mean(drive)), math.hypot(_spread(drive), wrong)
 
 
-def _still(means: Array, size: int, volts: float) -> bool:
-    """Tell whether a signal rests but for noise; `volts` is the back EMF (V) of one unit per sample."""
-    if volts * float(np.max(np.abs(np.diff(means)))) / size <= _CREEP:
+def _still(means: Array, size: int, steep: float) -> bool:
+    """Tell whether a signal rests but for noise; one unit per sample is `steep` times what counts as rest."""
+    if steep * float(np.max(np.abs(np.diff(means)))) / size <= 1.0:
         return True
     return means.size >= _FEWEST and _roughness(means) >= _SMOOTH
 
@@ -214,7 +224,7 @@ def _means(samples: Array, size: int) -> Array:
     return np.asarray(samples.reshape(-1, size).mean(axis=1))
 
 
-def _no_rest(window: Window, size: int) -> str:
-    if not _constant(window, size):
-        return f"the reference is nowhere constant for {SHORTEST:g} s"
-    return f"motor and position rest nowhere for {SHORTEST:g} s while the reference is constant"
+def _no_rest(constant: bool, shortest: float) -> str:
+    if not constant:
+        return f"the reference is nowhere constant for {shortest:g} s"
+    return f"motor and position rest nowhere for {shortest:g} s while the reference is constant"

@@ -23,12 +23,12 @@ class Method(NamedTuple):
     settings : type
         Class of its settings.
     shortest : callable
-        (settings, sample rate in Hz) -> shortest window (s), and the reason in words.
+        (settings, servo, sample rate in Hz) -> shortest window (s), and the reason in words.
     """
 
     estimate: Callable[..., GapEstimate]
     settings: type
-    shortest: Callable[[Any, float], tuple[float, str]]
+    shortest: Callable[[Any, Servo, float], tuple[float, str]]
 
 
 METHODS: Mapping[str, Method] = {
@@ -87,9 +87,9 @@ def settings_of(method: str, settings: Any = None) -> Any:
     return kind() if settings is None else settings
 
 
-def shortest_window(method: str, sample_rate: float, settings: Any = None) -> tuple[float, str]:
-    """The shortest window (s) that a method accepts at a sample rate (Hz), and why, in words."""
-    return METHODS[method].shortest(settings_of(method, settings), sample_rate)
+def shortest_window(method: str, servo: Servo, sample_rate: float, settings: Any = None) -> tuple[float, str]:
+    """The shortest window (s) of a servo that a method accepts at a sample rate (Hz), and why, in words."""
+    return METHODS[method].shortest(settings_of(method, settings), servo, sample_rate)
 
 
 def _usable_prior(prior: float | GapEstimate | None) -> float | GapEstimate | None:

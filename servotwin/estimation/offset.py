@@ -22,6 +22,7 @@ from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus,
 from servotwin.estimation.whitened.channels import motor_angle
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -112,7 +113,7 @@ def read_offset(
 def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.WhitenedSettings) -> Array:
     """(k, n) residual, its derivatives by gap and constant (per rad of offset), nuisances."""
     model = response(servo, window.sample_rate)
-    angle = motor_angle(window, servo.encoder_resolution, settings)
+    angle = motor_angle(window, servo.encoder_resolution, settings, scales(servo).time)
     first, home = float(angle[0]), float(window.position[0])
     screw = polygon(angle - first, Gap(estimate.gap, estimate.theta_d0 - first))
     rows = model.respond(screw[[SCREW, BY_GAP, BY_START]])

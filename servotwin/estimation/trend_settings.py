@@ -73,6 +73,12 @@ class TrendSettings:
         check(self)
 
     @classmethod
+    def on(cls, second: float) -> TrendSettings:
+        """Defaults for a servo whose own second (`plant.scales`) is so many seconds: a slow machine wears slowly."""
+        rate, walk = math.radians(0.2) / second, math.radians(0.015) / second / math.sqrt(second)
+        return cls(rate_std_rad_per_s=rate, rate_walk_rad_per_s_per_sqrt_s=walk)
+
+    @classmethod
     def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
         """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a rate that may change.
 

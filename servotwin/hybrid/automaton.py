@@ -7,6 +7,7 @@ a power of two scales the whole trajectory bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -106,6 +107,64 @@ class Automaton:
     def index(self, name: str) -> int:
         """Index of the state called `name`."""
         return self.names.index(name)
+
+
+@dataclass(frozen=True, eq=False)
+class AutomatonStack:
+    """Automata of one structure: their states, guards and targets are those of the first; their numbers differ.
+
+    Parameters
+    ----------
+    first : Automaton
+    flows : (A, M, n, n) array
+    rows : (A, M, G, n) array
+        Guards; 0 where a mode has fewer.
+    resets : (A, M, G, n, n) array
+        0 where there is none.
+
+    Raises
+    ------
+    InvalidInput
+        A number is not finite.
+    """
+
+    first: Automaton
+    flows: Array
+    rows: Array
+    resets: Array
+
+    def __post_init__(self) -> None:
+        for what, values in (("flow", self.flows), ("guard", self.rows), ("reset", self.resets)):
+            if not np.isfinite(values).all():
+                raise InvalidInput(f"a {what} of a stack of automata holds a number that is not finite")
+
+    @classmethod
+    def of(cls, automata: Sequence[Automaton]) -> AutomatonStack:
+        """Numbers of automata.
+
+        Raises
+        ------
+        InvalidInput
+            They differ in structure.
+        """
+        structure = _structure(automata[0])
+        if any(_structure(automaton) != structure for automaton in automata[1:]):
+            raise InvalidInput("the automata of an ensemble must have the same states, modes, guards and targets")
+        modes, n = automata[0].modes, len(automata[0].names)
+        most = max(1, *(len(mode.guards) for mode in modes))
+        rows, resets = (np.zeros((len(automata), len(modes), most, *size)) for size in ((n,), (n, n)))
+        for a, automaton in enumerate(automata):
+            for m, mode in enumerate(automaton.modes):
+                for g, guard in enumerate(mode.guards):
+                    rows[a, m, g] = guard.row
+                    if guard.reset is not None:
+                        resets[a, m, g] = guard.reset
+        return cls(automata[0], np.array([automaton.flows for automaton in automata]), rows, resets)
+
+
+def _structure(automaton: Automaton) -> tuple[object, ...]:
+    targets = tuple(tuple((g.target, g.reset is None) for g in mode.guards) for mode in automaton.modes)
+    return automaton.names, targets
 
 
 def speeds(flows: Array) -> tuple[Array, Array]:

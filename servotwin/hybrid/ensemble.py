@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.automaton import Array, Automaton, shared_flows, speeds
-from servotwin.hybrid.build import new_workspace, numbers_of
+from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, shared_flows, speeds
+from servotwin.hybrid.build import new_workspace
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
@@ -97,7 +97,7 @@ def run_ensemble(
 
 
 def run_family(
-    automata: Sequence[Automaton],
+    automata: Sequence[Automaton] | AutomatonStack,
     rows: Array,
     members: Members,
     sample_step: float,
@@ -108,7 +108,7 @@ def run_family(
 
     Parameters
     ----------
-    automata : sequence of A Automaton
+    automata : sequence of A Automaton, or AutomatonStack
         Of one structure: states, guards, targets; their numbers differ.
     rows : (A, O, M, n) array
         Outputs ``rows[automaton, o, mode] @ x``.
@@ -130,12 +130,13 @@ def run_family(
     """
     traces = np.empty((len(members.mode), rows.shape[1], samples))
     results = MemberResults(traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64))
-    _run(_family(automata, rows, sample_step), automata[0], members, results, None, threads)
+    stack = _stacked(automata)
+    _run(_family(stack, rows, sample_step), stack.first, members, results, None, threads)
     return traces, results.events
 
 
 def figures_of_family(
-    automata: Sequence[Automaton],
+    automata: Sequence[Automaton] | AutomatonStack,
     rows: Array,
     members: Members,
     sample_step: float,
@@ -148,31 +149,25 @@ def figures_of_family(
         raise InvalidInput(f"the last {options.last} of {samples} samples: must be 1 to {samples}")
     figures = np.empty((len(members.mode), rows.shape[1], len(Figures._fields)))
     results = MemberResults(np.empty((1, rows.shape[1], samples)), figures, np.zeros(len(figures), dtype=np.int64))
-    _run(_family(automata, rows, sample_step), automata[0], members, results, options, threads)
+    stack = _stacked(automata)
+    _run(_family(stack, rows, sample_step), stack.first, members, results, options, threads)
     return Figures(*np.moveaxis(figures, 2, 0))
 
 
-def _family(automata: Sequence[Automaton], rows: Array, sample_step: float) -> AutomatonFamily:
-    flows = np.array([automaton.flows for automaton in automata])
-    structure = _structure(automata[0])
-    if any(_structure(automaton) != structure for automaton in automata[1:]):
-        raise InvalidInput("the automata of an ensemble must have the same states, modes, guards and targets")
-    guards = max(1, *(len(mode.guards) for mode in automata[0].modes))
-    numbers = [numbers_of(automaton, guards) for automaton in automata]
-    strides = divisors(*speeds(flows), sample_step)
+def _stacked(automata: Sequence[Automaton] | AutomatonStack) -> AutomatonStack:
+    return automata if isinstance(automata, AutomatonStack) else AutomatonStack.of(automata)
+
+
+def _family(stack: AutomatonStack, rows: Array, sample_step: float) -> AutomatonFamily:
+    strides = divisors(*speeds(stack.flows), sample_step)
     return AutomatonFamily(
-        np.array([each.flows for each in numbers]),
-        np.array([each.rows for each in numbers]),
-        np.array([each.resets for each in numbers]),
+        stack.flows.reshape(len(strides), -1),
+        stack.rows.reshape(len(strides), -1),
+        stack.resets.reshape(len(strides), -1),
         np.array(rows, dtype=float).reshape(*rows.shape[:2], -1),
         sample_step / strides,
         strides,
     )
-
-
-def _structure(automaton: Automaton) -> tuple[object, ...]:
-    targets = tuple(tuple((g.target, g.reset is None) for g in mode.guards) for mode in automaton.modes)
-    return automaton.names, targets
 
 
 def _run(

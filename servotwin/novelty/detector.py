@@ -121,7 +121,8 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
     settings : NoveltySettings
     """
     rules, model = settings.rules, settings.model
-    leads = leads_at_rest(cut.signals["theta_m"], cut.signals["position"], model.rate, model.static_gain, _still(rules))
+    theta_m, position, rate = cut.signals["theta_m"], cut.signals["position"], model.rate * model.second
+    leads = leads_at_rest(theta_m, position, rate, model.static_gain, _still(rules))
     state = _rested(_updated(state, cut, rules), leads)
     estimate = _read(state, cut, settings)
     if estimate is None:

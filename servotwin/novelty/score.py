@@ -27,6 +27,7 @@ from servotwin.estimation.core.least_squares import LeastSquares, independent_le
 from servotwin.estimation.core.response import Readout, Response, response
 from servotwin.estimation.core.whitening import Autoregression, burg
 from servotwin.novelty.settings import NoveltyModel, ResponseMode
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -42,7 +43,7 @@ _ORDER = 8  # of the autoregression, at most
 _ROUNDING = 1e-13  # of the largest motion
 _PER_COLUMN = 3  # judged samples, at least
 _LARGEST = 1e100  # rad or m: no sensor gives more, and the squares of larger numbers overflow
-_BLOCK_S, _PARTS = 0.1, 5  # s of rest that make one lead; parts of it whose means must agree
+_BLOCK_S, _PARTS = 0.1, 5  # the servo's own seconds of rest that make one lead; parts of it whose means must agree
 
 
 class EncoderOffset(NamedTuple):
@@ -91,7 +92,9 @@ def model_of(servo: Servo, sample_rate: float) -> NoveltyModel:
         for decay, gain in zip(known.decay.tolist(), known.position.gain.tolist(), strict=True)
     )
     factor = max(1, round(sample_rate / (_PER_PERIOD * fastest)))
-    return NoveltyModel(sample_rate, modes, known.position.direct, known.static_gain, known.unseen, factor)
+    return NoveltyModel(
+        sample_rate, modes, known.position.direct, known.static_gain, known.unseen, factor, scales(servo).time
+    )
 
 
 @lru_cache(maxsize=8)
@@ -310,7 +313,7 @@ class _Columns(NamedTuple):
 def leads_at_rest(
     theta_m: Sequence[float] | Array, position: Sequence[float] | Array, rate: float, static_gain: float, still: float
 ) -> list[float]:
-    """Leads (rad) of the motor over the load, one for each tenth of a second in which neither moves.
+    """Leads (rad) of the motor over the load, one for each tenth of the servo's own second in which neither moves.
 
     At rest the motor's angle less the load's, as an angle of the screw, is where in the gap the screw lies. Its range
     over all rests since the encoder was set is a lower bound of the gap, whatever the dynamics.
@@ -320,7 +323,7 @@ def leads_at_rest(
     theta_m, position : (n,) sequences
         rad, m.
     rate : float
-        Hz.
+        Samples per second of the servo's own.
     static_gain : float
         m/rad.
     still : float

@@ -38,6 +38,8 @@ class NoveltyModel:
         s: motion of the screw so late in a window has not reached the last mass.
     factor : int
         Decimation factor of the score.
+    second : float
+        s, one of the servo's own (`plant.scales`).
     """
 
     rate: float
@@ -46,6 +48,7 @@ class NoveltyModel:
     static_gain: float
     unseen: float
     factor: int = 1
+    second: float = 1.0
 
     def __post_init__(self) -> None:
         numbers = [part for mode in self.modes for value in mode for part in (value.real, value.imag)]
@@ -59,6 +62,8 @@ class NoveltyModel:
             raise InvalidInput("novelty model static gain = 0 m/rad: must be another number")
         if not 0.0 <= self.unseen < 1e6:
             raise InvalidInput(f"novelty model unseen = {self.unseen!r} s: must be at least 0")
+        if not (isfinite(self.second) and self.second > 0.0):
+            raise InvalidInput(f"novelty model second = {self.second!r} s: must be finite and greater than 0")
         if self.factor < 1:
             raise InvalidInput(f"novelty model decimation = {self.factor!r} samples: must be at least 1")
 
@@ -76,13 +81,16 @@ def model_table(
         key("unseen_s", minimum=0.0, help="Motion of the screw this late in a window has not reached the last mass."),
     ],
     factor: Annotated[int, key("decimation", minimum=1, help="Decimation factor of the score.")],
+    second: Annotated[
+        float, key("own_second_s", above=0.0, help="The servo's own second, in which a rest lasts.")
+    ] = 1.0,
 ) -> NoveltyModel:
     """Response of the structure; a program writes it."""
     if not len(decay_real) == len(decay_imag) == len(gain_real) == len(gain_imag):
         raise InvalidInput("decay_real, decay_imag, gain_real and gain_imag must have as many numbers as one another")
     decay, gain = map(complex, decay_real, decay_imag), map(complex, gain_real, gain_imag)
     modes = tuple(ResponseMode(*pair) for pair in zip(decay, gain, strict=True))
-    return NoveltyModel(rate, modes, direct, static_gain, unseen, factor)
+    return NoveltyModel(rate, modes, direct, static_gain, unseen, factor, second)
 
 
 def _model_values(model: NoveltyModel) -> Values:
@@ -92,7 +100,7 @@ def _model_values(model: NoveltyModel) -> Values:
         "decay_imag": [mode.decay.imag for mode in model.modes],
         "gain_real": [mode.gain.real for mode in model.modes],
         "gain_imag": [mode.gain.imag for mode in model.modes],
-        **values_of(model, model_table, only=("rate", "direct", "static_gain", "unseen", "factor")),
+        **values_of(model, model_table, only=("rate", "direct", "static_gain", "unseen", "factor", "second")),
     }
 
 

@@ -15,9 +15,9 @@ from functools import lru_cache
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.hybrid.automaton import Array, Automaton, Guard, Mode
+from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, Guard, Mode
 from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, screw_rate
-from servotwin.plant.basis import Basis, GuardRow, input_names, plant_names
+from servotwin.plant.basis import Basis, GuardRow, LawNumbers, PlantNumbers, input_names, outer, plant_names, scaled
 from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
@@ -95,6 +95,61 @@ class ServoAutomaton:
         return {index: float(factorials[k] * coefficients[k]) for k, index in enumerate(states)}
 
 
+@dataclass(frozen=True, eq=False)
+class LoopParts:
+    """Parts of an automaton, or on leading axes of many with one structure.
+
+    Attributes
+    ----------
+    states, modes : sequence of str
+        Names.
+    flows : list of M (..., N, N) arrays
+    guards : list of M tuples of Guard
+        Rows (..., N), resets (..., N, N).
+    rows : dict of (..., M, N) arrays
+    zones : tuple of str
+    frictions : int
+    """
+
+    states: tuple[str, ...]
+    modes: list[str]
+    flows: list[Array]
+    guards: list[tuple[Guard, ...]]
+    rows: dict[str, Array]
+    zones: tuple[str, ...]
+    frictions: int
+
+    def assembled(self) -> ServoAutomaton:
+        """The automaton of parts without leading axes."""
+        modes = tuple(Mode(*mode) for mode in zip(self.flows, self.guards, self.modes, strict=True))
+        return ServoAutomaton(Automaton(modes, self.states), self.rows, self.zones, self.frictions)
+
+    def stacked(self, count: int) -> tuple[ServoAutomaton, AutomatonStack, dict[str, Array]]:
+        """The first automaton, the numbers of all `count` of them, and the rows of their outputs."""
+        n, most = len(self.states), max(1, *(len(guards) for guards in self.guards))
+        shape = count, len(self.modes)
+        flows, rows, resets = np.zeros((*shape, n, n)), np.zeros((*shape, most, n)), np.zeros((*shape, most, n, n))
+        for m, (flow, guards) in enumerate(zip(self.flows, self.guards, strict=True)):
+            flows[:, m] = flow
+            for g, guard in enumerate(guards):
+                rows[:, m, g] = guard.row
+                if guard.reset is not None:
+                    resets[:, m, g] = guard.reset
+        every = {name: np.broadcast_to(row, (count, *row.shape[-2:])) for name, row in self.rows.items()}
+        modes = tuple(
+            Mode(flows[0, m], tuple(_with(each, rows[0, m, g], resets[0, m, g]) for g, each in enumerate(guards)), name)
+            for m, (guards, name) in enumerate(zip(self.guards, self.modes, strict=True))
+        )
+        first = ServoAutomaton(
+            Automaton(modes, self.states), {name: row[0] for name, row in every.items()}, self.zones, self.frictions
+        )
+        return first, AutomatonStack(first.automaton, flows, rows, resets), every
+
+
+def _with(guard: Guard, row: Array, reset: Array) -> Guard:
+    return replace(guard, row=row, reset=None if guard.reset is None else reset)
+
+
 def degree(pieces: PiecewiseCubic) -> int:
     """Highest power with a coefficient that is not zero in any piece."""
     used = np.flatnonzero(np.any(pieces.coeffs != 0.0, axis=0))
@@ -103,7 +158,7 @@ def degree(pieces: PiecewiseCubic) -> int:
 
 def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
     """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in the feedforward only."""
-    return _continuous_loop(servo, without_feedforward(controller), shape)
+    return _one_continuous_loop(servo, without_feedforward(controller), shape)
 
 
 def without_feedforward(controller: Controller) -> Controller:
@@ -112,33 +167,43 @@ def without_feedforward(controller: Controller) -> Controller:
 
 
 @lru_cache(maxsize=64)
-def _continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
+def _one_continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
+    return continuous_parts(servo, controller, shape).assembled()
+
+
+def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> LoopParts:
+    """Modes, guards and outputs of plants and laws together."""
     basis = Basis(tuple(_loop_names(servo, controller, shape)))
-    sensed = basis.positions(servo)[-1] + basis.row("noise")
-    measured = basis.row("filtered") if controller.loop_filter_hz else sensed
+    sensed = basis.positions(servo)[..., -1, :] + basis.row("noise")
+    measured = sensed if controller.loop_filter_hz is None else basis.row("filtered")
     error = basis.row("reference") - measured
     system = _System(servo, basis, _controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
     for contact, stick_slip, zone in system.combinations:
         flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
-        flow[basis["integral"]], flow[basis["derivative"]] = zone.integral, zone.derivative
-        if controller.loop_filter_hz:
+        flow[..., basis["integral"], :], flow[..., basis["derivative"], :] = zone.integral, zone.derivative
+        if controller.loop_filter_hz is not None:
             rate = 2.0 * np.pi * controller.loop_filter_hz
-            flow[basis["filtered"]] = rate * (sensed - basis.row("filtered"))
+            flow[..., basis["filtered"], :] = rate * (sensed - basis.row("filtered"))
         if shape.offset:
-            flow[basis["offset"]] = -basis.row("offset") / controller.release_time
+            flow[..., basis["offset"], :] = -basis.row("offset") / controller.release_time
         flows.append(flow)
-    return system.assembled(flows, error=error, measured_position=sensed)
+    return system.parts(flows, error=error, measured_position=sensed)
 
 
 @lru_cache(maxsize=64)
 def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: bool = False) -> ServoAutomaton:
     """The plant between two ticks, under a constant voltage (zero-order hold)."""
+    return sampled_parts(servo, gap_degree, bias, friction).assembled()
+
+
+def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bool) -> LoopParts:
+    """Modes, guards and outputs of plants under a constant voltage."""
     names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(bias, friction)]
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
     system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero),), friction)
-    return system.assembled(
+    return system.parts(
         [
             mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
             for contact, stick_slip, zone in system.combinations
@@ -147,33 +212,32 @@ def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: b
 
 
 def mechanical_flow(
-    servo: Servo, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
+    servo: PlantNumbers, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
 ) -> Array:
-    """(N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero."""
-    flow = np.zeros((len(basis.names), len(basis.names)))
+    """(..., N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero."""
     chain, (A, B, E) = servo.chain(), servo.motor()
-    size, first, screw = chain.A.shape[0], basis["chain0"], basis["theta_d"]
+    flow = np.zeros((*A.shape[:-2], len(basis.names), len(basis.names)))
+    size, first, screw = chain.A.shape[-1], basis["chain0"], basis["theta_d"]
     states = slice(first, first + size)
-    flow[:3, :3] = A
-    flow[:3] += np.outer(B, voltage + basis.row("input bias")) - np.outer(E, stick_slip.side * basis.row("friction"))
-    flow[screw] = screw_rate(basis, contact)
-    flow[states, states] = chain.A
-    flow[states] += servo.p * (
-        np.outer(chain.B_position, basis.row("theta_d")) + np.outer(chain.B_velocity, flow[screw])
-    )
+    flow[..., :3, :3] = A
+    flow[..., :3, :] += outer(B, voltage + basis.row("input bias")) - outer(E, stick_slip.side * basis.row("friction"))
+    flow[..., screw, :] = screw_rate(basis, contact)
+    flow[..., states, states] = chain.A
+    pushed = outer(chain.B_position, basis.row("theta_d")) + outer(chain.B_velocity, flow[..., screw, :])
+    flow[..., states, :] += scaled(servo.p, pushed)
     if contact.resting:
         # The motor moves with its flank, whose half gap changes at its own rate.
-        flow[basis["speed"]] = 0.5 * contact.side * basis.row("gap''")
+        flow[..., basis["speed"], :] = 0.5 * contact.side * basis.row("gap''")
     elif contact.side:
         force = chain.reaction_position * servo.p * basis.row("theta_d")
-        force[states] += chain.reaction
-        flow[:3] -= servo.p * np.outer(E, force)
+        force[..., states] += chain.reaction
+        flow[..., :3, :] -= scaled(servo.p, outer(E, force))
     if stick_slip.stuck:
-        flow[basis["speed"]] = 0.0
+        flow[..., basis["speed"], :] = 0.0
     # A polynomial input is a chain of integrators: every derivative drives the one before it.
     for name in basis.names:
         if name + "'" in basis:
-            flow[basis[name]] = basis.row(name + "'")
+            flow[..., basis[name], :] = basis.row(name + "'")
     return flow
 
 
@@ -188,7 +252,7 @@ class Zone:
     guards: tuple[GuardRow, ...] = ()
 
 
-def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
+def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
     """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added.
 
     With `integral_only` the integral stops inside, and the rest goes on.
@@ -199,7 +263,7 @@ def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, err
     unlimited = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
     tolerance = basis.row("tolerance")
     # Pure integral action has a tracking time of zero: a thousandth of the filter's stands for it in the flow.
-    back_calculation = 1.0 / max(controller.tracking, controller.Tf * 1e-3)
+    back_calculation = 1.0 / np.maximum(controller.tracking, controller.Tf * 1e-3)
     zones: list[Zone] = []
     for side in (-1, 1) if dead_zone else (0,):
         name = {-1: "-", 0: "on", 1: "+"}[side]
@@ -219,7 +283,7 @@ def _controller_zones(controller: Controller, dead_zone: bool, basis: Basis, err
     return tuple(zones)
 
 
-def _saturated(zone: Zone, basis: Basis, rate: float) -> list[Zone]:
+def _saturated(zone: Zone, basis: Basis, rate: float | Array) -> list[Zone]:
     """The zone itself and, with a voltage limit, its two saturated zones, with back-calculation at a rate (1/s)."""
     if "voltage limit" not in basis:
         return [zone]
@@ -236,10 +300,14 @@ def _saturated(zone: Zone, basis: Basis, rate: float) -> list[Zone]:
     return zones
 
 
-def _loop_names(servo: Servo, controller: Controller, shape: Shape) -> list[str]:
-    names = plant_names(servo) + ["integral", "derivative"] + (["filtered"] if controller.loop_filter_hz else [])
+def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> list[str]:
+    names = (
+        plant_names(servo)
+        + ["integral", "derivative"]
+        + (["filtered"] if controller.loop_filter_hz is not None else [])
+    )
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
-    names += ["voltage limit"] if controller.voltage_limit else []
+    names += ["voltage limit"] if controller.voltage_limit is not None else []
     names += ["noise"] if shape.noise else []
     names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
     return names + _constants(shape.bias, shape.friction)
@@ -252,7 +320,7 @@ def _constants(bias: bool, friction: bool) -> list[str]:
 class _System:
     """All combinations of contact mode, stick-slip mode and zone, in the order of the automaton's modes."""
 
-    def __init__(self, servo: Servo, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
+    def __init__(self, servo: PlantNumbers, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
         self.servo, self.basis, self.zones = servo, basis, zones
         self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
         self.combinations = [
@@ -260,15 +328,17 @@ class _System:
         ]
         self.names = [(contact.name, stick_slip.name, zone.name) for contact, stick_slip, zone in self.combinations]
 
-    def assembled(self, flows: list[Array], **rows: Array) -> ServoAutomaton:
-        """The automaton with these flows, and `rows` among its outputs."""
-        modes = tuple(
-            Mode(flow, self._guards(contact, stick_slip, zone), "/".join(filter(None, names)))
-            for flow, (contact, stick_slip, zone), names in zip(flows, self.combinations, self.names, strict=True)
-        )
-        outputs = self._outputs() | {name: np.tile(row, (len(modes), 1)) for name, row in rows.items()}
-        names = tuple(zone.name for zone in self.zones)
-        return ServoAutomaton(Automaton(modes, self.basis.names), outputs, names, len(self.frictions))
+    def parts(self, flows: list[Array], **rows: Array) -> LoopParts:
+        """Everything with these flows, and `rows` among its outputs."""
+        guards = [self._guards(*combination) for combination in self.combinations]
+        names = ["/".join(filter(None, name)) for name in self.names]
+        outputs = self._outputs() | {name: self._everywhere(row) for name, row in rows.items()}
+        zones = tuple(zone.name for zone in self.zones)
+        return LoopParts(self.basis.names, names, flows, guards, outputs, zones, len(self.frictions))
+
+    def _everywhere(self, row: Array) -> Array:
+        """(..., M, N) rows, the same in every mode."""
+        return np.repeat(row[..., None, :], len(self.combinations), axis=-2)
 
     def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> tuple[Guard, ...]:
         ends = [(guard, (contact.name, stick_slip.name, guard.target)) for guard in zone.guards]
@@ -291,12 +361,13 @@ class _System:
     def _acceleration(self, side: int, zone: Zone) -> Array:
         """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
         flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), StickSlipMode(""), zone.voltage)
-        return np.asarray(flow[self.basis["speed"]])
+        return np.asarray(flow[..., self.basis["speed"], :])
 
     def _outputs(self) -> dict[str, Array]:
-        rows = {f"q{i + 1}": row for i, row in enumerate(self.basis.positions(self.servo))}
+        positions = self.basis.positions(self.servo)
+        rows = {f"q{i + 1}": positions[..., i, :] for i in range(self.servo.n)}
         rows |= {"position": rows[f"q{self.servo.n}"]}
         rows |= {name: self.basis.row(name) for name in ("theta_m", "theta_d", "reference", "gap", "tolerance")}
-        full = {name: np.tile(row, (len(self.combinations), 1)) for name, row in rows.items()}
-        full["voltage"] = np.array([zone.voltage for _, _, zone in self.combinations])
+        full = {name: self._everywhere(row) for name, row in rows.items()}
+        full["voltage"] = np.stack(np.broadcast_arrays(*(zone.voltage for _, _, zone in self.combinations)), axis=-2)
         return full

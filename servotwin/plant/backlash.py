@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
-from servotwin.plant.basis import Basis, GuardRow
-from servotwin.plant.servo import Servo
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, outer, scaled
 from servotwin.plant.signals import Array
 
 
@@ -97,7 +96,7 @@ OPEN = 1
 """Index of the open mode."""
 
 
-def contact_modes(servo: Servo) -> tuple[ContactMode, ...]:
+def contact_modes(servo: PlantNumbers) -> tuple[ContactMode, ...]:
     """All modes of the backlash."""
     return _RIGID if servo.rigid else _ELASTIC
 
@@ -111,7 +110,7 @@ def screw_rate(basis: Basis, contact: ContactMode) -> Array:
 
 
 def contact_guards(
-    servo: Servo, basis: Basis, contact: ContactMode, stopping: Array | float, accelerations: Sequence[Array]
+    servo: PlantNumbers, basis: Basis, contact: ContactMode, stopping: Array | float, accelerations: Sequence[Array]
 ) -> list[GuardRow]:
     """Guards that end a mode of the backlash.
 
@@ -141,16 +140,16 @@ def contact_guards(
     if servo.rigid:
         return [GuardRow(release, "open", reset, "release", side)]
     # The motor stands on the flank and moves with it, at the rate of the half gap.
-    reset[basis["speed"]] = 0.5 * side * basis.row("gap'")
+    reset[..., basis["speed"], :] = 0.5 * side * basis.row("gap'")
     return [GuardRow(release, f"held {flank}", reset, "hold", side)]
 
 
-def _contact_reset(servo: Servo, basis: Basis, side: int) -> Array:
+def _contact_reset(servo: PlantNumbers, basis: Basis, side: int) -> Array:
     """Put the screw on its flank; the chain's damper turns a jump of the screw into one of velocity (Eq 10)."""
-    reset = np.eye(len(basis.names))
-    moved = basis.row("theta_m") - 0.5 * side * basis.row("gap") - basis.row("theta_d")
     chain = servo.chain()
-    reset[basis["theta_d"]] += moved
-    first = basis["chain0"]
-    reset[first : first + chain.A.shape[0]] += servo.p * np.outer(chain.B_velocity, moved)
+    size, lead, first = len(basis.names), chain.B_velocity.shape[:-1], basis["chain0"]
+    reset = np.broadcast_to(np.eye(size), (*lead, size, size)).copy()
+    moved = basis.row("theta_m") - 0.5 * side * basis.row("gap") - basis.row("theta_d")
+    reset[..., basis["theta_d"], :] += moved
+    reset[..., first : first + chain.A.shape[-1], :] += scaled(servo.p, outer(chain.B_velocity, moved))
     return reset

@@ -2,12 +2,128 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
+from servotwin.plant.structure import Chain
+
+
+class PlantNumbers(Protocol):
+    """Numbers of a plant that its automaton needs: of one, or of many with one structure on leading axes."""
+
+    @property
+    def n(self) -> int:
+        """Number of masses."""
+        ...
+
+    @property
+    def rigid(self) -> bool:
+        """True when the first mass follows the screw."""
+        ...
+
+    @property
+    def k_d(self) -> float | Array:
+        """N/m, stiffness of the screw."""
+        ...
+
+    @property
+    def p(self) -> float | Array:
+        """m/rad; (P, 1) for many plants, as the others."""
+        ...
+
+    @property
+    def R(self) -> float | Array:
+        """Resistance of the winding, ohm."""
+        ...
+
+    @property
+    def k_T(self) -> float | Array:
+        """Torque per current, N m/A."""
+        ...
+
+    @property
+    def k_B(self) -> float | Array:
+        """Back-EMF per angular velocity, V s/rad."""
+        ...
+
+    def chain(self) -> Chain:
+        """Matrices of the structure."""
+        ...
+
+    def motor(self) -> tuple[Array, Array, Array]:
+        """Matrices of the motor."""
+        ...
+
+
+class LawNumbers(Protocol):
+    """Numbers of a continuous law that its automaton needs: of one, or (P, 1) of many."""
+
+    @property
+    def Kp(self) -> float | Array:
+        """Proportional gain, V/m."""
+        ...
+
+    @property
+    def Ki(self) -> float | Array:
+        """Integral gain, V/(m s)."""
+        ...
+
+    @property
+    def Kd(self) -> float | Array:
+        """Derivative gain, V s/m."""
+        ...
+
+    @property
+    def Tf(self) -> float | Array:
+        """Time constant of the derivative's filter, s."""
+        ...
+
+    @property
+    def enter(self) -> float | Array:
+        """Error at which the loop opens, in tolerances."""
+        ...
+
+    @property
+    def leave(self) -> float | Array:
+        """Error at which it closes again, in tolerances."""
+        ...
+
+    @property
+    def tracking(self) -> float | Array:
+        """Time constant of the back-calculation, s."""
+        ...
+
+    @property
+    def loop_filter_hz(self) -> float | Array | None:
+        """Cut-off of the filter on the measurement."""
+        ...
+
+    @property
+    def voltage_limit(self) -> float | Array | None:
+        """V; None: none."""
+        ...
+
+    @property
+    def integral_only(self) -> bool:
+        """True where the dead zone stops the integral only."""
+        ...
+
+    @property
+    def release_time(self) -> float | Array:
+        """Time constant of an offset, s."""
+        ...
+
+
+def outer(column: Array, row: Array) -> Array:
+    """(..., m, n) outer products of (..., m) columns and (..., n) rows."""
+    return np.asarray(column[..., :, None] * row[..., None, :])
+
+
+def scaled(factor: float | Array, matrices: Array) -> Array:
+    """Matrices (..., m, n) times a number, or (P, 1) numbers."""
+    return np.asarray(np.asarray(factor)[..., None] * matrices)
 
 
 class GuardRow(NamedTuple):
@@ -40,19 +156,19 @@ class Basis:
         """The row that picks a state, not to be written to; zero when there is no such state."""
         return np.asarray(self._rows[self._index.get(name, -1)])
 
-    def positions(self, servo: Servo) -> Array:
-        """(n, states) rows of the masses' positions."""
+    def positions(self, servo: PlantNumbers) -> Array:
+        """(..., n, states) rows of the masses' positions."""
         chain = servo.chain()
         first = self["chain0"]
-        rows = np.zeros((servo.n, len(self.names)))
-        rows[:, first : first + chain.A.shape[0]] = chain.C
-        rows[:, self["theta_d"]] += chain.D * servo.p
+        rows = np.zeros((*np.shape(servo.p)[:-1], servo.n, len(self.names)))
+        rows[..., first : first + chain.A.shape[-1]] = chain.C
+        rows[..., self["theta_d"]] += chain.D * servo.p
         return rows
 
 
-def plant_names(servo: Servo) -> list[str]:
+def plant_names(servo: PlantNumbers) -> list[str]:
     """States of motor, screw and structure."""
-    return ["current", "speed", "theta_m", "theta_d", *(f"chain{i}" for i in range(servo.chain().A.shape[0]))]
+    return ["current", "speed", "theta_m", "theta_d", *(f"chain{i}" for i in range(servo.chain().A.shape[-1]))]
 
 
 def input_names(key: str, order: int) -> list[str]:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import Basis, GuardRow
-from servotwin.plant.servo import Servo
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers
 from servotwin.plant.signals import Array
 
 # A motor has stopped at this part of the speed at which its back EMF takes as much voltage as the friction. At zero
@@ -29,7 +28,7 @@ _FRICTIONLESS = (StickSlipMode(""),)
 _COULOMB = (StickSlipMode("stick", stuck=True), StickSlipMode("slip -", -1), StickSlipMode("slip +", 1))
 
 
-def stick_slip_modes(servo: Servo, friction: bool) -> tuple[StickSlipMode, ...]:
+def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode, ...]:
     """All modes of the friction; the first is the one at rest.
 
     Raises
@@ -42,7 +41,7 @@ def stick_slip_modes(servo: Servo, friction: bool) -> tuple[StickSlipMode, ...]:
     return _COULOMB if friction else _FRICTIONLESS
 
 
-def stick_slip_guards(servo: Servo, basis: Basis, mode: StickSlipMode) -> list[GuardRow]:
+def stick_slip_guards(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> list[GuardRow]:
     """Guards that end a mode of the friction: the motor stands still, or its torque exceeds the friction's."""
     if mode.stuck:
         # A rigid screw's load does not act back, so the current alone drives the shaft.
@@ -60,6 +59,6 @@ def stick_slip_guards(servo: Servo, basis: Basis, mode: StickSlipMode) -> list[G
     return [GuardRow(stopped, "stick", still, "stick", mode.side)]
 
 
-def stopping_speed(servo: Servo, basis: Basis, mode: StickSlipMode) -> Array | float:
+def stopping_speed(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> Array | float:
     """Speed (row) beyond zero at which a sliding motor has stopped; 0 in the other modes."""
     return _STOPPED * servo.R / (servo.k_T * servo.k_B) * basis.row("friction") if mode.side else 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,16 +12,16 @@ CURRENT, SPEED, ANGLE = 0, 1, 2
 
 
 class Motor(NamedTuple):
-    """Parameters of the motor: kg m^2, H, ohm, N m/A, V s/rad."""
+    """Parameters of the motor, or of many as arrays: kg m^2, H, ohm, N m/A, V s/rad."""
 
-    J: float
-    L: float
-    R: float
-    k_T: float
-    k_B: float
+    J: Any
+    L: Any
+    R: Any
+    k_T: Any
+    k_B: Any
 
     def matrices(self) -> tuple[Array, Array, Array]:
-        """Matrices of x = (I, omega, theta_m), x' = A x + B u + E torque.
+        """Matrices of x = (I, omega, theta_m), x' = A x + B u + E torque; many motors' on leading axes.
 
         Returns
         -------
@@ -31,8 +31,12 @@ class Motor(NamedTuple):
         E : (3,) array
             Column of an external torque on the shaft, N m (positive accelerates).
         """
-        A = np.array([[-self.R / self.L, -self.k_B / self.L, 0.0], [self.k_T / self.J, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        return A, np.array([1.0 / self.L, 0.0, 0.0]), np.array([0.0, 1.0 / self.J, 0.0])
+        lead = np.shape(self.J)
+        A, (B, E) = np.zeros((*lead, 3, 3)), np.zeros((2, *lead, 3))
+        A[..., 0, 0], A[..., 0, 1], A[..., 1, 0] = -self.R / self.L, -self.k_B / self.L, self.k_T / self.J
+        A[..., 2, 1] = 1.0
+        B[..., 0], E[..., 1] = 1.0 / self.L, 1.0 / self.J
+        return A, B, E
 
     def transfer(self) -> tuple[Array, Array]:
         """G1 = theta_m / u (Eq 8) as (numerator, denominator), ascending powers of s."""

@@ -29,6 +29,8 @@ class Structure(NamedTuple):
 class Chain:
     """x' = A x + B_position d + B_velocity d', the n positions q = C x + D d, with d = p theta_d.
 
+    Chains of one structure may share one of these: A, B_position, B_velocity and reaction have a leading axis then.
+
     Attributes
     ----------
     A : (N, N) array
@@ -39,7 +41,7 @@ class Chain:
     D : (n,) array
         All positions; with a rigid screw q_1 = d.
     reaction : (N,) array
-    reaction_position : float
+    reaction_position : float, or (P, 1) array
         Force on the screw, N: F = reaction x + reaction_position d = k_d (d - q_1). Zero with a rigid screw, whose
         load does not act back (the paper's first assumption).
     """
@@ -50,63 +52,74 @@ class Chain:
     C: Array
     D: Array
     reaction: Array
-    reaction_position: float
+    reaction_position: float | Array
 
     @property
     def C_last(self) -> Array:
         """(N,) row of the last mass's position, the controlled one."""
         return np.asarray(self.C[-1])
 
-    def equilibrium(self, d: float) -> Array:
-        """(N,) state at rest for a constant elongation d (m)."""
-        return np.asarray(np.linalg.solve(self.A, -self.B_position * d))
+    def equilibrium(self, d: float | Array) -> Array:
+        """(N,) state at rest for a constant elongation d (m); of many chains (P, N) for (P, 1) of them."""
+        return np.asarray(np.linalg.solve(self.A, (-self.B_position * d)[..., None])[..., 0])
 
 
-def chain(m: Array, k: Array, c: Array, k_d: float = math.inf) -> Chain:
+def chain(m: Array, k: Array, c: Array, k_d: float | Array = math.inf) -> Chain:
     """The chain's matrices.
 
     Parameters
     ----------
-    m, k, c : (n,) arrays
-        kg, N/m, N s/m, from the screw's end outwards. With a rigid screw the first of each is inert.
-    k_d : float
+    m, k, c : (n,) or (P, n) arrays
+        kg, N/m, N s/m, from the screw's end outwards; the matrices of P chains have a leading axis. With a rigid screw
+        the first of each is inert.
+    k_d : float or (P,) array
         N/m, stiffness between screw and mass 1; infinite means that mass 1 follows the screw.
     """
-    return _prescribed(m, k, c) if math.isinf(k_d) else _elastic(m, k, c, k_d)
+    return _prescribed(m, k, c) if np.isinf(k_d).all() else _elastic(m, k, c, k_d)
 
 
 def _prescribed(m: Array, k: Array, c: Array) -> Chain:
     """Eq 10: q_1 = d is moved to the right-hand side."""
-    free = m.size - 1
-    A = _first_order(m[1:], tridiagonal(k)[1:, 1:], tridiagonal(c)[1:, 1:])
-    B_position, B_velocity, zero = np.zeros((3, 2 * free))
-    B_position[free] = k[1] / m[1]
-    B_velocity[free] = c[1] / m[1]
+    lead, free = m.shape[:-1], m.shape[-1] - 1
+    A = _first_order(m[..., 1:], tridiagonal(k)[..., 1:, 1:], tridiagonal(c)[..., 1:, 1:])
+    B_position, B_velocity, zero = np.zeros((3, *lead, 2 * free))
+    B_position[..., free] = k[..., 1] / m[..., 1]
+    B_velocity[..., free] = c[..., 1] / m[..., 1]
     C = np.vstack([np.zeros(2 * free), np.eye(free, 2 * free)])
     return Chain(A, B_position, B_velocity, C, np.eye(free + 1)[0], zero, 0.0)
 
 
-def _elastic(m: Array, k: Array, c: Array, k_d: float) -> Chain:
+def _elastic(m: Array, k: Array, c: Array, k_d: float | Array) -> Chain:
     """Eq 9 with the force k_d (d - q_1) on mass 1."""
-    n = m.size
+    n = m.shape[-1]
     stiffness = tridiagonal(k)
-    stiffness[0, 0] += k_d
-    B_position, zero, reaction = np.zeros((3, 2 * n))
-    B_position[n] = k_d / m[0]
-    reaction[0] = -k_d
+    stiffness[..., 0, 0] += k_d
+    B_position, zero, reaction = np.zeros((3, *m.shape[:-1], 2 * n))
+    B_position[..., n] = k_d / m[..., 0]
+    reaction[..., 0] = -k_d
     A = _first_order(m, stiffness, tridiagonal(c))
-    return Chain(A, B_position, zero, np.eye(n, 2 * n), np.zeros(n), reaction, k_d)
+    # A column beside the rows that it multiplies.
+    column = k_d if np.ndim(k_d) == 0 else np.asarray(k_d)[..., None]
+    return Chain(A, B_position, zero, np.eye(n, 2 * n), np.zeros(n), reaction, column)
 
 
 def tridiagonal(k: Array) -> Array:
-    """(n, n) stiffness (or damping) matrix of Eq 9 for the elements k (n,)."""
-    return np.diag(k + np.append(k[1:], 0.0)) - np.diag(k[1:], 1) - np.diag(k[1:], -1)
+    """(..., n, n) stiffness (or damping) matrix of Eq 9 for the elements k (..., n)."""
+    n = k.shape[-1]
+    result, every = np.zeros((*k.shape, n)), np.arange(n)
+    result[..., every, every] = k
+    result[..., every[:-1], every[:-1]] += k[..., 1:]
+    result[..., every[:-1], every[1:]] = result[..., every[1:], every[:-1]] = -k[..., 1:]
+    return result
 
 
 def _first_order(m: Array, stiffness: Array, damping: Array) -> Array:
     """(2 n, 2 n) matrix of m q'' + damping q' + stiffness q = 0 for x = [q, q']."""
-    upper = np.eye(m.size, 2 * m.size, m.size)
-    return np.vstack([upper, np.hstack([-stiffness, -damping]) / m[:, None]])
+    n = m.shape[-1]
+    result = np.zeros((*m.shape[:-1], 2 * n, 2 * n))
+    result[..., :n, n:] = np.eye(n)
+    result[..., n:, :] = np.concatenate([-stiffness, -damping], axis=-1) / m[..., :, None]
+    return result
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a chain of a hundred masses overflows: see LinearSystem.response

@@ -10,14 +10,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 
-_ROUNDING = 1e-6  # s: a window is cut to whole samples, so it may be a little shorter than requested
+_ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a little shorter than requested
+_WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
+_ABSENT = "; where absent {:g} s on the paper's servo, and as much of another's own time"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 
 
@@ -36,21 +38,31 @@ class ExcitationSettings:
         int,
         key(minimum=1, help="Number of consecutive uninformative windows after which the twin sends a request."),
     ] = 2
-    window: Annotated[float, key("window_s", above=0.0, help="Length of the requested windows.")] = 2.0
+    window: Annotated[
+        float | None,
+        key("window_s", above=0.0, help=f"Length of the requested windows{_ABSENT.format(_WINDOW)}."),
+    ] = None
     pre_trigger: Annotated[
-        float,
-        key("pre_trigger_s", minimum=0.0, help="Part of them before the change of the reference, below window_s."),
-    ] = 0.3
+        float | None,
+        key(
+            "pre_trigger_s",
+            minimum=0.0,
+            help=f"Part of them before the change of the reference, below window_s{_ABSENT.format(_PRE_TRIGGER)}.",
+        ),
+    ] = None
     probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is requested.")] = 0.0
-    interval: Annotated[float, key("interval_s", above=0.0, help="Time from one probing move to the next.")] = 60.0
+    interval: Annotated[
+        float | None,
+        key("interval_s", above=0.0, help=f"Time from one probing move to the next{_ABSENT.format(_INTERVAL)}."),
+    ] = None
     hold: Annotated[
-        float,
+        float | None,
         key(
             "hold_s",
             above=0.0,
-            help="Duration of a probing move, and of the window after its return.",
+            help=f"Duration of a probing move, and of the window after its return{_ABSENT.format(_HOLD)}.",
         ),
-    ] = 0.85
+    ] = None
     strokes: Annotated[int, key(minimum=1, help="Number of moves there and back.")] = 1
     margin: Annotated[
         float,
@@ -64,9 +76,42 @@ class ExcitationSettings:
 
     def __post_init__(self) -> None:
         check(self)
-        if not self.pre_trigger < self.window:
-            allowed = f"must be below window = {self.window!r} s"
-            raise InvalidInput(f"excitation pre_trigger = {self.pre_trigger!r} s: {allowed}")
+        times = self.times
+        if not times.pre_trigger < times.window:
+            allowed = f"must be below window = {times.window!r} s"
+            raise InvalidInput(f"excitation pre_trigger = {times.pre_trigger!r} s: {allowed}")
+
+    @property
+    def times(self) -> ExcitationTimes:
+        """Times that are stated, and the paper's servo's for those that are not."""
+        defaults = (_WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD)
+        stated = (self.window, self.pre_trigger, self.interval, self.hold)
+        return ExcitationTimes(*(d if s is None else s for s, d in zip(stated, defaults, strict=True)))
+
+    def on(self, second: float) -> ExcitationSettings:
+        """The settings for a servo whose own second (`plant.scales`) is so many seconds.
+
+        A pre-trigger that is absent is never longer than its part of a stated window.
+        """
+        window = _WINDOW * second if self.window is None else self.window
+        before = min(_PRE_TRIGGER * second, 0.5 * window) if self.pre_trigger is None else self.pre_trigger
+        interval = _INTERVAL * second if self.interval is None else self.interval
+        return replace(
+            self,
+            window=window,
+            pre_trigger=before,
+            interval=interval,
+            hold=_HOLD * second if self.hold is None else self.hold,
+        )
+
+
+class ExcitationTimes(NamedTuple):
+    """Window, pre-trigger, time between probing moves, and duration of one, s."""
+
+    window: float
+    pre_trigger: float
+    interval: float
+    hold: float
 
 
 class Stage(StrEnum):
@@ -188,10 +233,10 @@ class ExcitationPolicy:
 
     def _window(self, state: ExcitationState) -> Decision:
         """Request longer windows; misses of shorter ones do not count against the longer ones."""
-        s = self.settings
+        s = self.settings.times
         if state.window is not Stage.OPEN:
             return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
-        if state.misses < s.after:
+        if state.misses < self.settings.after:
             return Decision(state, None, self._missed(state))
         why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
         after = replace(state, misses=0, window=Stage.REQUESTED)
@@ -204,7 +249,7 @@ class ExcitationPolicy:
             return Decision(state, None, f"{self._missed(state)}, and {why_not}")
         after = replace(state, misses=0, probing=Stage.REQUESTED, probed=window.time)
         why = f"{self._missed(state)}: a move of {_mm(needed)} crosses a gap of {math.degrees(window.upper):.3g} deg"
-        return Decision(after, Probe(needed, s.hold, s.strokes), why)
+        return Decision(after, Probe(needed, s.times.hold, s.strokes), why)
 
     def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
         """Reason against a probing move; empty where there is none."""
@@ -213,8 +258,9 @@ class ExcitationPolicy:
             return "a probing move is not allowed"
         if state.probing is Stage.REFUSED:
             return "this edge refuses probing moves"
-        if since < s.interval:
-            return f"the last probing move was requested {since:.3g} s ago, and {s.interval:g} s must lie between two"
+        pause = s.times.interval
+        if since < pause:
+            return f"the last probing move was requested {since:.3g} s ago, and {pause:g} s must lie between two"
         if not math.isfinite(needed):
             return "gap and dead zone are not bounded well enough to size a probing move"
         if needed > s.probe:
@@ -224,7 +270,9 @@ class ExcitationPolicy:
 
 def long_enough(length: float, pre_trigger: float, settings: ExcitationSettings) -> bool:
     """True where a window (s) is as long as would be requested."""
-    return length >= settings.window - _ROUNDING and pre_trigger >= settings.pre_trigger - _ROUNDING
+    times = settings.times
+    rounding = _ROUNDING * times.window
+    return length >= times.window - rounding and pre_trigger >= times.pre_trigger - rounding
 
 
 def _mm(metres: float) -> str:

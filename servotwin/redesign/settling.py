@@ -17,6 +17,7 @@ from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.measures import compute_cells
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 
 # In units of p gap, the screw's lost motion; the map's own unit p b is half of it.
@@ -24,7 +25,7 @@ _K_DZ, _STEPS = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)
 _UNITS = 2.0
 # The scale of a map is free; settled means as still as 1 um where the lost motion is 1 mm.
 _GAP, _STILL = 1.0, 1e-3
-_STARTS, _DURATION, _LAST = 4, 60.0, 20.0
+_STARTS, _DURATION, _LAST = 4, 60.0, 20.0  # s of the servo's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,8 @@ def settling_map(servo: Servo) -> SettlingMap:
         The controller is sampled, or does not stabilise the servo even without a gap.
     """
     axes = RatioAxes(tuple((_UNITS * _K_DZ).tolist()), tuple((_UNITS * _STEPS).tolist()), _GAP)
-    still = _STILL * servo.p * _GAP
-    settings = MapSettings(servo, axes, members=_STARTS, motion=0.0, duration=_DURATION, window=_LAST, still=still)
+    still, second = _STILL * servo.p * _GAP, scales(servo).time
+    duration, window = _DURATION * second, _LAST * second
+    settings = MapSettings(servo, axes, members=_STARTS, motion=0.0, duration=duration, window=window, still=still)
     measures = compute_cells(settings)
     return SettlingMap(_K_DZ, _STEPS, (measures.settled == 1.0).reshape(axes.shape))

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.automaton import Array, Automaton
+from servotwin.hybrid.automaton import Array, AutomatonStack
 from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family, run_family
 from servotwin.hybrid.members import Figures
-from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, without_feedforward
+from servotwin.plant.automaton import ServoAutomaton, Shape, without_feedforward
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import check_gap
+from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants
 
 NOT_NEGATIVE = ("gap", "tolerance", "friction")
@@ -49,7 +50,7 @@ class Group:
     ----------
     which : (k,) array
         Their indices among all members.
-    automata : list of Automaton
+    automata : AutomatonStack
         The different automata, each once.
     rows : (A, O, M, n) array
         Outputs of each automaton.
@@ -57,7 +58,7 @@ class Group:
     """
 
     which: NDArray[np.int64]
-    automata: list[Automaton]
+    automata: AutomatonStack
     rows: Array
     members: Members
 
@@ -100,18 +101,20 @@ class EnsembleMembers:
         places: dict[tuple[Servo, Controller], int] = {}
         pairs = [(servo, without_feedforward(law)) for servo, law in zip(servos, laws, strict=True)]
         automaton = np.array([places.setdefault(pair, len(places)) for pair in pairs])
-        loops = [continuous_loop(servo, law, shape) for servo, law in places]
-        constants = {name: values[which] for name, values in self.constants.items()}
-        states = np.zeros((len(which), len(loops[0].automaton.names)))
-        modes = np.zeros(len(which), dtype=np.int64)
-        for k, (loop, (servo, _)) in enumerate(zip(loops, places, strict=True)):
-            members = np.flatnonzero(automaton == k)
-            chosen = {name: values[members] for name, values in constants.items()}
-            chosen |= _constants_of([laws[member] for member in members])
-            states[members] = starts_of(servo, loop, chosen)
-            modes[members] = start_modes(loop, states[members], laws[members[0]].enter)
-        rows = np.array([[_row(loop, name) for name in outputs] for loop in loops])
-        return Group(which, [loop.automaton for loop in loops], rows, Members(automaton, modes, states))
+        loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
+        constants = {name: values[which] for name, values in self.constants.items()} | _constants_of(laws)
+        states = starts_of(loops, automaton, constants)
+        if not shape.dead_zone:
+            modes = np.full(len(which), loops.first.mode("on"))
+        else:
+            error = np.sum(states * loops.rows["error"][automaton, 0], axis=1)
+            enter = np.array([law.enter for law in laws]) * states[:, loops.first.automaton.index("tolerance")]
+            modes = zones_at(loops.first, error, enter)
+        for name in outputs:
+            if name not in loops.rows:
+                raise InvalidInput(f"an ensemble has no output {name!r}; allowed are {', '.join(loops.rows)}")
+        rows = np.stack([loops.rows[name] for name in outputs], axis=1)
+        return Group(which, loops.automata, rows, Members(automaton, modes, states))
 
 
 def simulate_ensemble(
@@ -320,24 +323,18 @@ def check_constants(constants: dict[str, Array]) -> None:
 
 
 def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
-    return servo.n, servo.rigid, law.voltage_limit is None, law.loop_filter_hz is None
-
-
-def _row(loop: ServoAutomaton, name: str) -> Array:
-    if name not in loop.rows:
-        raise InvalidInput(f"an ensemble has no output {name!r}; allowed are {', '.join(loop.rows)}")
-    return loop.rows[name]
+    return servo.n, servo.rigid, law.voltage_limit is None, law.loop_filter_hz is None, law.integral_only
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:
     """(k,) states that are constants of the controllers, by name."""
-    names = controller_constants(laws[0])
-    return {name: np.array([controller_constants(law)[name] for law in laws]) for name in names}
+    each = {id(law): controller_constants(law) for law in laws}
+    return {name: np.array([each[id(law)][name] for law in laws]) for name in controller_constants(laws[0])}
 
 
-def starts_of(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -> Array:
-    """(k, n) states at rest: `plant_start` for many members."""
-    names, index = loop.automaton.names, loop.automaton.index
+def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, Array]) -> Array:
+    """(k, n) states at rest, each of the automaton of its number: `plant_start` for many members."""
+    names, index = loops.first.automaton.names, loops.first.automaton.index
     states = np.zeros((len(constants["gap"]), len(names)))
     for name, values in constants.items():
         key = name.replace("_", " ")
@@ -345,11 +342,11 @@ def starts_of(servo: Servo, loop: ServoAutomaton, constants: dict[str, Array]) -
             states[:, index(key)] = values
     half = 0.5 * constants["gap"]
     screw, first = np.clip(constants["theta_d0"], -half, half), index("chain0")
-    rest = servo.chain().equilibrium(servo.p)
+    rest = loops.plants.chain().equilibrium(loops.plants.p)[which]
     states[:, index("theta_d")] = screw
-    states[:, first : first + rest.size] = screw[:, None] * rest
+    states[:, first : first + rest.shape[1]] = screw[:, None] * rest
     if "filtered" in names:
-        states[:, index("filtered")] = states @ loop.rows["measured_position"][0]
+        states[:, index("filtered")] = np.sum(states * loops.rows["measured_position"][which, 0], axis=1)
     return states
 
 
@@ -358,5 +355,10 @@ def start_modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np
     if "inside" not in loop.zones:
         return np.full(len(states), loop.mode("on"))
     error = states @ loop.rows["error"][0]
-    inside = np.abs(error) <= enter * states[:, loop.automaton.index("tolerance")]
+    return zones_at(loop, error, enter * states[:, loop.automaton.index("tolerance")])
+
+
+def zones_at(loop: ServoAutomaton, error: Array, enter: Array) -> NDArray[np.int64]:
+    """(k,) modes of a loop with a dead zone, by the error and the threshold of each member."""
+    inside = np.abs(error) <= enter
     return np.where(inside, loop.mode("inside"), np.where(error > 0.0, loop.mode("+"), loop.mode("-")))

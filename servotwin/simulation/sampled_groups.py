@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array, shared_flows, speeds
-from servotwin.hybrid.build import new_workspace, numbers_of
+from servotwin.hybrid.build import new_workspace
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
 from servotwin.hybrid.tables import divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
-from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
+from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble import starts_of
 from servotwin.simulation.lifted import more_segments, new_segments
 from servotwin.simulation.lifted_engine import new_memory, places_of, watches_of
@@ -110,52 +111,48 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
             for servo, each in zip(servos, laws, strict=True)
         ]
     )
-    loops = [sampled_plant(servo, 0, bool(bias), bool(friction)) for servo, _ in plant_places]
-    places = places_of(loops[0], laws[0], delay, degree(span.shape))
+    loops = sampled_plants([servo for servo, _ in plant_places], 0, bool(bias), bool(friction))
+    places = places_of(loops.first, laws[0], delay, degree(span.shape))
     states = np.zeros((len(which), places.states))
-    for k, (servo, _) in enumerate(plant_places):
-        chosen = np.flatnonzero(plant == k)
-        here = {name: values[chosen] for name, values in constants.items()}
-        states[chosen, : places.plant] = starts_of(servo, loops[k], here)
+    states[:, : places.plant] = starts_of(loops, plant, constants)
     if places.filtered >= 0:
         states[:, places.filtered] = states[:, places.position]
     if places.feedforward >= 0:
         states[:, places.feedforward] = [each.feedforward for each in laws]
-    family = _family(loops, list(plant_places), list(law_places), places, span, dead_zone)
+    rates = np.array([rate for _, rate in plant_places])
+    family = _family(loops, rates, list(law_places), places, span, dead_zone)
     thresholds = [each.thresholds(float(t)) for each, t in zip(laws, constants["tolerance"], strict=True)]
     enter, leave = np.array(thresholds).T.copy()
     order = np.lexsort((law, plant))
     limits = np.zeros((len(which), len(span.outputs)))
     starts = SampledStarts(order, plant, law, states, constants["reference"], enter, leave, limits)
-    return SampledGroup(which, loops[0], places, watches_of(loops[0], laws[0], dead_zone), family, starts)
+    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone), family, starts)
 
 
 def _family(
-    loops: list[ServoAutomaton],
-    plants: list[tuple[Servo, float]],
+    loops: LoopStack,
+    rates: Array,
     laws: list[Controller],
     places: Places,
     span: SampledSpan,
     dead_zone: bool,
 ) -> SampledFamily:
-    guards = max(len(mode.guards) for mode in loops[0].automaton.modes)
-    numbers = [numbers_of(loop.automaton, guards) for loop in loops]
-    period = np.array([1.0 / rate for _, rate in plants])
-    searches = divisors(*speeds(np.array([loop.automaton.flows for loop in loops])), period)
+    stack, period = loops.automata, 1.0 / rates
+    searches = divisors(*speeds(stack.flows), period)
     return SampledFamily(
-        np.array([each.flows for each in numbers]),
-        np.array([each.rows for each in numbers]),
-        np.array([each.resets for each in numbers]),
+        stack.flows.reshape(len(rates), -1),
+        stack.rows.reshape(len(rates), -1),
+        stack.resets.reshape(len(rates), -1),
         period / searches,
         searches,
         np.array([tuple(law.law(None)) for law in laws], dtype=float).reshape(-1, len(LawParameters._fields)),
         np.array([law.sample_rate for law in laws], dtype=float),
-        np.array([_row(loops[0], name, places) for name in span.outputs]),
+        np.array([_row(loops.first, name, places) for name in span.outputs]),
         span.shape.times,
         span.shape.coeffs,
         dead_zone,
-        loops[0].mode("held"),
-        len(loops[0].automaton.modes),
+        loops.first.mode("held"),
+        len(loops.first.automaton.modes),
     )
 
 

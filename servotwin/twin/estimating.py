@@ -215,6 +215,7 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     The published estimator starts from the previous gap, as printed. The default one gets the trend's prediction, the
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
+    settings = settings.on(servo)
     options, known = settings_of(settings.method, settings.estimator), settings.uncertainty
     learns = settings.learning.learn and servo.rigid
     new = nameplate(settings.learning, known.k, known.c, known.m) if learns else None

@@ -72,6 +72,7 @@ class TwinModel:
         InvalidInput
             The policy cannot design for this controller, or its table is not this model's.
         """
+        settings = settings.on(servo)
         chosen = policy or policy_of(servo, settings)
         return cls(
             estimator=estimator or estimator_of(servo, settings),

@@ -63,7 +63,7 @@ def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = 
     message, stored, then = _window(window), _stored(body), parts_of(context)
     servo, settings = described(then) if model is None else (model.servo, model.settings)
     now = parts_of(context_of(servo, settings)[1])
-    expected = stored.prior.expectation(settings.trend)
+    expected = stored.prior.expectation(settings.on(servo).trend)
     estimate = DecodedWindow.of(message).estimate(estimator_of(servo, settings), expected)
     again = plain(estimate)
     return ReplayResult(

@@ -15,11 +15,14 @@ from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
 from servotwin.estimation.machine import LearningSettings
 from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.registry import POLICIES
+
+_LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
 
 
 @settings("triage")
@@ -46,16 +49,45 @@ class TriageSettings:
         float, key(above=0.0, help="Factor above the usual misfit from which a misfit counts as unusual.")
     ] = 3.0
     least_misfit: Annotated[
-        float, key("least_misfit_um", above=0.0, help="Smallest misfit that counts as unusual.")
-    ] = 1e-7
-    bias: Annotated[float, key("bias_mv", above=0.0, help="A smaller change of the input bias needs no estimate.")] = (
-        2e-3
-    )
+        float | None,
+        key(
+            "least_misfit_um",
+            above=0.0,
+            help="Smallest misfit that counts as unusual; where absent a thousandth of the smallest stated step, "
+            "0.1 um by default.",
+        ),
+    ] = None
+    bias: Annotated[
+        float | None,
+        key(
+            "bias_mv",
+            above=0.0,
+            help="A smaller change of the input bias needs no estimate; where absent 2 mV on the preset paper, and as "
+            "much of another's own volt.",
+        ),
+    ] = None
     every: Annotated[int, key(minimum=1, help="Largest number of windows from one estimate to the next.")] = 50
     longest: Annotated[float, key("longest_s", above=0.0, help="Longest time from one estimate to the next.")] = 3600.0
 
     def __post_init__(self) -> None:
         check(self)
+
+    def on(self, volt: float, step: float) -> TriageSettings:
+        """The settings for a servo whose own volt (`plant.scales`) is so many V, and a smallest step (m)."""
+        usual = _LEAST_MISFIT * (step / Uncertainty().step[0])
+        misfit = usual if self.least_misfit is None else self.least_misfit
+        bias = _BIAS * volt if self.bias is None else self.bias
+        return replace(self, least_misfit=misfit, bias=bias)
+
+    @property
+    def misfit_limit(self) -> float:
+        """Smallest misfit that counts as unusual, m."""
+        return _LEAST_MISFIT if self.least_misfit is None else self.least_misfit
+
+    @property
+    def bias_limit(self) -> float:
+        """Smallest change of the input bias that counts, V."""
+        return _BIAS if self.bias is None else self.bias
 
 
 @settings("twin")
@@ -180,6 +212,20 @@ class TwinSettings:
                 raise InvalidInput(f"twin {name} = {value!r}: belongs to policy {owner!r}, and this is {self.policy!r}")
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False: the trend already combines the windows")
+
+    def on(self, servo: Servo) -> TwinSettings:
+        """The settings with what is absent derived for a servo: a slow machine wears slowly, and needs longer windows.
+
+        A trend that differs from the default one was stated, and stays.
+        """
+        second, _, volt = scales(servo)
+        step = self.uncertainty.step[0]
+        return replace(
+            self,
+            trend=TrendSettings.on(second) if self.trend == TrendSettings() else self.trend,
+            excitation=None if self.excitation is None else self.excitation.on(second),
+            triage=None if self.triage is None else self.triage.on(volt, step),
+        )
 
     def initial_tolerance(self, servo: Servo) -> float:
         """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""

@@ -186,10 +186,10 @@ def _moved(result: Glance, state: TriageState, settings: TriageSettings) -> str:
     if not off <= allowed(math.hypot(result.std, state.std), settings):
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
-    if not result.misfit <= settings.misfit * max(state.misfit, settings.least_misfit):
+    if not result.misfit <= settings.misfit * max(state.misfit, settings.misfit_limit):
         return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
     spread = settings.deviations * math.hypot(result.bias_std, state.bias_std)
-    if abs(result.bias - state.bias) > max(settings.bias, spread):
+    if abs(result.bias - state.bias) > max(settings.bias_limit, spread):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
     return ""
 

@@ -25,7 +25,8 @@ from servotwin.twin_service.twin_file import TwinFile, read_twin
 
 TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
 LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
-"""Limits of the windows that a twin with [twin.excitation] may request: a calm loop reverses the screw late."""
+"""Limits of the windows that a twin with [twin.excitation] may request, in the servo's own seconds: a calm loop
+reverses the screw late."""
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
 
 
@@ -140,11 +141,9 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     model = twin.fleet.model_of(request.servo)
     sampled = request.role == "control" or request.noise > 0.0
     law = model.servo.controller.replace(sample_rate=request.sample_rate if sampled else None)
-    recording = Recording(
-        sample_rate=request.sample_rate, longest_window=LONGEST_WINDOW_S, longest_pre_trigger=LONGEST_PRE_TRIGGER_S
-    )
     servo = model.servo.replace(controller=law)
-    commissioning = Commissioning(servo, law, model.settings, recording, noise=request.noise)
+    commissioning = Commissioning(servo, law, model.settings, Recording(request.sample_rate), noise=request.noise)
+    commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S)
     commissioning.check_window()
     agent = commissioning.agent_settings(request.servo, UNBOOTED)
     certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from scaling import Units, scaled
 
 from servotwin.analysis.maps.axes import Cells, PhysicalAxes, RatioAxes
 from servotwin.analysis.maps.measures import MEASURES, automaton, joined, measured, starts, trajectories
@@ -93,10 +94,38 @@ def test_only_ratios_matter():
 def test_a_pitch_half_as_large_with_gains_twice_as_large_is_the_same_loop():
     axes = RatioAxes((0.5, 1.4, 3.0), (0.7, 20.0))
     one = whole(MapSettings(PAPER, axes, members=4, **QUICK))
-    other = whole(MapSettings(Servo.preset("paper-gain2"), axes, members=4, still=0.5e-6, **QUICK))
+    other = whole(MapSettings(Servo.preset("paper-gain2"), axes, members=4, **QUICK))
     assert np.array_equal(one.settled, other.settled)
     assert np.allclose(one.effort, other.effort, rtol=1e-6)
     assert np.allclose(one.swing, 2.0 * other.swing, rtol=1e-6, atol=1e-11)
+
+
+@pytest.mark.parametrize("units", [Units(time=1e-3), Units(time=1e3, length=1e-6), Units(length=1e6, voltage=1e-2)])
+def test_a_machine_in_other_units_has_the_same_map_with_as_many_samples(units):
+    axes = RatioAxes((0.5, 1.4, 3.0), (0.7, 20.0))
+    here, there = (MapSettings(servo, axes, members=4) for servo in (PAPER, scaled(PAPER, *units)))
+    assert (here.run_time, here.last_part, here.stillness) == (120.0, 40.0, 1e-6)
+    one, other = whole(here), whole(there)
+    assert there.samples == here.samples
+    assert np.array_equal(one.settled, other.settled)
+    assert np.array_equal(one.settled_short, other.settled_short)
+    assert other.settling / units.time == pytest.approx(one.settling, rel=1e-9)
+    assert other.effort / units.voltage == pytest.approx(one.effort, rel=1e-6)
+    assert other.error / units.length == pytest.approx(one.error, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("axes", "still"),
+    [
+        (RatioAxes((1.0,), (1.0,), gap=20.0 * DEGREE), 2e-6),
+        (PhysicalAxes((0.0, 20.0 * DEGREE)), 1e-6),
+        (PhysicalAxes((0.05 * DEGREE,)), 1e-8),
+        (PhysicalAxes((0.0,), amplitude=(2e-3,)), 2e-6),
+    ],
+)
+def test_rest_is_relative_to_the_gap(axes, still):
+    assert MapSettings(PAPER, axes).stillness == pytest.approx(still)
+    assert MapSettings(PAPER, axes, still=3e-6).stillness == 3e-6
 
 
 def test_a_ratio_is_the_physical_cell_that_it_stands_for():

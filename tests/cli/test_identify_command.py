@@ -264,5 +264,5 @@ def test_measured_position_goes_before_the_true_one(folder):
 
 def test_a_log_without_reference_needs_start_and_duration(folder):
     log = logfile.read_log(folder / "run.npz")
-    assert identification.cut(log, IdentifyOptions(folder / "run.npz", duration=1.0))
+    assert identification.cut(log, IdentifyOptions(folder / "run.npz", duration=1.0), Servo.preset("paper"))
     assert log.metadata["window_s"] == 1.0

@@ -219,7 +219,7 @@ def test_the_motor_angle_is_needed():
         ({"settle_s": -1.0}, "settle_s = -1.0 s: must be a number, at least 0, finite"),
         ({"lowpass_order": 2.5}, "lowpass_order = 2.5: must be an integer, at least 1"),
         ({"reversals": True}, "reversals = True: must be an integer, at least 0"),
-        ({"rest_speed": None}, "rest_speed = None"),
+        ({"rest_speed": -0.1}, "rest_speed = -0.1 rad/s: must be a number, at least 0, finite"),
         ({"padding": "none"}, "padding = 'none': must be one of odd, even"),
         ({"origin": "zero"}, "origin = 'zero': must be one of absolute, first"),
     ],

@@ -11,6 +11,7 @@ from benchmarks import estimator_conditions as conditions
 from benchmarks.estimator_windows import RATE, WindowCase, cut
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel
+from servotwin.estimation.core.visible import BOUND, TRAVEL
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
@@ -233,6 +234,8 @@ def evidence(case: WindowCase) -> FitEvidence:
         observer=(0.0, math.inf),
         lost_motion=gap,
         unexplained=0.0,
+        needed=TRAVEL,
+        smallest=BOUND,
     )
 
 
@@ -242,7 +245,7 @@ def test_another_view_counts_from_three_standard_deviations_on(view: str, deviat
     """Noise moves every view of a window; only what noise cannot explain counts against the model."""
     seen, given = evidence(clean()[1]), WhitenedSettings()
     std = math.radians(0.1)
-    most = 1.05 * seen.aligned.whitened.point.gap + given.contact_travel
+    most = 1.05 * seen.aligned.whitened.point.gap + seen.needed
     seen = {
         "free model": replace(seen, shift=ModelShift(deviations * std, std, "a stiffness off", 0.0)),
         "observer form": replace(seen, observer=(-deviations * std, std)),

@@ -16,6 +16,7 @@ import pytest
 from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from scaling import Units, scaled
 
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.config.table import parse_toml
@@ -86,6 +87,22 @@ def test_the_first_are_sent_then_none_until_the_gap_changes() -> None:
     novelty = NoveltyDetector(SETTINGS)
     found = reasons(novelty, [*(cut(k) for k in range(8)), *(cut(k, 10.5) for k in range(8, 14))])
     assert found == [FIRST, FIRST, *[""] * 6, SCORE, *[""] * 5]
+
+
+@pytest.mark.parametrize("units", [Units(time=2.0**-10), Units(time=1e3, length=1e-6, voltage=1e2)])
+def test_a_machine_in_other_units_sends_the_same_windows(units: Units) -> None:
+    """The periods are in wall-clock time, which the settings state."""
+    model = model_of(scaled(Servo.preset("paper"), *units), RATE / units.time)
+    rules = replace(SETTINGS.rules, period_s=units.time * SETTINGS.rules.period_s)
+    there = NoveltySettings(model, rules, SETTINGS.gap)
+    cuts = [*(cut(k) for k in range(4)), *(cut(k, 10.5) for k in range(4, 6)), *(cut(k, 12.5) for k in range(6, 9))]
+    scaled_cuts = []
+    for each in cuts:
+        position = array("d", [units.length * value for value in each.signals["position"]])
+        scaled_cuts.append(each._replace(signals={**each.signals, "position": position}))
+    found = reasons(NoveltyDetector(there), scaled_cuts)
+    assert found == reasons(NoveltyDetector(SETTINGS), cuts)
+    assert SCORE in found
 
 
 def test_what_may_be_an_outlier_to_the_twin_is_sent_twice() -> None:

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scaling import Units, scaled
 from scipy.signal import lsim
 
 import servotwin
@@ -59,6 +60,33 @@ def test_the_stored_model_responds_as_the_linear_system() -> None:
     _, exact, _ = lsim((system.A, system.B[:, None], system.C[None], system.D), angle, time, interp=True)
     found = response_of(MODEL).respond(angle[None])[0]
     assert np.abs(found - exact).max() < 1e-10 * np.abs(exact).max() + 1e-15
+
+
+@pytest.mark.parametrize(
+    "units", [Units(time=2.0**-10), Units(time=1e3), Units(length=1e-6), Units(2.0**7, 2.0**20, 4.0)]
+)
+def test_a_machine_in_other_units_has_the_same_score(units: Units) -> None:
+    model = model_of(scaled(SERVO, *units), RATE / units.time)
+    assert model.second == pytest.approx(units.time)
+    assert model.factor == MODEL.factor
+    still = np.abs(np.arange(1500) - 750) < 400
+    for case in clean(10.0)[:2]:
+        theta_m, position = case.window.theta_m, case.window.position
+        assert theta_m is not None
+        here = score(theta_m, position, MODEL, math.radians(9.0))
+        there = score(theta_m, units.length * position, model, math.radians(9.0))
+        assert here is not None
+        assert there is not None
+        assert there.gap == pytest.approx(here.gap, rel=1e-9)
+        assert there.travel == pytest.approx(here.travel)
+        assert there.noise / units.length == pytest.approx(here.noise, rel=1e-3)
+    angle = np.where(still, 0.3, walk(1500))
+    leads = [
+        leads_at_rest(angle, one.static_gain * 0.1 * np.ones(1500), one.rate * one.second, one.static_gain, 1e-3)
+        for one in (MODEL, model)
+    ]
+    assert leads[0] == pytest.approx(leads[1])
+    assert leads[0]
 
 
 @pytest.mark.parametrize("gap_deg", [4.0, 10.0, 18.0])

@@ -148,7 +148,7 @@ def test_whatever_comes_probes_keep_distance_and_come_last(history: list[tuple[G
     found = run(ALLOWED, seen)
     assert all(decision.reason for decision in found)
     probed = [each.time for each, decision in zip(seen, found, strict=True) if isinstance(decision.ask, Probe)]
-    assert all(after - before >= ALLOWED.interval for before, after in pairwise(probed))
+    assert all(after - before >= ALLOWED.times.interval for before, after in pairwise(probed))
     for k, decision in enumerate(found):
         if decision.ask:
             assert k >= 1

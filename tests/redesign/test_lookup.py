@@ -11,12 +11,13 @@ import pytest
 from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from scaling import scaled
 
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import (
     CellIndex,
@@ -98,6 +99,21 @@ def test_every_interval_lies_in_a_cell_at_most_four_times_as_wide(one: float, ot
 def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
     with pytest.raises(InvalidInput, match=named):
         Grid(**changes)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_default_grid_of_a_preset(name: str) -> None:
+    policy = CertifiedPolicy(Servo.preset(name), Uncertainty(input_bias=(-0.1, 0.1)))
+    assert Grid.of(policy) == Grid()
+    assert Grid.of(policy, noises=(0.0,)) == Grid(noises=(0.0,))
+
+
+def test_a_machine_in_other_units_has_the_grid_in_them() -> None:
+    servo, steps = scaled(Servo.preset("paper"), 8.0, 2.0**-20, 2.0**7), (2.0**-20 * 1e-4, 2.0**-20 * 1e-3)
+    found = Grid.of(CertifiedPolicy(servo, Uncertainty(step=steps)))
+    assert found.finest == Grid().finest
+    assert found.biases == pytest.approx([2.0**7 * bias for bias in Grid().biases])
+    assert found.noises == pytest.approx([2.0**-20 * noise for noise in Grid().noises])
 
 
 # --- what is looked up

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import msgspec
 import numpy as np
 import pytest
+from scaling import scaled
 from scipy import stats
 
 from servotwin.commissioning.edge_settings import guarding
@@ -45,25 +46,6 @@ SMALL = Demands(
     machines=16, conditions=4, screened=2, settled=0.8, scales=(0.5, 0.7), integral=(0.0,), beyond=Beyond(machines=4)
 )
 NARROW = Uncertainty(gap=(9.9 * DEG, 10.1 * DEG), input_bias=(-2e-4, 2e-4))
-
-
-def scaled(servo: Servo, time: float, length: float, voltage: float) -> Servo:
-    """The same servo in other units: every solution is the same but for its scale."""
-    law, per = servo.controller, voltage / length
-    return servo.replace(
-        R=servo.R * voltage,
-        L=servo.L * voltage * time,
-        k_B=servo.k_B * voltage * time,
-        J=servo.J * time**2,
-        p=servo.p * length,
-        k=servo.k / time**2,
-        c=servo.c / time,
-        Kp=law.Kp * per,
-        Ki=law.Ki * per / time,
-        Kd=law.Kd * per * time,
-        Tf=law.Tf * time,
-        sample_rate=None if law.sample_rate is None else law.sample_rate / time,
-    )
 
 
 def inert_axis(rate: float) -> Servo:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Cells
-from servotwin.analysis.maps.settings import SHORT_WINDOW, MapSettings
+from servotwin.analysis.maps.settings import MapSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.ensemble import run_ensemble
@@ -33,10 +33,10 @@ class Measures:
     Attributes
     ----------
     settled : array
-        Share of the members whose half peak-to-peak in the final window is below `MapSettings.still`.
+        Share of the members whose half peak-to-peak in the final window is below `MapSettings.stillness`.
     settled_short : array
-        The same of the last ten seconds only (of the final window, if that is shorter). Where it is larger, there are
-        members that rest and move on.
+        The same of the last ten seconds of the servo's own only (of the final window, if that is shorter). Where it is
+        larger, there are members that rest and move on.
     error : array
         m, largest absolute error of any member in the final window: the steady error of those that settled.
     swing : array
@@ -134,15 +134,15 @@ def _draws(settings: MapSettings, cell: int) -> Array:
 
 def _reduced(settings: MapSettings, step: Array, position: Array, voltage: Array) -> Measures:
     """Measures of trajectories (cells, members, samples); `step` is (cells, 1, 1)."""
-    tail = _tail(position, settings.window * settings.sample_rate)
-    short = _tail(tail, SHORT_WINDOW * settings.sample_rate)
+    tail = _tail(position, settings.last_part * settings.sample_rate)
+    short = _tail(tail, settings.short_part * settings.sample_rate)
     swing, swing_short = (0.5 * np.ptp(each, axis=2) for each in (tail, short))
     inside = np.abs(position - tail.mean(axis=2, keepdims=True)) <= SETTLING_BAND * step
     since = _since(inside) / settings.sample_rate
-    settling = np.where(since <= settings.duration - settings.window, since, np.inf)
+    settling = np.where(since <= settings.run_time - settings.last_part, since, np.inf)
     return Measures(
-        np.mean(swing < settings.still, axis=1),
-        np.mean(swing_short < settings.still, axis=1),
+        np.mean(swing < settings.stillness, axis=1),
+        np.mean(swing_short < settings.stillness, axis=1),
         np.abs(step - tail).max(axis=(1, 2)),
         swing.max(axis=1),
         settling.max(axis=1),

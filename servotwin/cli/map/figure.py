@@ -112,7 +112,7 @@ def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Fig
     _shares(axes[0, 1], across, grid("settled"), bool(slow.any()))
     error, swing = grid("error") / unit, grid("swing") / unit
     _colour(axes[1, 0], across, up, error, _norm(error))
-    _colour(axes[1, 1], across, up, swing, _norm(swing, result.settings.still / unit))
+    _colour(axes[1, 1], across, up, swing, _norm(swing, result.settings.stillness / unit))
     _colour(axes[2, 0], across, up, grid("settling"), _norm(grid("settling"), 0.5))
     _colour(axes[2, 1], across, up, grid("effort"), _norm(grid("effort")))
     titles = (

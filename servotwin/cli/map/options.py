@@ -34,9 +34,9 @@ class MapOptions:
     members: int = 16
     motion: float = 1.0
     seed: int = 0
-    duration: float = 120.0
-    window: float = 40.0
-    still_um: float = 1.0
+    duration: float | None = None
+    window: float | None = None
+    still_um: float | None = None
 
     def settings(self) -> MapSettings:
         """Settings of the map.
@@ -62,7 +62,7 @@ class MapOptions:
             seed=self.seed,
             duration=self.duration,
             window=self.window,
-            still=self.still_um * 1e-6,
+            still=None if self.still_um is None else self.still_um * 1e-6,
         )
 
     def _axes(self) -> Axes:

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
-from servotwin.analysis.maps.settings import SHORT_WINDOW
 from servotwin.hybrid.automaton import Array
 
 ROWS = 21
@@ -61,11 +60,12 @@ def sentences(result: StabilityMap) -> tuple[str, ...]:
     s, settled = result.settings, result.grid("settled")
     slow = int(result.slow.sum())
     return (
-        f"{s.count} cells with {s.members} initial states each, {s.duration:g} s a run;"
-        f" settled: half the peak-to-peak of the last {s.window:g} s below {s.still * 1e6:g} um{_scale(result)}.",
+        f"{s.count} cells with {s.members} initial states each, {s.run_time:g} s a run;"
+        f" settled: half the peak-to-peak of the last {s.last_part:g} s"
+        f" below {s.stillness * 1e6:g} um{_scale(result)}.",
         f"Every run settles in {np.mean(settled == 1.0):.1%} of the cells, none in {np.mean(settled == 0.0):.1%};"
         f" {np.mean(settled):.1%} of all runs settle.",
-        f"In {slow} cells the last {SHORT_WINDOW:g} s alone would call more runs settled: they rest, then move on.",
+        f"In {slow} cells the last {s.short_part:g} s alone would call more runs settled: they rest, then move on.",
     )
 
 
@@ -76,7 +76,7 @@ def _scale(result: StabilityMap) -> str:
     at = f" at a gap of {math.degrees(axes.gap):g} deg"
     if law.voltage_limit is not None or law.feedforward != 0.0:  # neither scales with the gap
         return f"{at}, for which alone this map is made"
-    return f"{at}, {result.settings.still / (0.5 * result.settings.servo.p * axes.gap):.3g} p b at any"
+    return f"{at}, {result.settings.stillness / (0.5 * result.settings.servo.p * axes.gap):.3g} p b at any"
 
 
 def text(result: StabilityMap) -> str:

@@ -44,6 +44,7 @@ from servotwin.estimation.trend import Prior
 from servotwin.estimation.whitened.channels import faults, motor_angle
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -171,7 +172,7 @@ def estimate_jointly(
         Unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short; an elastic screw; no
         window at all, or some with theta_m and some without.
     """
-    given = settings or JointSettings()
+    given = (settings or JointSettings()).on(scales(servo).time)
     windows = _windows(window)
     names = _free(windows[0], free)
     fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
@@ -222,9 +223,9 @@ def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointS
         raise InvalidInput(f"{window.where}the window has neither theta_m (rad) nor voltage (V): one of them is needed")
     if not servo.rigid:
         raise InvalidInput(f"servo k_d = {servo.k_d} N/m: the joint estimator needs a rigid screw (k_d = inf)")
-    delay = ("delay",) if settings.largest_delay_s > 0.0 else ()
+    delay = ("delay",) if settings.delay_limit > 0.0 else ()
     motor = MOTOR_START if window.theta_m is None else ()
-    margin, factor = margin_for(settings.largest_delay_s, window.sample_rate), decimation_factor(window.sample_rate)
+    margin, factor = margin_for(settings.delay_limit, window.sample_rate), decimation_factor(servo, window.sample_rate)
     fewest = max(SHORTEST, shortest_for(factor, MINIMUM_SAMPLES)) + 2 * margin
     if window.position.size < fewest:
         raise InvalidInput(
@@ -256,8 +257,8 @@ def _fit(
     model = _model(window, servo, names, settings)
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
-        smooth = window.replace(theta_m=motor_angle(window, servo.encoder_resolution, WhitenedSettings()))
-        model = replace(model, window=smooth)
+        angle = motor_angle(window, servo.encoder_resolution, WhitenedSettings(), scales(servo).time)
+        model = replace(model, window=window.replace(theta_m=angle))
     silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
     if broken or silence:
         return unsearched(model, prior, settings, blocked=broken or silence)

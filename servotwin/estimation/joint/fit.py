@@ -18,11 +18,14 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, Reduce
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
 from servotwin.estimation.trend import Prior
+from servotwin.plant.scales import scales
+from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 Flags: TypeAlias = NDArray[np.bool_]
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-10, 1e9
 _SINGULAR = 1e-8  # of a derivative's length: what the others leave of it below this is nothing
+_LEAST_VOLTAGE = 1e-6  # V, the servo's own
 _SMALL_GAIN = 1e-6  # of the cost: a step that gains less is the last; whitened, far below one standard deviation
 
 
@@ -131,12 +134,12 @@ AnyPrior = float | GapEstimate | Prior | None
 def _known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
     """Bounds and priors of the model's parameters."""
     rows = {"gap": (0.0, settings.largest_gap_rad, 0.0, math.inf), "place": (-1.0, 1.0, 0.0, math.inf)}
-    rows["delay"] = (-settings.largest_delay_s, settings.largest_delay_s, 0.0, math.inf)
+    rows["delay"] = (-settings.delay_limit, settings.delay_limit, 0.0, math.inf)
     rows.update({name: (-4.0 * s, 4.0 * s, 0.0, s) for name, s in ((n, settings.spread(n)) for n in SPREADS)})
     if isinstance(prior, Prior):
         rows["gap"] = (0.0, settings.largest_gap_rad, prior.gap, max(prior.gap_std, settings.model_error_rad))
     if model.window.voltage is not None and model.window.theta_m is None:
-        size = max(1e-6, float(np.abs(model.window.voltage).max()))
+        size = max(_LEAST_VOLTAGE * scales(model.servo).voltage, float(np.abs(model.window.voltage).max()))
         speed, current = size / model.servo.k_B, size / model.servo.R
         rows["speed0"] = (-4.0 * speed, 4.0 * speed, float(model.window.voltage[0]) / model.servo.k_B, speed)
         rows["current0"] = (-4.0 * current, 4.0 * current, 0.0, current)
@@ -168,9 +171,11 @@ def _gap_of(prior: AnyPrior) -> float | None:
 
 
 def tolerance_of(model: JointModel) -> Array:
-    """(P,) steps small enough to end a search: 3e-5 deg for the gap, 1e-6 for logarithms."""
-    steps = {"gap": 5e-7, "place": 1e-2, "delay": 1e-8, "gap rate": 1e-6, "speed0": 1e-3, "current0": 1e-4}
-    steps.update({f"{JUMP}{index}": 1e-8 for index in model.jumps})
+    """(P,) steps small enough to end a search: 3e-5 deg for the gap, 1e-6 for logarithms; the servo's own units."""
+    second, _, volt = scales(model.servo)
+    steps = {"gap": 5e-7, "place": 1e-2, "delay": 1e-8 * second, "current0": 1e-4}
+    steps.update({"gap rate": 1e-6 / second, "speed0": 1e-3 / second})
+    steps.update({f"{JUMP}{index}": 1e-8 * second * volt for index in model.jumps})
     return np.array([steps.get(name, 1e-6) for name in model.names])
 
 
@@ -236,7 +241,8 @@ def _without_motor_start(model: JointModel, table: Array) -> Array:
 RIVAL, APART = 12.0, math.radians(0.3)  # a rival's cost is as near; minima closer than this (rad) are one
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _STARTS = 3
-_SAMPLES_HZ = 250.0  # rate after decimation: at a lower one the noise model fits itself to the residual
+# Rate after decimation, in the servo's own seconds: at a lower one the noise model fits itself to the residual.
+_SAMPLES_HZ = 250.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +287,7 @@ class WindowMinima:
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
     """Make the fit from which a search begins."""
     known, noise = _known_of(model, prior, settings), Autoregression.white(1.0)
-    reduce = decimation(decimation_factor(model.rate))
+    reduce = decimation(decimation_factor(model.servo, model.rate))
     here = _evaluate_at(model, start_of(model, prior), known, reduce.rows)
     return WindowMinima(model, known, reduce, noise, (here,), here.evaluations, blocked)
 
@@ -320,9 +326,9 @@ def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoi
     return replace(fit, minima=minima, evaluations=fit.evaluations + sum(one.evaluations for one in ends))
 
 
-def decimation_factor(rate: float) -> int:
+def decimation_factor(servo: Servo, rate: float) -> int:
     """Factor by which a window sampled at `rate` (Hz) is decimated for the fit."""
-    return max(1, int(rate / _SAMPLES_HZ))
+    return max(1, int(rate * scales(servo).time / _SAMPLES_HZ + 1e-9))
 
 
 def _distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:

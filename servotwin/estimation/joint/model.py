@@ -212,7 +212,7 @@ def jumps(voltage: Array) -> tuple[int, ...]:
 
 def margin_for(limit: float, rate: float) -> int:
     """Samples to leave out at either end for delays of up to `limit` (s) at `rate` (Hz)."""
-    return math.ceil(limit * rate) + _EDGE
+    return math.ceil(limit * rate - 1e-9) + _EDGE
 
 
 def cubic(x: float) -> tuple[float, float, float, float]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from servotwin.estimation.core.contacts import Gap, Travel, travel
 from servotwin.estimation.core.response import response
+from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
 from servotwin.estimation.joint.model import JointModel
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
@@ -150,7 +151,9 @@ def _verdict(fit: JointFit, std: float, settings: JointSettings) -> tuple[GapSta
             f"the gap is known to {math.degrees(std):.3g} deg only" if math.isfinite(std) else "nothing shows the gap"
         )
         return GapStatus.UNIDENTIFIABLE, (f"{known}, and {math.degrees(settings.largest_std_rad):.3g} deg are allowed",)
-    status, reasons = _by_contacts(fit, settings.contact_travel_rad)
+    travel = settings.contact_travel_rad
+    needed = least_travel(fit.values["gap"], fit.model.servo.encoder_resolution) if travel is None else travel
+    status, reasons = _by_contacts(fit, needed)
     bound = at_bound(fit, settings)
     if not bound:
         return status, reasons
@@ -174,8 +177,8 @@ def mismatched(fit: JointFit, settings: JointSettings) -> str:
     for name, value in fit.values.items():
         if name in SPREADS and abs(value) >= 3.999 * settings.spread(name):
             return f"{name} would have to leave its bounds of four times the spread of {settings.spread(name):.3g}"
-        if name == "delay" and abs(value) >= 0.999 * settings.largest_delay_s:
-            return f"the channels would have to be out of step by more than {1e3 * settings.largest_delay_s:.3g} ms"
+        if name == "delay" and abs(value) >= 0.999 * settings.delay_limit:
+            return f"the channels would have to be out of step by more than {1e3 * settings.delay_limit:.3g} ms"
     return ""
 
 

@@ -28,12 +28,15 @@ from servotwin.estimation.paper.residual import PlayResidual, standard_deviation
 from servotwin.estimation.paper.settings import PaperSettings
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 __all__ = ["METHOD", "PaperSettings", "estimate", "shortest_window"]
 
-_SPAN_S = 0.02  # speeds are taken over this time: one encoder count between two samples is no motion
+_SPAN_S = (
+    0.02  # s of the servo's own: speeds are taken over this time: one encoder count between two samples is no motion
+)
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,9 @@ class MotorMotion:
     reversals: int
 
 
-def motion(theta_m: Array, sample_rate: float, rest_speed: float) -> MotorMotion:
-    """Motion of an angle theta_m (n,) rad; slower than `rest_speed` (rad/s) counts as rest."""
-    span = min(max(1, round(_SPAN_S * sample_rate)), theta_m.size - 1)
+def motion(theta_m: Array, sample_rate: float, rest_speed: float, second: float = 1.0) -> MotorMotion:
+    """Motion of an angle theta_m (n,) rad; slower than `rest_speed` (rad/s) is rest; `second` is the servo's, s."""
+    span = min(max(1, round(_SPAN_S * sample_rate * second)), theta_m.size - 1)
     speed = (theta_m[span:] - theta_m[:-span]) * (sample_rate / span)
     direction = np.sign(speed[np.abs(speed) > rest_speed])
     return MotorMotion(direction.size / speed.size, int(np.count_nonzero(np.diff(direction))))
@@ -126,9 +129,9 @@ METHOD = "paper"
 _GRADIENT_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-9  # of the motor's range: 1e-5 deg in the paper's loop
 
 
-def shortest_window(settings: PaperSettings, sample_rate: float) -> tuple[float, str]:
+def shortest_window(settings: PaperSettings, servo: Servo, sample_rate: float) -> tuple[float, str]:
     """Shortest window (s) at a sample rate (Hz), and the reason in words."""
-    settle = settings.settle_s
+    settle = settings.times(scales(servo).time).settle
     return settle + MINIMUM_SAMPLES / sample_rate, f"the observer, which takes {settle!r} s to settle"
 
 
@@ -152,14 +155,16 @@ def estimate(
         No theta_m, a window too short for the observer to settle, a low-pass above half the sample rate.
     """
     settings = settings or PaperSettings()
-    theta_m, position = _channels(window, settings)
-    refusal = _unmoved(theta_m, window.sample_rate, settings)
+    second = scales(servo).time
+    times = settings.times(second)
+    theta_m, position = _channels(window, servo, settings)
+    refusal = _unmoved(theta_m, window.sample_rate, settings, second)
     if refusal:
         return _nothing(window, servo, refusal)
-    model = observer(servo, settings.alpha)
+    model = observer(servo, times.alpha)
     origin = float(position[0]) if settings.origin == "first" else 0.0
     angle_origin = origin / model.static_gain
-    skip = math.ceil(settings.settle_s * window.sample_rate - 1e-9)
+    skip = math.ceil(times.settle * window.sample_rate - 1e-9)
     theta_m = theta_m - angle_origin
     residual = PlayResidual.of(theta_m, position - origin, window.sample_rate, model, servo.p, skip)
     previous = prior.gap if isinstance(prior, GapEstimate) else prior
@@ -168,15 +173,15 @@ def estimate(
     return _stated(_nothing(window, servo), settings, residual, minimum, angle_origin)
 
 
-def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
+def _channels(window: Window, servo: Servo, settings: PaperSettings) -> tuple[Array, Array]:
     """theta_m and position, low-passed where the settings say so."""
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method 'paper' needs the motor's angle in rad")
-    needed, _ = shortest_window(settings, window.sample_rate)
-    if window.duration < needed:
+    needed, _ = shortest_window(settings, servo, window.sample_rate)
+    if window.duration < needed * (1.0 - 1e-9):
         raise InvalidInput(
             f"{window.where}the window lasts {window.duration:.6g} s: must be at least {needed:.6g} s, so that the "
-            f"observer can settle for settle_s = {settings.settle_s:.6g} s"
+            f"observer can settle for settle_s = {settings.times(scales(servo).time).settle:.6g} s"
         )
     cutoff, rate = settings.lowpass_hz, window.sample_rate
     if cutoff is None:
@@ -189,11 +194,12 @@ def _channels(window: Window, settings: PaperSettings) -> tuple[Array, Array]:
     return lowpass.respond(window.theta_m), lowpass.respond(window.position)
 
 
-def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings) -> str:
+def _unmoved(theta_m: Array, sample_rate: float, settings: PaperSettings, second: float) -> str:
     """Reason for which the motor's motion cannot show a gap; empty when it can."""
-    course = motion(theta_m, sample_rate, settings.rest_speed)
+    rest_speed = settings.times(second).rest_speed
+    course = motion(theta_m, sample_rate, rest_speed, second)
     if course.moving == 0.0:
-        return f"the motor never moved faster than {settings.rest_speed:.3g} rad/s"
+        return f"the motor never moved faster than {rest_speed:.3g} rad/s"
     if course.reversals < settings.reversals:
         return f"the motor changed direction {course.reversals} times, and {settings.reversals} are needed"
     return ""

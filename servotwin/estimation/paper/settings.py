@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import check, key, settings
 from servotwin.estimation.paper.zero_phase import PADDINGS
 
 _ORIGINS = ("absolute", "first")
+# rad/s, s and rad/s on the paper's servo.
+_ALPHA, _SETTLE, _REST_SPEED = 40.0, 0.25, 0.1
+
+
+class ObserverTimes(NamedTuple):
+    """Pole of the observer (1/s, without its sign), time for it to settle (s), speed of a motor at rest (rad/s)."""
+
+    alpha: float
+    settle: float
+    rest_speed: float
 
 
 @settings("estimator")
@@ -26,10 +36,22 @@ class PaperSettings:
     `rest_speed` (erratum E14).
     """
 
-    alpha: Annotated[float, key("alpha_rad_per_s", above=0.0, help="Poles of the observer are at minus this.")] = 40.0
+    alpha: Annotated[
+        float | None,
+        key(
+            "alpha_rad_per_s",
+            above=0.0,
+            help="Poles of the observer are at minus this; where absent the paper's 40 rad/s, in the servo's own time.",
+        ),
+    ] = None
     settle_s: Annotated[
-        float, key(minimum=0.0, help="Start of a window that the cost ignores, k_s T_s in the paper.")
-    ] = 0.25
+        float | None,
+        key(
+            minimum=0.0,
+            help="Start of a window that the cost ignores, k_s T_s in the paper; where absent the paper's 0.25 s, in "
+            "the servo's own time.",
+        ),
+    ] = None
     lowpass_hz: Annotated[
         float | None,
         key(
@@ -63,8 +85,14 @@ class PaperSettings:
     )
     reversals: Annotated[int, key(minimum=0, help="Smallest number of reversals of the motor.")] = 1
     rest_speed: Annotated[
-        float, key("rest_speed_rad_per_s", minimum=0.0, help="Speed of the motor below which it counts as at rest.")
-    ] = 0.1
+        float | None,
+        key(
+            "rest_speed_rad_per_s",
+            minimum=0.0,
+            help="Speed of the motor below which it counts as at rest; where absent 0.1 rad/s on the paper's servo, in "
+            "the own time of another.",
+        ),
+    ] = None
     contact_travel: Annotated[
         float, key("contact_travel_deg", minimum=0.0, help="Least travel of the fitted screw in each contact.")
     ] = math.radians(0.5)
@@ -94,3 +122,11 @@ class PaperSettings:
 
     def __post_init__(self) -> None:
         check(self)
+
+    def times(self, second: float) -> ObserverTimes:
+        """Times and speeds on a servo whose own second (`plant.scales`) is so many seconds."""
+        return ObserverTimes(
+            _ALPHA / second if self.alpha is None else self.alpha,
+            _SETTLE * second if self.settle_s is None else self.settle_s,
+            _REST_SPEED / second if self.rest_speed is None else self.rest_speed,
+        )

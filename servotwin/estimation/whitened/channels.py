@@ -25,7 +25,7 @@ _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; shar
 _JUMP = 50.0  # times the usual fastest motion
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
 _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder: below, nothing; above, the lowest cut
-_HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3
+_HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
 
 
 def faults(window: Window) -> tuple[str, ...]:
@@ -79,11 +79,11 @@ def _encoder_noise(theta_m: Array) -> float:
     return float(np.median(sizes[sizes > 0.0])) if np.any(sizes > 0.0) else 0.0
 
 
-def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -> Array:
+def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, second: float) -> Array:
     """(n,) theta_m, low-passed without phase where the encoder is noisy.
 
     The play operator would ratchet to the extremes of the noise. The cut-off goes from 200 Hz for little noise down to
-    60 Hz.
+    60 Hz, on the paper's servo.
 
     Parameters
     ----------
@@ -91,6 +91,8 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -
     resolution : float
         rad, one count of the encoder.
     settings : WhitenedSettings
+    second : float
+        s, one of the servo's own (`plant.scales`).
     """
     assert window.theta_m is not None
     cutoff, rate = settings.prefilter_hz, window.sample_rate
@@ -99,7 +101,7 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings) -
         if max(noise, resolution / math.sqrt(12.0)) <= _QUIET:
             return window.theta_m
         share = math.log(max(noise, _QUIET) / _QUIET) / math.log(_LOUD / _QUIET)
-        cutoff = _HIGHEST_HZ * (_LOWEST_HZ / _HIGHEST_HZ) ** min(1.0, share)
+        cutoff = _HIGHEST_HZ / second * (_LOWEST_HZ / _HIGHEST_HZ) ** min(1.0, share)
         if cutoff >= 0.45 * rate:
             return window.theta_m
     if cutoff == 0.0:
@@ -116,12 +118,12 @@ _ANGLE_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi, "units of 57
 _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 
 
-def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float) -> tuple[str, ...]:
+def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float, second: float) -> tuple[str, ...]:
     """Find the first fault whose correction lets the model explain the window; empty where none does or is needed."""
     if unexplained <= _EXPLAINS:
         return ()
     for sentence, angle, position, rate in _candidates(window, theta_m):
-        if _share_left(angle, position, rate, servo) < min(_EXPLAINS, _BETTER * unexplained):
+        if _share_left(angle, position, rate, servo, second) < min(_EXPLAINS, _BETTER * unexplained):
             return (sentence,)
     return ()
 
@@ -140,7 +142,7 @@ def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Ar
         yield wrong, theta_m, position, factor * rate
 
 
-def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> float:
+def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo, second: float) -> float:
     """Slow part of a plain fit's residual over that of the position."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
     angle, reduced = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
@@ -149,6 +151,6 @@ def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo) -> f
     fit = min(search(reduction.coarse(), gaps_to_try(span, 9), span, 1e-4 * span), key=lambda fit: fit.slopes.cost)
     table = reduction.table(fit.point)
     left = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
-    interval = reduction.response.interval * reduction.decimation.factor
+    interval = reduction.response.interval * reduction.decimation.factor / second
     variation = float(np.std(slow(reduction.position, interval)))
     return float(np.sqrt(np.mean(slow(left, interval) ** 2))) / variation if variation > 0.0 else math.inf

@@ -13,12 +13,12 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
+from servotwin.estimation.core.visible import least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
-    SMALLEST_BOUND,
     FitEvidence,
     ModelShift,
     contacts_seen,
@@ -29,10 +29,12 @@ from servotwin.estimation.whitened.gate import (
     one_sided,
     slow_share,
     static_lost_motion,
+    travel_needed,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import Window
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -40,10 +42,11 @@ __all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "f
 
 METHOD = "whitened"
 _ONE_CONTACT = "one contact with a model that is a little off explains the window nearly as well as two"
+_NO_SHIFT = ModelShift(0.0, math.inf, "", 0.0)
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
 
-def shortest_window(_settings: WhitenedSettings, sample_rate: float) -> tuple[float, str]:
+def shortest_window(_settings: WhitenedSettings, _servo: Servo, sample_rate: float) -> tuple[float, str]:
     """Shortest window (s) at a sample rate (Hz), and the reason in words."""
     return SHORTEST / sample_rate, f"method {METHOD!r}, which needs {SHORTEST} samples"
 
@@ -88,6 +91,8 @@ class WindowFit:
         None: the channels are broken.
     learnt : LearntFit, optional
         The same with the factors that were free; None: the model was taken as it is.
+    second : float
+        s, one of the servo's own (`plant.scales`).
     """
 
     window: Window
@@ -98,10 +103,14 @@ class WindowFit:
     angle: Array
     aligned: AlignedFit | None
     learnt: LearntFit | None = None
+    second: float = 1.0
 
     def one_sided(self) -> str:
         """Reason for which the window has too little contact to show the gap; empty when it has enough."""
-        return "" if self.aligned is None else one_sided(_travel(self.aligned.whitened), self.settings)
+        if self.aligned is None:
+            return ""
+        fitted = self.aligned.whitened
+        return one_sided(_travel(fitted), travel_needed(fitted.point.gap, self.servo, self.settings), self.settings)
 
     def rms(self) -> float:
         """Root mean square of the fit's residual, m."""
@@ -111,7 +120,7 @@ class WindowFit:
         """Judge the fit and make the estimate."""
         if self.aligned is None:
             return self.blank
-        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings)
+        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings)
         status, reasons = judge(evidence, self.settings)
@@ -125,7 +134,8 @@ class WindowFit:
                 return _one_contact(self.blank, evidence, contacts, reasons, self.settings)
             teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
-            reasons = (*likely_fault(self.window, self.angle, self.servo, evidence.unexplained), *reasons)
+            fault = likely_fault(self.window, self.angle, self.servo, evidence.unexplained, self.second)
+            reasons = (*fault, *reasons)
         stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
         if self.learnt is None or not teaches:
             return stated
@@ -149,7 +159,8 @@ def fit(
 
     With `machine`, the model's factors are free within that; without it the model is taken as it is.
     """
-    settings = settings or WhitenedSettings()
+    second = scales(servo).time
+    settings = (settings or WhitenedSettings()).on(second)
     _check(window)
     assert window.theta_m is not None
     blank = _nothing(window, servo, prior)
@@ -158,15 +169,14 @@ def fit(
         dead = any("constant" in sentence for sentence in broken)
         blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
         return WindowFit(window, servo, prior, settings, blank, window.theta_m, None)
-    angle = motor_angle(window, servo.encoder_resolution, settings)
+    angle = motor_angle(window, servo.encoder_resolution, settings, second)
     position, rate = window.position, window.sample_rate
     if machine is not None:
         learnt = learn_and_fit(angle, position, rate, servo, _start(prior), settings, machine)
-        return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt)
+        return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt, second)
     _, points = look_around(angle, position, rate, servo, _start(prior), settings)
-    return WindowFit(
-        window, servo, prior, settings, blank, angle, align_and_fit(angle, position, rate, servo, points, settings)
-    )
+    aligned = align_and_fit(angle, position, rate, servo, points, settings)
+    return WindowFit(window, servo, prior, settings, blank, angle, aligned, second=second)
 
 
 def _check(window: Window) -> None:
@@ -183,21 +193,23 @@ def _start(prior: float | GapEstimate | None) -> float:
 
 
 def _evidence(
-    aligned: AlignedFit, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings
+    aligned: AlignedFit, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings, second: float
 ) -> FitEvidence:
     result = aligned.whitened
     std = settings.calibration * result.std * math.sqrt(max(1.0, result.variance))
-    gain = result.reduction.response.static_gain
+    gain, gap = result.reduction.response.static_gain, result.point.gap
     identifiable = math.isfinite(result.std)
     return FitEvidence(
         aligned=aligned,
         std=std,
         interval=profile_interval(result, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
         travel=_travel(result),
-        shift=model_shift(result, servo, settings.order) if identifiable else ModelShift(0.0, math.inf, "", 0.0),
-        observer=observer_shift(result, servo) if identifiable else (0.0, math.inf),
-        lost_motion=static_lost_motion(angle, window.position, window.sample_rate, gain, result.point.gap),
-        unexplained=slow_share(result),
+        shift=model_shift(result, servo, settings.order, second) if identifiable else _NO_SHIFT,
+        observer=observer_shift(result, servo, second) if identifiable else (0.0, math.inf),
+        lost_motion=static_lost_motion(angle, window.position, window.sample_rate * second, gain, gap),
+        unexplained=slow_share(result, second),
+        needed=travel_needed(gap, servo, settings),
+        smallest=least_bound(servo.encoder_resolution),
     )
 
 
@@ -238,7 +250,7 @@ def _one_contact(
     blank = replace(blank, reasons=reasons, rms=_left(fitted), evaluations=fitted.evaluations)
     lead = contacts.lead - NORMAL_95 * math.hypot(settings.model_error, contacts.lead_std)
     bound = min(lead, lower_bound(evidence, settings))
-    if bound < SMALLEST_BOUND:
+    if bound < evidence.smallest:
         return replace(blank, status=GapStatus.UNIDENTIFIABLE)
     return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
 

@@ -241,7 +241,7 @@ def align_and_fit(
         measured = position[behind : position.size - ahead]
         fitted = _fit(angle, measured, rate, servo, points, settings)
         late = _delay(fitted.whitened) * rate if settings.skew else 0.0
-        if abs(late) <= 0.5 or abs(shift + late) > settings.largest_skew * rate or attempt == _ALIGNMENTS - 1:
+        if abs(late) <= 0.5 or abs(shift + late) > settings.skew_limit * rate or attempt == _ALIGNMENTS - 1:
             break
         shift, points = shift + round(late), [fitted.whitened.point]
     return AlignedFit(fitted.whitened, (shift + late) / rate, fitted.span, fitted.first)

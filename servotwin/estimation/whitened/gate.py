@@ -20,6 +20,7 @@ from servotwin.estimation.core.contacts import BY_RATE, Travel
 from servotwin.estimation.core.least_squares import LeastSquares, least_squares, orthonormal, project_out, spread
 from servotwin.estimation.core.reduced import ReducedResponse
 from servotwin.estimation.core.variants import variants
+from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.estimation.paper.observer import LagFilter, observer
@@ -38,16 +39,17 @@ from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
+# Seconds are the servo's own (`plant.scales`): `second` is how many seconds one of them has.
 _SLOW_S = 0.06  # s: motions faster than this are averaged away, twice
 _CHANCE = 6.0  # times what white noise would leave when averaged; decimated, it leaves twice that
 
 
-def slow_share(result: WhitenedFit) -> float:
+def slow_share(result: WhitenedFit, second: float) -> float:
     """Slow part of the residual over the slow variation of the position, rms both; 0 where it can be noise.
 
     Where hardly anything moves, noise is most of the position's own variation, and that is no fault.
     """
-    interval = result.reduction.response.interval * result.reduction.decimation.factor
+    interval = result.reduction.response.interval * result.reduction.decimation.factor / second
     variation = float(np.std(slow(result.reduction.position, interval)))
     left = result.left
     remains = _rms(slow(left, interval))
@@ -57,7 +59,10 @@ def slow_share(result: WhitenedFit) -> float:
 
 
 def _averaged_noise(values: Array, interval: float) -> float:
-    """rms of the slow part of white noise that has a signal's (m,) differences from sample to sample."""
+    """rms of the slow part of white noise that has a signal's (m,) differences from sample to sample.
+
+    The interval here and below is in the servo's own seconds.
+    """
     weights = np.convolve(_averaging(interval), _averaging(interval))
     return _rms(np.diff(values)) * math.sqrt(0.5 * float(weights @ weights))
 
@@ -84,7 +89,7 @@ def _rms(values: Array) -> float:
     return math.sqrt(float(values @ values) / values.size)
 
 
-_BLOCK_S = 0.1  # length of a block
+_BLOCK_S = 0.1  # s, length of a block
 _STILL = 0.02  # of the gap: what moves less within a block rests
 
 
@@ -96,7 +101,7 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
     theta_m, position : (n,) arrays
         rad, m.
     rate : float
-        Hz.
+        Samples per second of the servo's own.
     static_gain : float
         m/rad.
     gap : float
@@ -115,7 +120,7 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
 _STEP = 1e-3  # relative
 _STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
 _TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
-GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
+_GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
 _ALPHA = 40.0  # rad/s, the paper's observer
 
 
@@ -131,7 +136,7 @@ class ModelShift(NamedTuple):
     gain: float
 
 
-def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
+def model_shift(result: WhitenedFit, servo: Servo, order: int, second: float) -> ModelShift:
     """Move of the gap when the model is free within `_TOLERANCES`, in the noise that is then left.
 
     Whitening takes the error of a wrong model for noise; a free model takes it up itself.
@@ -145,7 +150,7 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
     sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
         free = np.vstack([free, model.respond(screw[BY_RATE:])])
-        sizes.append(GROWTH * model.response.interval)
+        sizes.append(_GROWTH / second * model.response.interval)
     free *= np.array(sizes)[:, None]
     table, size = np.vstack([table, free]), len(free)
     shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
@@ -154,7 +159,7 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int) -> ModelShift:
     solved = _within_tolerance(rows, size)
     own = spread(rows[GAP], rows[PLACE:-size])
     std = math.sqrt(max(0.0, float(solved.deviations[0]) ** 2 - own**2)) if math.isfinite(own) else math.inf
-    words = _words(solved.coefficients[-size:], solved.deviations[-size:])
+    words = _words(solved.coefficients[-size:], solved.deviations[-size:], second)
     gain = (
         2.0 * table.shape[1] * math.log(result.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
     )
@@ -169,11 +174,13 @@ def _within_tolerance(rows: Array, free: int) -> LeastSquares:
     return least_squares(columns[GAP:], columns[RESIDUAL])
 
 
-def _words(shares: Array, deviations: Array) -> str:
+def _words(shares: Array, deviations: Array, second: float) -> str:
     """Describe the direction that is needed most, and its size."""
     index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
     if index == len(_TOLERANCES):
-        return f"a gap that grows by {math.degrees(GROWTH) * shares[index]:+.2g} deg/s would explain most of it"
+        return (
+            f"a gap that grows by {math.degrees(_GROWTH / second) * shares[index]:+.2g} deg/s would explain most of it"
+        )
     name = list(_TOLERANCES)[index]
     return f"a {name} off by {100.0 * _TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
 
@@ -190,17 +197,17 @@ def _neighbours(servo: Servo, model: ReducedResponse) -> tuple[Neighbour, ...]:
     return tuple(Neighbour.of(model, other, step, row) for row, (other, step) in enumerate(steps))
 
 
-def observer_shift(result: WhitenedFit, servo: Servo) -> tuple[float, float]:
+def observer_shift(result: WhitenedFit, servo: Servo, second: float) -> tuple[float, float]:
     """Return the change of the gap (rad) in the paper's observer form, and its standard deviation.
 
     The observer weights the residual by denominator / (s + alpha)^N; one step of Gauss and Newton in that weight.
     """
     reduction = result.reduction
-    interval = reduction.response.interval * reduction.decimation.factor
-    model = observer(servo, _ALPHA)
-    weight = LagFilter.sampled(model.denominator, model.order, _ALPHA, interval)
+    interval, alpha = reduction.response.interval * reduction.decimation.factor, _ALPHA / second
+    model = observer(servo, alpha)
+    weight = LagFilter.sampled(model.denominator, model.order, alpha, interval)
     rows = np.array([weight.respond(row) for row in result.table])
-    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, interval, rows.shape[1])]))
+    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, alpha * interval, rows.shape[1])]))
     left = project_out(basis, rows[[RESIDUAL, GAP]])
     information = float(left[1] @ left[1])
     if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
@@ -211,14 +218,13 @@ def observer_shift(result: WhitenedFit, servo: Servo) -> tuple[float, float]:
     return float(left[0] @ left[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
 
 
-def _transients(order: int, interval: float, samples: int) -> Array:
-    """(order, m) what the observer has not yet forgotten: t^i exp(-alpha t)."""
-    time = _ALPHA * interval * np.arange(samples)
+def _transients(order: int, step: float, samples: int) -> Array:
+    """(order, m) what the observer has not yet forgotten: t^i exp(-t), in steps of alpha times the interval."""
+    time = step * np.arange(samples)
     return np.array([time**i * np.exp(-time) for i in range(order)])
 
 
 _SIGMAS = 3.0  # standard deviations by which another view may disagree
-SMALLEST_BOUND = math.radians(0.1)  # a lower bound below this says nothing
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
 
@@ -244,6 +250,10 @@ class FitEvidence:
         rad, range of the lead at rest.
     unexplained : float
         Slow part of the residual over that of the position.
+    needed : float
+        rad, least travel in each contact.
+    smallest : float
+        rad: a lower bound below this says nothing.
     """
 
     aligned: AlignedFit
@@ -254,6 +264,8 @@ class FitEvidence:
     observer: tuple[float, float]
     lost_motion: float
     unexplained: float
+    needed: float
+    smallest: float
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
@@ -261,12 +273,12 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
 
     Where the screw was not pushed far enough, the fitted gap means nothing, and other views need not agree with it.
     """
-    too_little = one_sided(evidence.travel, settings)
+    too_little = one_sided(evidence.travel, evidence.needed, settings)
     disagreements = () if too_little else _disagreements(evidence, settings)
     own = (_unexplained(evidence), _delayed(evidence, settings), _growing(evidence.aligned.whitened))
     mismatches = tuple(filter(None, (*own, *disagreements)))
     silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
-    bound = lower_bound(evidence, settings) > SMALLEST_BOUND and math.isinf(evidence.interval[1])
+    bound = lower_bound(evidence, settings) > evidence.smallest and math.isinf(evidence.interval[1])
     if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
@@ -288,10 +300,18 @@ def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:
     return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error)
 
 
-def one_sided(motion: Travel, settings: WhitenedSettings) -> str:
-    """Reason for which the contacts do not show the gap; with a known offset of the encoder one contact is enough."""
+def travel_needed(gap: float, servo: Servo, settings: WhitenedSettings) -> float:
+    """Least travel (rad) of the screw in each contact, for a gap (rad)."""
+    travel = settings.contact_travel
+    return least_travel(gap, servo.encoder_resolution) if travel is None else travel
+
+
+def one_sided(motion: Travel, needed: float, settings: WhitenedSettings) -> str:
+    """Reason for which the contacts do not show the gap; with a known offset of the encoder one contact is enough.
+
+    `needed` is the least travel in each, rad.
+    """
     forwards, backwards = motion.forwards, motion.backwards
-    needed = settings.contact_travel
     enough = min(forwards, backwards) if settings.offset is None else max(forwards, backwards)
     if enough >= needed:
         return ""
@@ -322,9 +342,9 @@ def _unexplained(evidence: FitEvidence) -> str:
 
 def _delayed(evidence: FitEvidence, settings: WhitenedSettings) -> str:
     delay = evidence.aligned.delay
-    if abs(delay) <= settings.largest_skew:
+    if abs(delay) <= settings.skew_limit:
         return ""
-    allowed = 1e3 * settings.largest_skew
+    allowed = 1e3 * settings.skew_limit
     return f"position and theta_m would be {1e3 * delay:+.3g} ms apart, and {allowed:.3g} ms are allowed"
 
 
@@ -353,7 +373,7 @@ def _disagreements(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[s
     if abs(move) > max(2.0 * limit, _SIGMAS * std):
         sentences.append(f"the observer form puts the gap {_deg(move)} away, with a joint spread of {_deg(std)}")
     gap = evidence.aligned.whitened.point.gap
-    if evidence.lost_motion > 1.05 * gap + _SIGMAS * evidence.std + settings.contact_travel:
+    if evidence.lost_motion > 1.05 * gap + _SIGMAS * evidence.std + evidence.needed:
         sentences.append(
             f"the lost motion at rest is {_deg(evidence.lost_motion)}, more than the fitted gap of {_deg(gap)}"
         )

@@ -98,7 +98,7 @@ class Misfit:
 
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
-_SAMPLES_PER_PERIOD, _SLOWEST, _FEWEST = 40.0, 400.0, 100  # kept at least: of the fastest mode; Hz; in all
+_SAMPLES_PER_PERIOD, _FEWEST = 40.0, 100  # kept at least: of the fastest mode; in all
 
 _ROUNDING = 1e-13  # of the largest motion, some hundred times a float's
 _MOST_GROWTH = 4.0  # standard deviations of the gap's rate
@@ -252,5 +252,4 @@ def factor_for(model: Response, samples: int) -> int:
     """Choose the decimation: the structure's fastest mode keeps its band, and the window enough samples."""
     rate = 1.0 / model.interval
     fastest = float(np.abs(model.poles).max()) / (2.0 * np.pi)
-    least = max(_SLOWEST, _SAMPLES_PER_PERIOD * fastest)
-    return max(1, min(int(rate / least), samples // _FEWEST))
+    return max(1, min(int(rate / (_SAMPLES_PER_PERIOD * fastest)), samples // _FEWEST))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings, value
 from servotwin.errors import InvalidInput
+
+_LARGEST_SKEW = 5e-3  # s of the paper's servo
 
 
 @settings("estimator")
@@ -35,8 +37,14 @@ class WhitenedSettings:
     ] = 4
     skew: Annotated[bool, key(help="Estimate a delay between the channels.")] = True
     largest_skew: Annotated[
-        float, key("largest_skew_s", minimum=0.0, help="Largest delay between the channels that is accepted.")
-    ] = 5e-3
+        float | None,
+        key(
+            "largest_skew_s",
+            minimum=0.0,
+            help="Largest delay between the channels that is accepted; where absent 5 ms on the paper's servo and as "
+            "much of its own time on another.",
+        ),
+    ] = None
     gap_rate: Annotated[
         float,
         key(
@@ -62,8 +70,14 @@ class WhitenedSettings:
         ),
     ] = None
     contact_travel: Annotated[
-        float, key("contact_travel_deg", minimum=0.0, help="Least travel of the fitted screw in each contact.")
-    ] = math.radians(0.5)
+        float | None,
+        key(
+            "contact_travel_deg",
+            minimum=0.0,
+            help="Least travel of the fitted screw in each contact; where absent 0.5 deg, or, where the servo states "
+            "the encoder's resolution, a third of the gap and at least 100 counts, if that is less.",
+        ),
+    ] = None
     largest_std: Annotated[
         float,
         key(
@@ -97,6 +111,15 @@ class WhitenedSettings:
             "own prediction would then be counted twice."
         ),
     ] = False
+
+    @property
+    def skew_limit(self) -> float:
+        """Largest delay between the channels that is accepted, s."""
+        return _LARGEST_SKEW if self.largest_skew is None else self.largest_skew
+
+    def on(self, second: float) -> WhitenedSettings:
+        """The settings for a servo whose own second (`plant.scales`) is so many seconds."""
+        return replace(self, largest_skew=_LARGEST_SKEW * second) if self.largest_skew is None else self
 
     def __post_init__(self) -> None:
         check(self)

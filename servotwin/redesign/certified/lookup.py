@@ -19,6 +19,7 @@ import msgspec
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
+from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, known_bias
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -28,8 +29,10 @@ from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
 _PREFERRED_LEVELS = 2
-# m rms: smaller noise counts as none.
-_QUIET = 1e-6
+# Of the smallest noise of the grid: less counts as none.
+_QUIET = 10.0
+# To the smallest step.
+_NOISES = 10.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,22 @@ class Grid:
             rising = all(a < b for a, b in itertools.pairwise(values))
             if not values or not rising or not (least <= values[0] and values[-1] < math.inf):
                 raise InvalidInput(f"table {name} = {values!r} {unit}: must be finite, rising and not negative")
+
+    @classmethod
+    def of(
+        cls,
+        policy: CertifiedPolicy,
+        finest: float | None = None,
+        biases: tuple[float, ...] | None = None,
+        noises: tuple[float, ...] | None = None,
+    ) -> Grid:
+        """Make a grid; biases that are left out are in the servo's own volts, noises a part of the smallest step."""
+        usual, volt = cls(), scales(policy.servo).voltage
+        return cls(
+            usual.finest if finest is None else finest,
+            tuple(volt * bias for bias in usual.biases) if biases is None else biases,
+            (0.0, policy.uncertainty.step[0] / _NOISES) if noises is None else noises,
+        )
 
     def levels(self, stated: Range) -> tuple[float, ...]:
         """rad: widths of cells, rising; the last is the whole stated range."""
@@ -151,7 +170,8 @@ class CertifiedTable:
 
     def _noise(self, noise: float) -> int:
         """Index of the nearest noise of the grid, by ratio."""
-        distances = [abs(math.log((level + _QUIET) / (noise + _QUIET))) for level in self.grid.noises]
+        quiet = min((level for level in self.grid.noises if level > 0.0), default=1.0) / _QUIET
+        distances = [abs(math.log((level + quiet) / (noise + quiet))) for level in self.grid.noises]
         return distances.index(min(distances))
 
 

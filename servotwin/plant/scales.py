@@ -1,0 +1,59 @@
+"""A servo's own second, metre and volt: the units in which defaults are counted that have a dimension.
+
+Such defaults (how long a rest must be, how slow a motion counts as slow) were chosen on the paper's servo. A servo that
+is the same machine in other units (slower, larger, on another voltage) gets the same criteria in its own units, and
+thereby the same verdicts.
+"""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.plant.servo import Servo
+
+# Of the loop's own time: the paper's structure is slower than that, with the gains of every preset; a stiff one is not.
+_LOOP = 0.1
+
+
+class Scales(NamedTuple):
+    """Units of a servo over those of the preset `paper`.
+
+    Attributes
+    ----------
+    time : float
+        Slowness of the structure, or of the loop where that is much slower than the structure.
+    length : float
+        Travel of the screw per angle.
+    voltage : float
+        Back EMF of one radian in this time.
+    """
+
+    time: float
+    length: float
+    voltage: float
+
+
+@lru_cache(maxsize=64)
+def scales(servo: Servo) -> Scales:
+    """Units of a servo with its own controller; (1, 1, 1) for the preset `paper`."""
+    own, paper = _units(servo), _paper()
+    return Scales(own.time / paper.time, own.length / paper.length, own.voltage / paper.voltage)
+
+
+@cache
+def _paper() -> Scales:
+    return _units(Servo.preset("paper"))
+
+
+def _units(servo: Servo) -> Scales:
+    """The same in s, m/rad and V/rad.
+
+    A motion needs sqrt(m / k) to pass from one mass to the next, and a stiff machine's loop k_B / (Kp p) to follow.
+    """
+    time = float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:])))
+    if servo.controller.Kp != 0.0:
+        time = max(time, _LOOP * servo.k_B / (abs(servo.controller.Kp) * servo.p))
+    return Scales(time, servo.p, servo.k_B / time)

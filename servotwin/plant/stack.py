@@ -1,0 +1,117 @@
+"""Many servos and controllers as arrays, and their automata at once: one by one they take longer than their runs.
+
+Every number has a leading axis, that of the servos; those that multiply rows are columns (P, 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.hybrid.automaton import AutomatonStack
+from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
+from servotwin.plant.motor import Motor
+from servotwin.plant.servo import PerMass, Servo
+from servotwin.plant.signals import Array
+from servotwin.plant.structure import Chain, chain
+
+
+class LoopStack(NamedTuple):
+    """Automata of many servos.
+
+    Attributes
+    ----------
+    plants : PlantStack
+    first : ServoAutomaton
+        The automaton of the first servo, whose structure all have.
+    automata : AutomatonStack
+    rows : dict of (P, M, n) arrays
+        Outputs of each.
+    """
+
+    plants: PlantStack
+    first: ServoAutomaton
+    automata: AutomatonStack
+    rows: dict[str, Array]
+
+
+class PlantStack:
+    """Numbers of servos that have one structure: the number of masses, and a rigid or an elastic screw."""
+
+    def __init__(self, servos: Sequence[Servo]) -> None:
+        self.count, self.n, self.rigid = len(servos), servos[0].n, servos[0].rigid
+        self.p, self.R, self.k_T, self.k_B = (_column(servos, name) for name in ("p", "R", "k_T", "k_B"))
+        m, k, c = (
+            np.array([_spread(getattr(servo, name), self.n) for servo in servos], dtype=float)
+            for name in ("m", "k", "c")
+        )
+        self.k_d: float | Array = math.inf if self.rigid else np.array([servo.k_d for servo in servos])
+        self._chain = chain(m, k, c, self.k_d)
+        motors = Motor(*(np.array([getattr(servo, name) for servo in servos]) for name in Motor._fields))
+        self._motor = motors.matrices()
+
+    def chain(self) -> Chain:
+        """Matrices of the structures."""
+        return self._chain
+
+    def motor(self) -> tuple[Array, Array, Array]:
+        """Matrices of the motors."""
+        return self._motor
+
+
+@dataclass(frozen=True, eq=False)
+class LawStack:
+    """Numbers of continuous controllers that have the same limits and filters, (P, 1) arrays."""
+
+    Kp: Array
+    Ki: Array
+    Kd: Array
+    Tf: Array
+    enter: Array
+    leave: Array
+    tracking: Array
+    release_time: Array
+    loop_filter_hz: Array | None
+    voltage_limit: Array | None
+    integral_only: bool
+
+    @classmethod
+    def of(cls, laws: Sequence[Controller]) -> LawStack:
+        """Numbers of controllers."""
+        names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release_time")
+        optional = ("loop_filter_hz", "voltage_limit")
+        columns: dict[str, Any] = {name: _column(laws, name) for name in names}
+        columns |= {name: None if getattr(laws[0], name) is None else _column(laws, name) for name in optional}
+        return cls(**columns, integral_only=laws[0].integral_only)
+
+
+def continuous_loops(servos: Sequence[Servo], laws: Sequence[Controller], shape: Shape) -> LoopStack:
+    """Automata of servos, each with its continuous controller.
+
+    Parameters
+    ----------
+    servos, laws : sequences of equal length
+        Of one structure.
+    shape : Shape
+    """
+    plants = PlantStack(servos)
+    return LoopStack(plants, *continuous_parts(plants, LawStack.of(laws), shape).stacked(plants.count))
+
+
+def sampled_plants(servos: Sequence[Servo], gap_degree: int, bias: bool, friction: bool) -> LoopStack:
+    """Automata of servos of one structure under a constant voltage."""
+    plants = PlantStack(servos)
+    return LoopStack(plants, *sampled_parts(plants, gap_degree, bias, friction).stacked(plants.count))
+
+
+def _column(items: Sequence[Servo] | Sequence[Controller], name: str) -> Array:
+    return np.array([[getattr(item, name)] for item in items], dtype=float)
+
+
+def _spread(value: PerMass, count: int) -> tuple[float, ...]:
+    return value if isinstance(value, tuple) else (value,) * count

@@ -1,0 +1,103 @@
+"""Settings of twin and edge that a servo's own units fill in where a file leaves them out."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from scaling import Units, scaled
+
+from servotwin.commissioning.edge_settings import Commissioning, Recording, supervision_of
+from servotwin.edge.parameters import FallbackSet
+from servotwin.edge.settings import Supervision
+from servotwin.estimation.trend_settings import TrendSettings
+from servotwin.messages import Setting
+from servotwin.plant.servo import PRESETS, Servo
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.excitation import ExcitationSettings, long_enough
+from servotwin.twin.model import TwinModel
+from servotwin.twin.settings import TriageSettings, TwinSettings
+
+SERVO = Servo.preset("paper")
+SETTINGS = TwinSettings(policy="paper", excitation=ExcitationSettings(), triage=TriageSettings())
+
+
+def edge(servo: Servo, **recording: float) -> Commissioning:
+    return Commissioning(servo, servo.controller, SETTINGS, Recording(**recording))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_presets_keep_the_papers_numbers(name: str) -> None:
+    found = SETTINGS.on(Servo.preset(name))
+    assert found.trend == TrendSettings()
+    assert found.excitation is not None
+    assert found.excitation.times == ExcitationSettings().times == (2.0, 0.3, 60.0, 0.85)
+    assert found.triage is not None
+    assert (found.triage.bias, found.triage.least_misfit) == (2e-3, 1e-7)
+    assert edge(Servo.preset(name)).window == 1.0
+
+
+@pytest.mark.parametrize("units", [Units(time=1e3), Units(2.0**-6, 2.0**-20, 2.0**7)])
+def test_what_a_file_leaves_out_is_in_the_machines_own_units(units: Units) -> None:
+    steps = Uncertainty(step=(units.length * 1e-4, units.length * 1e-3))
+    model = TwinModel.of(scaled(SERVO, *units), SETTINGS.replace(uncertainty=steps))
+    found = model.settings
+    assert found.trend.rate_std_rad_per_s * units.time == pytest.approx(math.radians(0.2))
+    assert found.trend.rate_walk_rad_per_s_per_sqrt_s * units.time**1.5 == pytest.approx(math.radians(0.015))
+    assert found.excitation is not None
+    assert found.excitation.times == pytest.approx([units.time * time for time in (2.0, 0.3, 60.0, 0.85)])
+    assert found.triage is not None
+    assert found.triage.bias_limit / units.voltage == pytest.approx(2e-3)
+    assert found.triage.misfit_limit / units.length == pytest.approx(1e-7)
+    assert found.on(scaled(SERVO, *units)) == found
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_presets_are_supervised_with_the_papers_numbers(name: str) -> None:
+    fallback = FallbackSet(Setting(1e-5))
+    assert supervision_of(Servo.preset(name), TwinSettings(), fallback) == Supervision(fallback)
+
+
+def test_the_edge_watches_in_the_machines_own_units() -> None:
+    steps = Uncertainty(step=(1e-10, 2.5e-9), input_bias=(-10.0, 10.0))
+    servo, fallback = scaled(SERVO, 8.0, 1e-6, 1e2), FallbackSet(Setting(1e-11))
+    found = supervision_of(servo, TwinSettings(uncertainty=steps), fallback)
+    assert found.period_s == pytest.approx(0.4)
+    assert found.watch is not None
+    assert (found.watch.slot_s, found.watch.window_s, found.watch.settling_s) == pytest.approx((0.08, 16.0, 24.0))
+    assert (found.watch.error_floor, found.watch.effort_floor) == pytest.approx((1e-11, 2.0))
+
+
+def test_what_a_file_states_counts() -> None:
+    stated = replace(
+        SETTINGS,
+        trend=TrendSettings.for_wear(0.1, 100.0),
+        excitation=ExcitationSettings(window=3.0, pre_trigger=0.1, interval=9.0, hold=1.0),
+        triage=TriageSettings(least_misfit=1e-6, bias=1e-2),
+    )
+    assert stated.on(scaled(SERVO, 10.0, 10.0, 10.0)) == stated
+
+
+def test_windows_are_in_the_servos_own_time_but_hold_enough_samples() -> None:
+    assert edge(scaled(SERVO, time=8.0)).window == pytest.approx(8.0)
+    assert edge(scaled(SERVO, time=0.5)).window == pytest.approx(0.5)
+    fast = edge(scaled(SERVO, time=1e-3))
+    assert fast.window == 400 / 5000.0
+    fast.check_window()
+    assert edge(scaled(SERVO, time=1e-3), sample_rate=5e6).window == pytest.approx(1e-3)
+    calm = Commissioning(scaled(SERVO, time=8.0), SERVO.controller.replace(Ki=0.0), SETTINGS)
+    assert (calm.window, calm.pre_trigger) == pytest.approx((16.0, 2.4))
+
+
+def test_windows_are_whole_samples_and_the_twin_may_request_longer_ones() -> None:
+    slow = edge(SERVO.replace(k=7e3)).with_longest(4.0, 0.3)
+    agent = slow.agent_settings("axis", "boot-1")
+    second = math.sqrt(1e4 / 7e3)
+    assert agent.window_s == pytest.approx(second, abs=2e-4)
+    assert agent.longest_window_s == pytest.approx(4.0 * second, abs=2e-4)
+    request = SETTINGS.on(SERVO.replace(k=7e3)).excitation
+    assert request is not None
+    samples = round(5000.0 * request.times.window)
+    assert samples <= agent.longest_samples
+    assert long_enough(samples / 5000.0, round(5000.0 * request.times.pre_trigger) / 5000.0, request)
+    fast = edge(scaled(SERVO, time=1e-3)).with_longest(4.0, 0.3)
+    assert fast.agent_settings("axis", "boot-1").longest_window_s == fast.window
