@@ -10,6 +10,7 @@ from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
 from benchmarks.novelty import command as worth_sending
 from benchmarks.policies import command as side_by_side
+from benchmarks.policies import loops as in_the_loop
 from servotwin.errors import InvalidInput
 
 QUICK_SIZE = 0.02
@@ -25,6 +26,10 @@ def _hostile(date: str, output: Path | None, quick: bool) -> None:
 
 def _policies(date: str, output: Path | None, quick: bool) -> None:
     side_by_side.policies(date, output, side_by_side.QUICK if quick else side_by_side.MACHINES)
+
+
+def _loops(date: str, output: Path | None, quick: bool) -> None:
+    in_the_loop.loops(date, output, in_the_loop.QUICK if quick else in_the_loop.MACHINES)
 
 
 def _novelty(date: str, output: Path | None, quick: bool) -> None:
@@ -49,6 +54,7 @@ ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     whole.NAME: _fleet,
     glances.NAME: _triage,
     side_by_side.NAME: _policies,
+    in_the_loop.NAME: _loops,
     tick.NAME: _tick,
     worth_sending.NAME: _novelty,
 }

@@ -15,8 +15,8 @@ def bench(
     workloads: Annotated[
         list[str] | None,
         typer.Argument(
-            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies, tick, "
-            "novelty, triage, fleet."
+            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies, "
+            "loops, tick, novelty, triage, fleet."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,

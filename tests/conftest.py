@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,6 +48,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return next((k for k, name in enumerate(FIRST) if path.startswith(name)), len(FIRST))
 
     items.sort(key=place)
+
+
+def pytest_collection_finish() -> None:
+    """Refuse test modules that simulate when they are imported: every process would, and would compile the kernel."""
+    kernel = sys.modules.get("servotwin.hybrid.kernel")
+    if kernel is not None and kernel.follow_schedule.signatures:
+        raise pytest.UsageError("a test module simulates when it is imported; a fixture or a cached function should")
 
 
 class Kept(logging.Handler):

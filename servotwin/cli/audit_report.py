@@ -151,6 +151,7 @@ _REMARKS = {
     "disturbance": "",
     "trend": "trend: {}",
     "machine": "",
+    "motor": "",
     "redesign": "{}",
     "excitation": "",
 }

@@ -168,7 +168,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
     factor = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values()) * _ROUNDING
-    leave = max((leave for _, leave in demands.hysteresis), default=1.0)
+    leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
     limits = Limits(
         maximum=demands.tolerance,
         gain_factor=factor,

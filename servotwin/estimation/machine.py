@@ -60,6 +60,23 @@ class LearningSettings:
     ratio_floor: Annotated[
         float, key("mass_ratio_floor_percent", above=0.0, help="No number of windows tells the mass ratio better.")
     ] = 1e-3
+    motor: Annotated[
+        float,
+        key(
+            "motor_percent",
+            above=0.0,
+            below=1.0,
+            help="Least standard deviation of the motor's lag (J R / k_T) before any window.",
+        ),
+    ] = 0.05
+    motor_drift: Annotated[
+        float,
+        key("motor_drift_per_sqrt_day", minimum=0.0, help="Random walk of the motor's back EMF and lag, relative."),
+    ] = 0.005
+    motor_floor: Annotated[
+        float,
+        key("motor_floor_percent", above=0.0, help="No number of windows tells the motor's back EMF and lag better."),
+    ] = 1e-3
     restart_after: Annotated[
         int,
         key(minimum=1, help="So many windows in a row that agree on other numbers mean that the machine is another."),

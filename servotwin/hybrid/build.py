@@ -63,7 +63,7 @@ def numbers_of(automaton: Automaton, guards: int) -> Numbers:
 def build_tables(automaton: Automaton, step: float) -> Tables:
     """All tables of `automaton` for one search step in seconds."""
     tables = empty_tables(automaton)
-    fill_tables(tables, numbers_of(automaton, tables.guards), step, new_workspace(tables))
+    fill_tables(tables, numbers_of(automaton, tables.guards), step, True, new_workspace(tables))
     return tables
 
 
@@ -165,7 +165,7 @@ def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, sp
 
 
 @bare
-def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
+def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, blocks: bool, w: Workspace) -> None:
     """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
     n, p = t.states, w.powers
     _fill_orders(t, numbers, flow, mode, step, w)
@@ -178,7 +178,8 @@ def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w
         next_power(n, p)
     # Literals would have the function compiled once for each.
     _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), flow, step, w)
-    _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), flow, step * NODES_FINE, w)
+    if blocks:
+        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), flow, step * NODES_FINE, w)
 
 
 @bare
@@ -208,14 +209,15 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
 
 
 @bare
-def fill_tables(t: Tables, numbers: Numbers, step: float, w: Workspace) -> None:
-    """Tables of the automaton with these numbers; `t` has its structure."""
+def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Workspace) -> None:
+    """Tables of the automaton with these numbers; `t` has its structure. Without `blocks` the coarse scale is left out,
+    for loops that only take steps."""
     _fill_guards(t, numbers, w)
     modes, filled = len(t.guard_count), -1
     for m in range(modes):
         if t.flow_of[m] > filled:
             filled = t.flow_of[m]
-            _fill_flow(t, numbers, filled, m, step, w)
+            _fill_flow(t, numbers, filled, m, step, blocks, w)
     for m in range(modes):
         for g in range(t.guard_count[m]):
             _fill_series(t, numbers, m, g, step, w)

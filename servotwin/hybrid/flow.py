@@ -9,7 +9,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
-from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, aligned, padded
+from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, padded, zeros
 
 # A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero. Each
 # derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
@@ -37,7 +37,7 @@ def new_scratch(tables: Tables) -> Scratch:
     n = tables.states
     rows = max(padded(2 * tables.guards * (NODES_COARSE + 1)), n + 4 * tables.guards)
     sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
-    return Scratch(*(aligned(np.zeros(size)) for size in sizes))
+    return Scratch(*(zeros(size) for size in sizes))
 
 
 @inlined

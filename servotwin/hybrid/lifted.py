@@ -1,9 +1,10 @@
 """Sampled loops in blocks of ticks: while nothing switches, a tick and the flow up to the next one are one linear map.
 
 A *slot* holds everything about one map ``M``: its powers, and its *watches*, the quantities that must stay within
-bounds, or the loop switches. Two scales: 8 intervals of one tick, and 16 intervals of 8 ticks. Over an interval a watch
-is the cubic with its values and slopes at the ends, but for a deviation whose squares, summed over every interval of
-the block, are the quadratic form of the start. So one product bounds every watch at every instant of a block.
+bounds, or the loop switches. Three scales: 8 intervals of one tick, 16 of 8 ticks, 16 of 128 ticks. Over an interval a
+watch is the cubic with its values and slopes at the ends, but for a deviation whose squares, summed over every
+interval of the block, are the quadratic form of the start. So one product bounds every watch at every instant of a
+block.
 """
 
 from __future__ import annotations
@@ -15,33 +16,38 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
-from servotwin.hybrid.flow import SIGNIFICANT, advance, dot_sizes, product, tall_product
-from servotwin.hybrid.tables import VECTOR, aligned, padded
+from servotwin.hybrid.flow import SIGNIFICANT, dot_sizes, product, tall_product
+from servotwin.hybrid.tables import VECTOR, padded, zeros
 
 FINE = 8
 """Intervals of the fine scale, one tick each; and ticks of an interval of the coarse scale."""
 COARSE = 16
-"""Intervals of the coarse scale."""
+"""Intervals of the coarse scale, and of the vast one."""
 BLOCK = FINE * COARSE
+"""Ticks of a coarse block, and of an interval of the vast scale."""
 # Rounding of a product with a row, of the sum of its terms' sizes, in units of `SIGNIFICANT`.
 _ROUNDING = 0.01
 
 
 class LiftedTables(NamedTuple):
     """Flat tables of `S` slots, `N` states, `W` watches each; rows of a level: per watch the values at the
-    ends, the thirds of the slopes at the beginnings and at the ends of its intervals, and its deviation's matrix."""
+    ends, the thirds of the slopes at the beginnings and at the ends of its intervals, and its deviation's matrix.
+
+    Jumps stand side by side, so that one product gives the states at all ends: ``[slot, state, power, new state]``."""
 
     states: int
     watches: int
     fine: Array  # S * N * padded(W * (3 * 8 + 1 + N))
     coarse: Array  # S * N * padded(W * (3 * 16 + 1 + N))
-    jump_fine: Array  # S * 8 * N * N, transposed: M**j - I
-    jump_coarse: Array  # S * 16 * N * N, transposed: M**(8 j) - I
+    vast: Array  # the same, filled only where a run is calm for long
+    jump_fine: Array  # S * N * 8 * N: M**j - I, j = 1 .. 8
+    jump_coarse: Array  # S * N * 16 * N: M**(8 j) - I
+    jump_vast: Array  # S * N * 16 * N: M**(128 j) - I
     sizes: Array  # S * W * N: a watch below this part of abs(z) times `SIGNIFICANT` is rounding
 
 
 class LiftedWorkspace(NamedTuple):
-    """Working memory to fill a slot; matrices are row-major."""
+    """Working memory to fill a slot; matrices are row-major, those of many watches side by side."""
 
     map: Array  # N * N: M - I
     values: Array  # W * N: rows of the watches at a tick
@@ -50,12 +56,13 @@ class LiftedWorkspace(NamedTuple):
     sizes: Array  # W * N: sizes of all terms that enter a watch
     discrete: Array  # W: 1.0 where the watch counts at ticks only
     inside: Array  # W * N * N: squares of the deviation from the cubic within one tick
-    powers: Array  # (8 + 16) * N * N
-    rows: Array  # 3 * 9 * N: values, starts and ends at the ticks of an interval
+    powers: Array  # N * 16 * N: those of one scale side by side, [row, power, column]
+    rows: Array  # 3 * 17 * N: values, starts and ends at the ends of the intervals
     row: Array
-    sums: Array  # N * N
+    sums: Array  # N * W * N: [row, watch, column]
+    half: Array  # N * W * N
+    turned: Array  # N * W * N
     product: Array  # N * N
-    column: Array
 
 
 def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
@@ -64,32 +71,21 @@ def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
     sizes = (
         states * row_count(states, watches, FINE),
         states * row_count(states, watches, COARSE),
+        states * row_count(states, watches, COARSE),
         FINE * n2,
+        COARSE * n2,
         COARSE * n2,
         watches * states,
     )
-    return LiftedTables(states, watches, *(aligned(np.zeros(slots * size)) for size in sizes))
+    return LiftedTables(states, watches, *(zeros(slots * size) for size in sizes))
 
 
 def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:
     """Working memory to fill slots."""
     n, n2 = states, states * states
-    sizes = (
-        n2,
-        watches * n,
-        watches * n,
-        watches * n,
-        watches * n,
-        watches,
-        watches * n2,
-        24 * n2,
-        27 * n,
-        n,
-        n2,
-        n2,
-        n,
-    )
-    return LiftedWorkspace(*(aligned(np.zeros(size)) for size in sizes))
+    rows = (watches * n,) * 4
+    sizes = (n2, *rows, watches, watches * n2, COARSE * n2, 3 * (COARSE + 1) * n, n, *(watches * n2,) * 3, n2)
+    return LiftedWorkspace(*(zeros(size) for size in sizes))
 
 
 def row_count(states: int, watches: int, intervals: int) -> int:
@@ -103,31 +99,14 @@ def _stride(t: LiftedTables, intervals: int) -> int:
 
 
 @bare
-def _compose(n: int, powers: Array, to: int, a: int, b: int, row: Array) -> None:
-    """``powers[to] = P_a + P_b + P_a P_b``: the deviation of the product of two maps."""
-    for i in range(n):
-        at = a + i * n
-        product(powers, b, n, n, powers[at : at + n], row)
-        for j in range(n):
-            powers[to + i * n + j] = powers[at + j] + (powers[b + i * n + j] + row[j])
-
-
-@bare
-def _times(n: int, row: Array, matrix: Array, base: int, out: Array) -> None:
-    """``row M`` from the deviation of ``M``."""
-    product(matrix, base, n, n, row, out)
-    for j in range(n):
-        out[j] += row[j]
-
-
-@bare
-def add_square(n: int, row: Array, sums: Array, base: int) -> None:
-    """Add ``row' row`` to a matrix."""
+def add_square(n: int, row: Array, sums: Array, base: int, stride: int) -> None:
+    """Add ``row' row`` to a matrix whose rows are `stride` apart."""
     for i in range(n):
         factor = row[i]
         if factor != 0.0:
+            at = base + i * stride
             for j in range(n):
-                sums[base + i * n + j] += factor * row[j]
+                sums[at + j] += factor * row[j]
 
 
 @inlined
@@ -143,139 +122,192 @@ def cubic_weights(u: float, tilt: float) -> tuple[float, float, float, float]:
 
 
 @bare
-def _double(n: int, power: int, w: LiftedWorkspace) -> None:
-    """``G + M' G M`` for the power of ``M`` at that place: the sums over twice as many ticks."""
-    for i in range(n):
-        _times(n, w.sums[i * n : (i + 1) * n], w.powers, power, w.product[i * n : (i + 1) * n])
-    for i in range(n):
-        for j in range(n):
-            w.column[j] = w.powers[power + j * n + i]
-        product(w.product, 0, n, n, w.column, w.row)
-        for j in range(n):
-            w.sums[i * n + j] += w.product[i * n + j] + w.row[j]
+def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
+    """The powers of a scale from its first, as deviations from one; each round makes as many as there were."""
+    u, stride, known = w.powers, intervals * n, 1
+    while known < intervals:
+        # The last one times all of them: D_a + (I + D_a) D_b.
+        last = (known - 1) * n
+        for i in range(n):
+            at = i * stride
+            for k in range(n):
+                w.row[k] = u[at + last + k]
+            w.row[i] += 1.0
+            to = at + known * n
+            tall_product(u, 0, stride, known * n, w.row, u[to : to + known * n])
+            for j in range(known):
+                for k in range(np.uint64(n)):
+                    u[to + j * n + k] += u[at + last + k]
+        known *= 2
 
 
 @bare
-def _transpose(n: int, source: Array, base: int, target: Array, to: int) -> None:
+def _store_jumps(n: int, intervals: int, table: Array, slot: int, w: LiftedWorkspace) -> None:
+    stride = intervals * n
     for i in range(n):
-        for j in range(n):
-            target[to + j * n + i] = source[base + i * n + j]
+        for j in range(intervals):
+            for k in range(n):
+                table[(slot * n + i) * stride + j * n + k] = w.powers[k * stride + j * n + i]
 
 
 @bare
-def _fill_powers(t: LiftedTables, slot: int, w: LiftedWorkspace) -> None:
-    n, n2 = t.states, t.states * t.states
-    for i in range(n2):
-        w.powers[i] = w.map[i]
-    for j in range(1, FINE):
-        _compose(n, w.powers, j * n2, (j - 1) * n2, 0, w.row)
-    first = FINE * n2
-    for i in range(n2):
-        w.powers[first + i] = w.powers[(FINE - 1) * n2 + i]
-    for j in range(1, COARSE):
-        _compose(n, w.powers, first + j * n2, first + (j - 1) * n2, first, w.row)
-    for j in range(FINE):
-        _transpose(n, w.powers, j * n2, t.jump_fine, (slot * FINE + j) * n2)
-    for j in range(COARSE):
-        _transpose(n, w.powers, first + j * n2, t.jump_coarse, (slot * COARSE + j) * n2)
+def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace) -> None:
+    """``G + M' G M`` of every watch for the power of ``M`` at that place: the sums over twice as many intervals."""
+    stride, width = intervals * n, watches * n
+    for i in range(n):
+        for k in range(n):
+            w.row[k] = w.powers[k * stride + power * n + i]
+        half = w.half[i * width : (i + 1) * width]
+        tall_product(w.sums, 0, width, width, w.row, half)
+        for j in range(width):
+            half[j] += w.sums[i * width + j]
+    # M' G, turned over, is G M, for G is symmetric.
+    for i in range(n):
+        for watch in range(watches):
+            for k in range(n):
+                w.turned[k * width + watch * n + i] = w.half[i * width + watch * n + k]
+    for i in range(n):
+        for k in range(n):
+            w.row[k] = w.powers[k * stride + power * n + i]
+        half = w.half[i * width : (i + 1) * width]
+        tall_product(w.turned, 0, width, width, w.row, half)
+        for j in range(width):
+            w.sums[i * width + j] += half[j] + w.turned[i * width + j]
 
 
 @bare
-def _rows_at(n: int, watch: int, length: int, powers: int, w: LiftedWorkspace, i: int) -> None:
-    """Value row, start row and end row at the i-th end of the intervals, into `rows`."""
+def _fill_rows(n: int, intervals: int, watch: int, w: LiftedWorkspace) -> None:
+    """Value row, start row and end row of a watch at all ends of the intervals, into `rows`."""
+    stride = intervals * n
     for kind in range(3):
         source = w.values if kind == 0 else (w.starts if kind == 1 else w.ends)
-        row, to = source[watch * n : (watch + 1) * n], w.rows[(kind * 9) * n : (kind * 9 + 1) * n]
-        if i == 0:
-            for j in range(n):
-                to[j] = row[j]
-        else:
-            _times(n, row, w.powers, powers + (i - 1) * n * n, to)
-        if kind > 0:
-            for j in range(n):
-                to[j] *= length
+        row, first = source[watch * n : (watch + 1) * n], kind * (COARSE + 1) * n
+        tall_product(w.powers, 0, stride, stride, row, w.rows[first + n : first + n + stride])
+        for k in range(n):
+            w.rows[first + k] = row[k]
+        for j in range(1, intervals + 1):
+            for k in range(n):
+                w.rows[first + j * n + k] += row[k]
 
 
 @bare
-def _fill_level(t: LiftedTables, table: Array, slot: int, watch: int, intervals: int, w: LiftedWorkspace) -> None:
-    """Rows of one watch at one scale, and its deviation's matrix from `sums`."""
-    n = t.states
-    stride = _stride(t, intervals)
-    length = 1 if intervals == FINE else FINE
-    powers = 0 if intervals == FINE else FINE * n * n
+def _fill_level(
+    t: LiftedTables,
+    table: Array,
+    slot: int,
+    watch: int,
+    watches: int,
+    intervals: int,
+    length: float,
+    w: LiftedWorkspace,
+) -> None:
+    """Rows of one watch at one scale, and its deviation's matrix from `sums`; `length` of an interval in ticks."""
+    n, stride, starts = t.states, _stride(t, intervals), (COARSE + 1) * t.states
     at = slot * n * stride + watch * (3 * intervals + 1 + n)
     for i in range(intervals + 1):
-        _rows_at(n, watch, length, powers, w, i)
         for j in range(n):
-            column = at + j * stride
-            table[column + i] = w.rows[j]
+            column, value = at + j * stride, w.rows[i * n + j]
+            table[column + i] = value
             size = (slot * t.watches + watch) * n + j
-            t.sizes[size] = max(t.sizes[size], _ROUNDING * abs(w.rows[j]))
+            t.sizes[size] = max(t.sizes[size], _ROUNDING * abs(value))
             if i < intervals:
-                table[column + intervals + 1 + i] = w.rows[9 * n + j]
+                table[column + intervals + 1 + i] = length * w.rows[starts + i * n + j]
             if i > 0:
-                table[column + 2 * intervals + i] = w.rows[18 * n + j]
+                table[column + 2 * intervals + i] = length * w.rows[2 * starts + i * n + j]
     square = at + 3 * intervals + 1
     for i in range(n):
         for j in range(n):
-            table[square + j * stride + i] = w.sums[i * n + j]
+            table[square + j * stride + i] = w.sums[(i * watches + watch) * n + j]
 
 
 @bare
-def _coarse_deviation(t: LiftedTables, watch: int, w: LiftedWorkspace) -> None:
-    """Add the squares of the tick's cubics' deviation from the cubic over 8 ticks to `sums`."""
-    n, n2, base = t.states, t.states * t.states, watch * t.states
-    for kind in range(3):
-        source = w.values if kind == 0 else (w.starts if kind == 1 else w.ends)
-        row = source[base : base + n]
-        for i in range(FINE + 1):
-            to = w.rows[(kind * 9 + i) * n : (kind * 9 + i + 1) * n]
-            if i == 0:
-                for j in range(n):
-                    to[j] = row[j]
-            else:
-                _times(n, row, w.powers, (i - 1) * n2, to)
-    for i in range(FINE):
+def _add_deviation(
+    n: int, watch: int, watches: int, intervals: int, length: float, only_ends: bool, w: LiftedWorkspace
+) -> None:
+    """Make the sums of one scale those of an interval of the next: add the squares of its cubics' deviation from the
+    cubic over all of its intervals."""
+    starts, ends = (COARSE + 1) * n, 2 * (COARSE + 1) * n
+    whole = intervals * length
+    for i in range(intervals):
         for point in range(1, 4):
-            if point < 3 and w.discrete[watch] > 0.0:
+            if point < 3 and only_ends:
                 continue
-            u = (i if point == 1 else i + 1) / FINE
-            tilt = 0.0 if point == 3 else (1.0 if point == 1 else -1.0) / FINE
+            u = (i if point == 1 else i + 1) / intervals
+            tilt = 0.0 if point == 3 else (1.0 if point == 1 else -1.0) / intervals
             c0, c1, c2, c3 = cubic_weights(u, tilt)
             for j in range(n):
-                start, end = w.rows[j], w.rows[FINE * n + j]
-                second = start + FINE * w.rows[9 * n + j]
-                third = end - FINE * w.rows[(18 + FINE) * n + j]
+                start, end = w.rows[j], w.rows[intervals * n + j]
+                second = start + whole * w.rows[starts + j]
+                third = end - whole * w.rows[ends + intervals * n + j]
                 true = w.rows[(i if point == 1 else i + 1) * n + j]
                 if point == 1:
-                    true += w.rows[(9 + i) * n + j]
+                    true += length * w.rows[starts + i * n + j]
                 elif point == 2:
-                    true -= w.rows[(18 + i + 1) * n + j]
+                    true -= length * w.rows[ends + (i + 1) * n + j]
                 w.row[j] = true - ((c0 * start + c1 * second) + (c2 * third + c3 * end))
-            add_square(n, w.row, w.sums, 0)
+            add_square(n, w.row, w.sums, watch * n, watches * n)
+    for i in range(n):
+        for j in range(n):
+            # The square of a sum is at most twice the sum of the squares.
+            w.sums[(i * watches + watch) * n + j] *= 2.0
 
 
 @bare
-def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """All tables of the map and the watches in `w`."""
+def _rebase(n: int, intervals: int, following: int, w: LiftedWorkspace) -> None:
+    """The last power of a scale becomes the first of the next, which has `following` intervals."""
+    last = (intervals - 1) * n
+    for i in range(n):
+        for k in range(n):
+            w.product[i * n + k] = w.powers[i * intervals * n + last + k]
+    for i in range(n):
+        for k in range(n):
+            w.powers[i * following * n + k] = w.product[i * n + k]
+
+
+@bare
+def _fill_scale(
+    t: LiftedTables, table: Array, jumps: Array, slot: int, watches: int, intervals: int, length: int, last: bool,
+    w: LiftedWorkspace,
+) -> None:  # fmt: skip
+    """One scale, from the first of its powers and the sums of one interval; the sums become those of the next scale's
+    interval, but for the last."""
+    n = t.states
+    _fill_powers(n, intervals, w)
+    _store_jumps(n, intervals, jumps, slot, w)
+    size = 0.0
+    for i in range(n * watches * n):
+        size += abs(w.sums[i])
+    power = 1
+    # A tick that is one step of the search is its cubic: nothing is to be summed.
+    while size > 0.0 and power < intervals:
+        _double(n, intervals, power - 1, watches, w)
+        power *= 2
+    for watch in range(watches):
+        _fill_rows(n, intervals, watch, w)
+        _fill_level(t, table, slot, watch, watches, intervals, float(length), w)
+        if not last:
+            _add_deviation(n, watch, watches, intervals, float(length), length == 1 and w.discrete[watch] > 0.0, w)
+
+
+@bare
+def fill_slot(t: LiftedTables, slot: int, watches: int, deep: bool, w: LiftedWorkspace) -> None:
+    """All tables of the map and the watches in `w`; those of the vast scale only where it is to be `deep`."""
     n, n2 = t.states, t.states * t.states
-    _fill_powers(t, slot, w)
     for watch in range(watches):
         for i in range(n):
             t.sizes[(slot * t.watches + watch) * n + i] = w.sizes[watch * n + i]
-        for i in range(n2):
-            w.sums[i] = w.inside[watch * n2 + i]
-        _double(n, 0, w)
-        _double(n, n2, w)
-        _double(n, 3 * n2, w)
-        _fill_level(t, t.fine, slot, watch, int(FINE), w)
-        _coarse_deviation(t, watch, w)
-        for i in range(n2):
-            # The square of a sum is at most twice the sum of the squares.
-            w.sums[i] *= 2.0
-        for place in (FINE, FINE + 1, FINE + 3, FINE + 7):
-            _double(n, place * n2, w)
-        _fill_level(t, t.coarse, slot, watch, int(COARSE), w)
+            for j in range(n):
+                w.sums[(i * watches + watch) * n + j] = w.inside[watch * n2 + i * n + j]
+    for i in range(n):
+        for k in range(n):
+            w.powers[i * FINE * n + k] = w.map[i * n + k]
+    # Literals would have the function compiled once for each.
+    _fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
+    _rebase(n, int(FINE), int(COARSE), w)
+    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), not deep, w)
+    if deep:
+        _rebase(n, int(COARSE), int(COARSE), w)
+        _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
 
 
 @inlined
@@ -313,23 +345,26 @@ def clean_part(
 
 
 @inlined
-def advance_ticks(
-    t: LiftedTables, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array, slack: Array,
-    z: Array, out: Array, change: Array,
+def clean_ticks(
+    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array,
+    slack: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
-    """Advance through the first intervals of a block, at most `wanted`, in which no watch may leave its bounds; return
-    their number."""
+    """Number of intervals of a block, at most `wanted`, before the first in which some watch may leave its bounds."""
     stride = _stride(t, intervals)
     used = (watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
-    if intervals == FINE:
-        tall_product(t.fine, slot * t.states * stride, stride, used, z, out)
-    else:
-        tall_product(t.coarse, slot * t.states * stride, stride, used, z, out)
-    clean = clean_part(t, slot, watches, intervals, wanted, low, high, slack, z, out)
-    if clean > 0:
-        n2 = t.states * t.states
-        if intervals == FINE:
-            advance(t.jump_fine, (slot * FINE + clean - 1) * n2, z, change)
-        else:
-            advance(t.jump_coarse, (slot * COARSE + clean - 1) * n2, z, change)
-    return clean
+    tall_product(table, slot * t.states * stride, stride, used, z, out)
+    return clean_part(t, slot, watches, intervals, wanted, low, high, slack, z, out)
+
+
+@inlined
+def jump(n: int, jumps: Array, slot: int, intervals: int, clean: int, z: Array, change: Array) -> None:
+    """Advance by some intervals of a scale, at least one."""
+    product(jumps, (slot * n * intervals + clean - 1) * n, intervals * n, n, z, change)
+    for i in range(np.uint64(n)):
+        z[i] += change[i]
+
+
+@inlined
+def changes_at_ends(n: int, jumps: Array, slot: int, z: Array, out: Array) -> None:
+    """Changes of the state up to the end of each interval of the vast scale, one after the other."""
+    tall_product(jumps, slot * n * COARSE * n, COARSE * n, COARSE * n, z, out)

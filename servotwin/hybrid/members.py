@@ -99,7 +99,7 @@ def output(memory: WorkerMemory, o: int) -> Outputs:
 def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
     """Fill the tables for automaton `a`."""
     numbers = Numbers(family.flows[a], family.guards[a], family.resets[a])
-    fill_tables(memory.tables, numbers, family.step[a], memory.workspace)
+    fill_tables(memory.tables, numbers, family.step[a], True, memory.workspace)
     for o in range(family.outputs.shape[1]):
         fill_output(memory.tables, family.outputs[a, o], family.stride[a], output(memory, o), memory.block)
     memory.loaded[0] = a

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import Scratch, advance, advance_fraction, dot, product
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables, aligned
+from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables, zeros
 
 _BLOCK = NODES_COARSE * NODES_FINE
 
@@ -35,15 +35,13 @@ class OutputWorkspace(NamedTuple):
 
 def new_output_workspace(states: int) -> OutputWorkspace:
     """Working memory for outputs of so many states."""
-    return OutputWorkspace(
-        aligned(np.zeros(NODES_COARSE * states)), aligned(np.zeros(states * states)), aligned(np.zeros(_BLOCK * states))
-    )
+    return OutputWorkspace(zeros(NODES_COARSE * states), zeros(states * states), zeros(_BLOCK * states))
 
 
 def empty_outputs(tables: Tables, *count: int) -> Outputs:
     """Room for one output, or for `count` of them."""
     n, modes = tables.states, len(tables.guard_count)
-    table = aligned(np.zeros(math.prod(count) * modes * _BLOCK * n)).reshape(*count, modes * _BLOCK * n)
+    table = zeros(math.prod(count) * modes * _BLOCK * n).reshape(*count, modes * _BLOCK * n)
     place, used = np.zeros((2, *count, modes), dtype=np.int64)
     return Outputs(table, place, np.zeros((*count, modes, n), dtype=np.int64), used)
 

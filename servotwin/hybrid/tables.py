@@ -103,7 +103,7 @@ def empty_tables(automaton: Automaton, flow_of: NDArray[np.int64] | None = None)
         has_reset=has_reset,
         flow_of=flow_of,
         bernstein=aligned(_bernstein_of_taylor().ravel()),
-        **{name: aligned(np.zeros(size)) for name, size in sizes.items()},
+        **{name: zeros(size) for name, size in sizes.items()},
     )
 
 
@@ -119,6 +119,13 @@ def aligned(flat: Array) -> Array:
     result = room[start : start + len(flat)]
     result[:] = flat
     return result
+
+
+def zeros(count: int) -> Array:
+    """The same, of zeros; the system provides those pages that are used."""
+    room = np.zeros(count + 8)
+    start = -(room.ctypes.data // 8) % 8
+    return room[start : start + count]
 
 
 def _bernstein_of_taylor() -> Array:

@@ -13,6 +13,7 @@ from msgspec import Struct, structs
 
 from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
+from servotwin.estimation.core.visible import least_travel
 from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, score
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
@@ -153,7 +154,8 @@ def _after_score(state: NoveltyState, cut: Cut, estimate: Score, rules: NoveltyR
 
 def _read(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> Score | None:
     """Score a window by itself, or else with the encoder's offset from earlier ones; None: it does not show the gap."""
-    theta_m, position, least = cut.signals["theta_m"], cut.signals["position"], settings.rules.travel
+    theta_m, position, stated = cut.signals["theta_m"], cut.signals["position"], settings.rules.travel
+    least = least_travel(state.gap, settings.model.encoder_resolution) if stated is None else stated
     alone = score(theta_m, position, settings.model, state.gap, usual=state.noise)
     if alone is not None and min(alone.travel) >= least and alone.std < _WIDEST:
         return alone

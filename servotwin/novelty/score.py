@@ -93,7 +93,14 @@ def model_of(servo: Servo, sample_rate: float) -> NoveltyModel:
     )
     factor = max(1, round(sample_rate / (_PER_PERIOD * fastest)))
     return NoveltyModel(
-        sample_rate, modes, known.position.direct, known.static_gain, known.unseen, factor, scales(servo).time
+        rate=sample_rate,
+        modes=modes,
+        direct=known.position.direct,
+        static_gain=known.static_gain,
+        unseen=known.unseen,
+        factor=factor,
+        second=scales(servo).time,
+        encoder_resolution=servo.encoder_resolution,
     )
 
 

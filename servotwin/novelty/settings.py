@@ -11,6 +11,7 @@ from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 
 _NUMERIC = "numpy", "scipy", "numba"
+_PLAIN, _OPTIONAL = ("rate", "direct", "static_gain", "unseen", "factor"), {"second": 1.0, "encoder_resolution": 0.0}
 
 
 class ResponseMode(NamedTuple):
@@ -40,6 +41,8 @@ class NoveltyModel:
         Decimation factor of the score.
     second : float
         s, one of the servo's own (`plant.scales`).
+    encoder_resolution : float
+        rad, one count of the motor's encoder; 0: not known.
     """
 
     rate: float
@@ -49,6 +52,7 @@ class NoveltyModel:
     unseen: float
     factor: int = 1
     second: float = 1.0
+    encoder_resolution: float = 0.0
 
     def __post_init__(self) -> None:
         numbers = [part for mode in self.modes for value in mode for part in (value.real, value.imag)]
@@ -64,6 +68,9 @@ class NoveltyModel:
             raise InvalidInput(f"novelty model unseen = {self.unseen!r} s: must be at least 0")
         if not (isfinite(self.second) and self.second > 0.0):
             raise InvalidInput(f"novelty model second = {self.second!r} s: must be finite and greater than 0")
+        if not (isfinite(self.encoder_resolution) and self.encoder_resolution >= 0.0):
+            count = f"encoder_resolution = {self.encoder_resolution!r} rad"
+            raise InvalidInput(f"novelty model {count}: must be finite and at least 0")
         if self.factor < 1:
             raise InvalidInput(f"novelty model decimation = {self.factor!r} samples: must be at least 1")
 
@@ -84,23 +91,28 @@ def model_table(
     second: Annotated[
         float, key("own_second_s", above=0.0, help="The servo's own second, in which a rest lasts.")
     ] = 1.0,
+    encoder_resolution: Annotated[
+        float, key("encoder_resolution_rad", minimum=0.0, help="One count of the motor's encoder; 0: not known.")
+    ] = 0.0,
 ) -> NoveltyModel:
     """Response of the structure; a program writes it."""
     if not len(decay_real) == len(decay_imag) == len(gain_real) == len(gain_imag):
         raise InvalidInput("decay_real, decay_imag, gain_real and gain_imag must have as many numbers as one another")
     decay, gain = map(complex, decay_real, decay_imag), map(complex, gain_real, gain_imag)
     modes = tuple(ResponseMode(*pair) for pair in zip(decay, gain, strict=True))
-    return NoveltyModel(rate, modes, direct, static_gain, unseen, factor, second)
+    return NoveltyModel(rate, modes, direct, static_gain, unseen, factor, second, encoder_resolution)
 
 
 def _model_values(model: NoveltyModel) -> Values:
     """Keys and values that `model_table` reads as this model."""
+    # Files of the version before have neither.
+    changed = [name for name, usual in _OPTIONAL.items() if getattr(model, name) != usual]
     return {
         "decay_real": [mode.decay.real for mode in model.modes],
         "decay_imag": [mode.decay.imag for mode in model.modes],
         "gain_real": [mode.gain.real for mode in model.modes],
         "gain_imag": [mode.gain.imag for mode in model.modes],
-        **values_of(model, model_table, only=("rate", "direct", "static_gain", "unseen", "factor", "second")),
+        **values_of(model, model_table, only=(*_PLAIN, *changed)),
     }
 
 
@@ -153,14 +165,16 @@ class NoveltyRules:
         ),
     ] = radians(0.25)
     travel: Annotated[
-        float,
+        float | None,
         key(
             "travel_deg",
             "travel_rad",
             above=0.0,
-            help="Smallest travel of the pushed screw, both ways, in an informative window.",
+            help="Smallest travel of the pushed screw, both ways, in an informative window; where absent 0.5 deg, or, "
+            "where the servo states the encoder's resolution, a third of the gap and at least 100 counts, if that is "
+            "less.",
         ),
-    ] = radians(0.5)
+    ] = None
     settle: Annotated[
         float,
         key(

@@ -9,6 +9,7 @@ from typing import ClassVar, Protocol
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.motor import LearntMotor
 from servotwin.estimation.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, Setting
@@ -39,6 +40,10 @@ class Evidence:
         Reason against using the estimate, such as that it does not fit the trend; empty where it may be used.
     machine : FactorPrior or None
         The machine's numbers over the model's, as learnt from the windows; None: the model is all that is known.
+    motor : LearntMotor or None
+        The motor's numbers, friction and input bias, as learnt from the windows.
+    rests : tuple of float
+        V, input biases that the last windows before this one showed.
     """
 
     estimate: GapEstimate
@@ -48,6 +53,8 @@ class Evidence:
     tuned_for: float | None = None
     why_not: str = ""
     machine: FactorPrior | None = None
+    motor: LearntMotor | None = None
+    rests: tuple[float, ...] = ()
 
     @property
     def gains(self) -> Gains | None:

@@ -13,7 +13,7 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
-from servotwin.hybrid.lifted import COARSE, FINE, advance_ticks
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, changes_at_ends, clean_ticks, jump
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted_tables import (
     LIMITED,
@@ -30,6 +30,8 @@ tick = verbatim(law.tick)
 
 UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
+# The vast scale's tables pay after so many calm ticks, and where so many more are to come.
+_CALM, _WORTH = 8 * BLOCK, 16 * COARSE * BLOCK
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
 
@@ -162,38 +164,70 @@ def note(segments: Segments, k: int, slot: int, z: Array) -> None:
     segments.size[0] = at + 1
 
 
+@inlined
+def deepens(place: Place, end: int, filled: int) -> bool:
+    """True where a run has been calm, and goes on so long that the tables of the vast scale pay."""
+    return filled < 2 and place.at[5] >= _CALM and end - place.at[0] >= _WORTH
+
+
+@inlined
+def vast_blocks(
+    z: Array, place: Place, slot: int, watches: int, end: int, segments: Segments, memory: LiftedMemory
+) -> bool:
+    """Advance by intervals of 128 ticks, a start recorded for each; return True where a whole block was clean."""
+    lifted, n = memory.lifted, memory.lifted.states
+    wanted = min(COARSE, (end - place.at[0]) // BLOCK)
+    clean = clean_ticks(
+        lifted, lifted.vast, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, z, memory.out
+    )
+    if clean > 0:
+        changes_at_ends(n, lifted.jump_vast, slot, z, memory.out)
+        for i in range(np.uint64(n)):
+            memory.change[i] = z[i]
+        for part in range(clean):
+            note(segments, place.at[0], slot, z)
+            for i in range(np.uint64(n)):
+                z[i] = memory.change[i] + memory.out[np.uint64(part) * np.uint64(n) + i]
+            place.at[0] += BLOCK
+        place.at[5] += clean * BLOCK
+    return clean == wanted
+
+
 @bare
 def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segments, memory: LiftedMemory) -> int:
-    """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced."""
+    """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced. Stops where
+    `deepens`."""
     slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
-    k = begin
-    while end - k >= 2 and segments.size[0] + 4 < len(segments.tick):
+    n, again = lifted.states, begin
+    low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
+    while end - place.at[0] >= 2 and segments.size[0] + COARSE + 4 < len(segments.tick):
+        filled, k = memory.filled[slot], place.at[0]
+        if deepens(place, end, filled):
+            break
+        if filled == 2 and place.at[5] >= _CALM and k >= again and end - k >= BLOCK:
+            if vast_blocks(z, place, slot, watches, end, segments, memory):
+                continue
+            # What is near its bound now is so for a while.
+            again, k = place.at[0] + 4 * BLOCK, place.at[0]
         if place.at[5] >= FINE and end - k >= FINE:
             wanted = min(COARSE, (end - k) // FINE)
-            note(segments, k, slot, z)
-            clean = advance_ticks(
-                lifted, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, z, memory.out,
-                memory.change,
-            )  # fmt: skip
-            k += clean * FINE
-            place.at[5] += clean * FINE
+            clean = clean_ticks(lifted, lifted.coarse, slot, watches, COARSE, wanted, low, high, slack, z, out)
+            if clean > 0:
+                note(segments, k, slot, z)
+                jump(n, lifted.jump_coarse, slot, COARSE, clean, z, memory.change)
+                k += clean * FINE
+                place.at[0], place.at[5] = k, place.at[5] + clean * FINE
             if clean == wanted:
                 continue
-            if clean == 0:
-                segments.size[0] -= 1
         wanted = min(FINE, end - k)
-        note(segments, k, slot, z)
-        clean = advance_ticks(
-            lifted, slot, watches, FINE, wanted, memory.low, memory.high, memory.slack, z, memory.out, memory.change
-        )
-        k += clean
-        place.at[5] += clean
-        if clean == 0:
-            segments.size[0] -= 1
+        clean = clean_ticks(lifted, lifted.fine, slot, watches, FINE, wanted, low, high, slack, z, out)
+        if clean > 0:
+            note(segments, k, slot, z)
+            jump(n, lifted.jump_fine, slot, FINE, clean, z, memory.change)
+            place.at[0], place.at[5] = k + clean, place.at[5] + clean
         if clean < wanted:
             break
-    place.at[0] = k
-    return k - begin
+    return place.at[0] - begin
 
 
 @bare
@@ -217,19 +251,23 @@ def run_lifted(
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
     while at[0] < end:
-        if segments.size[0] + 8 > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
+        if segments.size[0] + 2 * COARSE > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
             return FULL
         if record.size[1] > room:
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
         if at[5] > 0 and end - at[0] >= 2:
-            if memory.filled[slot_of(at[1], at[2] == 1, at[3])] == 0:
+            filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
+            at[6] = 1 if deepens(place, end, filled) else 0
+            if filled == 0 or at[6] == 1:
                 return UNFILLED
             watches = set_bounds(t, loop, places, place, memory)
             if advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
                     break
                 set_reference(places, coefficients, at[0] / rate - origin, z)
+                if deepens(place, end, filled):
+                    continue
         active, mode, side, kind, sign = at[2], at[1], at[4], at[3], place.sign[0]
         error = take_tick(loop, places, z, place)
         # The first tick finds the zone that holds at the start.

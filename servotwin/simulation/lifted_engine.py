@@ -96,7 +96,7 @@ def watches_of(plant: ServoAutomaton, controller: Controller, dead_zone: bool) -
 def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
     """Tables and working memory of one run."""
     n, slots = places.states, modes * 2 * KINDS
-    rows = max(row_count(n, watches, COARSE), n)
+    rows = max(row_count(n, watches, COARSE), COARSE * n)
     return LiftedMemory(
         new_lifted(n, watches, slots),
         new_lifted_workspace(n, watches),
@@ -151,7 +151,7 @@ class LiftedEngine:
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)
         self.scratch = new_scratch(self.tables)
-        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0], dtype=np.int64), np.zeros(1))
+        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
 
     def advance(self, index: int) -> None:
         """Run from the start to the last sample; `index` must be that one."""

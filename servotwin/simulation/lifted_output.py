@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
-from servotwin.hybrid.flow import dot, product
-from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables
+from servotwin.hybrid.flow import dot, product, tall_product
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace
 from servotwin.simulation.lifted import TICKED, Segments
 from servotwin.simulation.lifted_tables import LiftedMemory, Places
 
@@ -19,24 +19,28 @@ def _at(sample: int, state: int, n: int, samples_first: bool) -> int:
 
 
 @bare
-def _fill_output(lifted: LiftedTables, slot: int, row: Array, samples_first: bool, out: Array) -> None:
+def _fill_output(
+    lifted: LiftedTables, w: LiftedWorkspace, slot: int, row: Array, samples_first: bool, out: Array
+) -> None:
     """Rows ``row M**j`` for j = 0 .. 127, one after the other, or sample after sample in each column."""
-    n = lifted.states
-    n2 = n * n
+    n, fine, coarse = lifted.states, FINE * lifted.states, COARSE * lifted.states
+    rest = fine - n
+    # Powers 1 .. 7 of the map, whose rows the jumps hold as columns.
+    for i in range(n):
+        for j in range(FINE - 1):
+            for k in range(n):
+                w.powers[i * rest + j * n + k] = lifted.jump_fine[(slot * n + k) * fine + j * n + i]
+    start, rows = w.row[:n], w.rows[:rest]
     for c in range(COARSE):
         for k in range(n):
-            value = row[k]
+            start[k] = row[k]
             if c > 0:
-                value += dot(lifted.jump_coarse, (slot * COARSE + c - 1) * n2 + k * n, row)
-            out[_at(c * FINE, k, n, samples_first)] = value
-    for c in range(COARSE):
+                start[k] += dot(lifted.jump_coarse, (slot * n + k) * coarse + (c - 1) * n, row)
+            out[_at(c * FINE, k, n, samples_first)] = start[k]
+        tall_product(w.powers, 0, rest, rest, start, rows)
         for j in range(1, FINE):
-            base = (slot * FINE + j - 1) * n2
             for k in range(n):
-                value = out[_at(c * FINE, k, n, samples_first)]
-                for i in range(n):
-                    value += lifted.jump_fine[base + k * n + i] * out[_at(c * FINE, i, n, samples_first)]
-                out[_at(c * FINE + j, k, n, samples_first)] = value
+                out[_at(c * FINE + j, k, n, samples_first)] = start[k] + rows[(j - 1) * n + k]
 
 
 @bare
@@ -71,7 +75,7 @@ def sample_lifted(
                 whole[j] = row[j] if j != places.voltage else 0.0
             for j in range(n):
                 whole[j] += row[places.voltage] * memory.voltage_rows[slot * n + j]
-            _fill_output(memory.lifted, slot, whole, stride == 1, table[base : base + BLOCK * n])
+            _fill_output(memory.lifted, memory.workspace, slot, whole, stride == 1, table[base : base + BLOCK * n])
             filled[slot] = 1
         if stride == 1:
             product(table, base, BLOCK, last - first, z, out[first:last])

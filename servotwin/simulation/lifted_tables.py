@@ -56,7 +56,7 @@ class LiftedMemory(NamedTuple):
 
     lifted: LiftedTables
     workspace: LiftedWorkspace
-    filled: NDArray[np.int8]  # (slots,)
+    filled: NDArray[np.int8]  # (slots,): 1, or 2 with the vast scale
     voltage_rows: Array  # slots * N: the applied voltage after a tick, of the state before it
     low: Array
     high: Array
@@ -69,8 +69,8 @@ class LiftedMemory(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a run is: ``at = [tick, mode, active, kind, side of the error, ticks since a switch]``; `sign` of the limit
-    that acts."""
+    """Where a run is: ``at = [tick, mode, active, kind, side of the error, ticks since a switch, vast scale wanted]``;
+    `sign` of the limit that acts."""
 
     at: NDArray[np.int64]
     sign: Array
@@ -283,7 +283,7 @@ def _inside_tick(t: Tables, loop: LiftedLoop, places: Places, mode: int, guard: 
                 cubic = (c0 * points[i] + c1 * points[n + i]) + (c2 * points[2 * n + i] + c3 * points[3 * n + i])
                 deviation[i] = true - cubic
             _after_tick(places, memory, deviation, 1.0, whole)
-            add_square(n, whole, w.inside, base)
+            add_square(n, whole, w.inside, base, n)
         for i in range(plant):
             value[i], slope[i] = new_value[i], new_slope[i]
 
@@ -319,5 +319,6 @@ def fill_here(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory:
             w.inside[watch * n * n + i] = 0.0
     for i in range(n):
         memory.voltage_rows[slot * n + i] = memory.tick_map[places.voltage * n + i] + (i == places.voltage)
-    fill_slot(memory.lifted, slot, watches, w)
-    memory.filled[slot] = 1
+    deep = place.at[6] == 1
+    fill_slot(memory.lifted, slot, watches, deep, w)
+    memory.filled[slot] = 2 if deep else 1

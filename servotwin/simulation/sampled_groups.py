@@ -227,7 +227,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         new_memory(group.places, family.modes, group.watches),
         new_scratch(tables),
         np.zeros(n),
-        Place(np.zeros(6, dtype=np.int64), np.zeros(1)),
+        Place(np.zeros(7, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
         np.zeros(4),
         np.zeros((outputs, slots), dtype=np.int8),

@@ -14,7 +14,7 @@ from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, RunRecord
 from servotwin.hybrid.members import figures_of
-from servotwin.hybrid.tables import Tables
+from servotwin.hybrid.tables import NODES_FINE, Tables
 from servotwin.simulation.lifted import TICKED, UNFILLED, Segments, note, run_lifted, set_reference, take_tick
 from servotwin.simulation.lifted_output import sample_lifted
 from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places, fill_here
@@ -80,7 +80,9 @@ def load(family: SampledFamily, plant: int, law: int, worker: SampledWorker) -> 
     """Make the tables those of a plant and a law."""
     if worker.loaded[0] != plant:
         numbers = Numbers(family.flows[plant], family.guards[plant], family.resets[plant])
-        fill_tables(worker.tables, numbers, family.step[plant], worker.workspace)
+        # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
+        blocks = family.searches[plant] >= NODES_FINE
+        fill_tables(worker.tables, numbers, family.step[plant], blocks, worker.workspace)
     elif worker.loaded[1] == law:
         return
     worker.loaded[0], worker.loaded[1] = plant, law

@@ -18,6 +18,7 @@ from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import estimate_gap, settings_of
 from servotwin.estimation.machine import LearningSettings, LearntMachine, nameplate, updated
+from servotwin.estimation.motor import LearntMotor, MotorLearning
 from servotwin.estimation.offset import estimate_carrying
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -134,6 +135,8 @@ class Wear(Struct, frozen=True):
         None before the first estimate.
     machine : LearntMachine or None
         None before a window told of the machine's numbers.
+    motor : LearntMotor or None
+        None before a window told of the motor's numbers.
     """
 
     previous: float
@@ -141,6 +144,7 @@ class Wear(Struct, frozen=True):
     arrived: float = 0.0
     state: TrendState | None = None
     machine: LearntMachine | None = None
+    motor: LearntMotor | None = None
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
@@ -187,7 +191,7 @@ class Wear(Struct, frozen=True):
         counts = after.refused == 0
         previous = float(estimate.gap) if counts else self.previous
         rejection = "" if counts else "; ".join(after.reasons) or "the window is older than the trend"
-        return Wear(previous, boot, now, TrendState.of(after), self.machine), rejection
+        return Wear(previous, boot, now, TrendState.of(after), self.machine, self.motor), rejection
 
     def _on_clock(self, settings: TrendSettings, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""
@@ -234,6 +238,18 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
         return replace(made, machine=other.machine) if other.ok else made
 
     return estimate
+
+
+def motor_learning_of(servo: Servo, settings: TwinSettings) -> MotorLearning | None:
+    """Make the learning of the motor's numbers; None where the settings or the servo's elastic screw rule it out."""
+    if not (settings.learning.learn and servo.rigid):
+        return None
+    known = settings.uncertainty
+    # Half-widths within which every value is as likely.
+    back_emf, lag = known.k_B / math.sqrt(3.0), known.k_T / math.sqrt(3.0)
+    return MotorLearning(
+        servo, settings.learning, max(back_emf, settings.learning.motor_floor), max(lag, settings.learning.motor)
+    )
 
 
 def known_gap(gap: SignalLike, duration: float) -> Estimator:

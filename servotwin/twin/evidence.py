@@ -16,6 +16,7 @@ from msgspec import Struct
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.machine import LearntMachine
+from servotwin.estimation.motor import LearntMotor
 from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import (
@@ -80,6 +81,13 @@ class MachineRecord(NamedTuple):
     machine: LearntMachine
 
 
+class MotorRecord(NamedTuple):
+    """The motor as learnt, after a window that told of it."""
+
+    window: WindowMessage
+    motor: LearntMotor
+
+
 class RedesignRecord(NamedTuple):
     """A redesign, or the reason why there is none."""
 
@@ -109,7 +117,7 @@ class WithdrawalRecord(NamedTuple):
 
 
 Record = (
-    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | RedesignRecord
+    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | RedesignRecord
     | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
     | Update | Request | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
@@ -129,6 +137,7 @@ class EvidenceLog:
     disturbances: dict[WindowId, Disturbance] = field(default_factory=dict)
     trends: dict[WindowId, Trend | None] = field(default_factory=dict)
     machines: dict[WindowId, LearntMachine] = field(default_factory=dict)
+    motors: dict[WindowId, LearntMotor] = field(default_factory=dict)
     redesigns: dict[WindowId, Redesign] = field(default_factory=dict)
     excitations: dict[WindowId, Decision] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
@@ -164,6 +173,8 @@ class EvidenceLog:
                 self.trends[window.identity] = trend
             case MachineRecord(window, machine):
                 self.machines[window.identity] = machine
+            case MotorRecord(window, motor):
+                self.motors[window.identity] = motor
             case RedesignRecord(window, redesign):
                 self.redesigns[window.identity] = redesign
             case ExcitationRecord(window, decision):
@@ -266,6 +277,8 @@ def _row(record: Record) -> EvidenceRecord | None:
             return _made("trend", numbers, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
         case MachineRecord(_, machine):
             return _made("alarm" if machine.alarm else "machine", machine, machine.alarm)
+        case MotorRecord(_, motor):
+            return _made("alarm" if motor.alarm else "motor", motor, motor.alarm)
         case RedesignRecord(_, redesign):
             return _made("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
         case ExcitationRecord(_, decision):

@@ -8,12 +8,13 @@ from functools import partial
 from msgspec.structs import replace
 
 from servotwin.estimation.disturbance import disturbance
+from servotwin.estimation.motor import MotorLearning
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of
+from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of, motor_learning_of
 from servotwin.twin.lookups import Lookups, LookupState
 from servotwin.twin.requests import Requests, RequestState
 from servotwin.twin.settings import TwinSettings
@@ -43,6 +44,8 @@ class TwinModel:
         Decides for which windows a glance is enough.
     lookups : Lookups, optional
         Looks settings up, and verifies them after they were sent; `policy` is not used then.
+    motor : MotorLearning, optional
+        Learns the motor's numbers; None: the model's are taken as they are.
     """
 
     estimator: Estimator
@@ -53,6 +56,7 @@ class TwinModel:
     requests: Requests | None = None
     triage: Triage | None = None
     lookups: Lookups | None = None
+    motor: MotorLearning | None = None
 
     @classmethod
     def of(
@@ -79,6 +83,7 @@ class TwinModel:
             policy=chosen,
             settings=settings,
             observer=partial(disturbance, servo=servo),
+            motor=motor_learning_of(servo, settings),
             start=start,
             requests=Requests.of(servo, settings),
             triage=None if settings.triage is None else Triage(servo, settings.triage),

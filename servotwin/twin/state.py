@@ -35,6 +35,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         Sendings of the pending update.
     tuned_for : float or None
         rad, gap of the last redesign.
+    rests : tuple of float
+        V, input biases that the last windows showed, the newest last.
     requests, triage, lookups : RequestState, TriageState, LookupState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -48,6 +50,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     requests: RequestState | None = None
     triage: TriageState | None = None
     lookups: LookupState | None = None
+    rests: tuple[float, ...] = ()
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -37,6 +37,7 @@ from servotwin.twin.evidence import (
     GapEstimateRecord,
     GlanceRecord,
     MachineRecord,
+    MotorRecord,
     Record,
     RedesignRecord,
     TrendRecord,
@@ -49,6 +50,10 @@ from servotwin.twin.state import TwinState
 from servotwin.twin.versions import Attempts, noted_setting
 
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
+
+
+# Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
+_RESTS = 3
 
 
 class WindowArrival(NamedTuple):
@@ -155,23 +160,32 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     estimate = decoded.estimate(model.estimator, expected)
     disturbed = decoded.disturbance(model.observer)
     records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
+    before = state.wear
     # A stale window is estimated for the record, but moves nothing: windows may come in any order.
     stale = not state.versions.admits(message)
-    rejection, learnt = _STALE, state.wear.machine
+    rejection = _STALE
     if not stale:
         wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning)
+        if model.motor is not None and decoded.window is not None:
+            wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records.append(TrendRecord(message, trend))
-    if state.wear.machine is not None and state.wear.machine != learnt:
+    if state.wear.machine is not None and state.wear.machine != before.machine:
         records.append(MachineRecord(message, state.wear.machine))
+    if state.wear.motor is not None and state.wear.motor != before.motor:
+        records.append(MotorRecord(message, state.wear.motor))
     if model.triage is not None and state.triage is not None and not stale:
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
         state = replace(state, triage=triage)
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
-    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine)
+    evidence = Evidence(
+        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, state.wear.motor, state.rests
+    )
     state, redesign = _redesign(model, state, evidence, stale)
+    if disturbed.known and not stale:
+        state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     requests: tuple[Message, ...] = ()
     if model.requests is not None and state.requests is not None and not stale and estimate.method != UNUSABLE:

@@ -28,7 +28,7 @@ _SERVOS, _MESSAGES = 16, 16
 """Servos in one job, and messages of each."""
 _MAX_STEPS = 64
 """Results that one lock-step request may lead to."""
-QUIET = ("glance", "trend", "machine", "disturbance", "excitation")
+QUIET = ("glance", "trend", "machine", "motor", "disturbance", "excitation")
 """Evidence of every window: logged at level debug."""
 ALARMS = ("failed", "fallback", "withdrawn", "alarm")
 """Evidence that somebody should look at: logged as warnings."""

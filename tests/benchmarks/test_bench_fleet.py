@@ -28,6 +28,7 @@ from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, ResourceSample, Resourc
 from servotwin.cli.app import app
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Setting, Update, decode, encode
+from servotwin.redesign.certified.lookup import Grid
 from servotwin.store.records import Incoming, MessageKind
 from servotwin.store.store import open_store
 
@@ -249,6 +250,8 @@ def test_a_small_fleet_runs_with_real_processes(tmp_path: Path, monkeypatch) -> 
     monkeypatch.setattr(
         "benchmarks.fleet.command.show", lambda _scale, alone, whole, _console: kept.extend((alone, whole))
     )
+    # Few and wide cells: the bench's own table takes most of its time, and is looked up in the same way.
+    monkeypatch.setattr("benchmarks.fleet.setting.GRID", Grid(math.radians(8.0), (1e-2,), (0.0,)))
     output = tmp_path / "fleet.json"
     shown = CliRunner().invoke(app, ["bench", "fleet", "--quick", "--json", str(output)])
     assert shown.exit_code == 0, shown.output

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from rich.console import Console
 
 from benchmarks.policies.command import chosen, dumps, policies, shown
 from benchmarks.policies.contenders import constants, contender
+from benchmarks.policies.loops import scored
 from benchmarks.policies.machines import BIAS, BLOCKS, machines
 from benchmarks.policies.table import PolicyScores, compare
 from benchmarks.policies.trial import REST, Contender, run_machine, scores
+from benchmarks.policies.worn import BLOCKS as WORN_BLOCKS
+from benchmarks.policies.worn import HALF_PERIOD, RATE, STEPS, worn_machines
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
@@ -70,7 +74,7 @@ def test_constants_are_all_different_and_hold_the_calm_one() -> None:
 
 @pytest.mark.slow
 def test_the_table_and_its_document() -> None:
-    rows = list(compare(MODEL, KNOWN, 3, seed=3, blocks=("clean",)))
+    rows = list(compare(MODEL, KNOWN, 2, seed=3, blocks=("clean",)))
     assert [row.name for row in rows[:5]] == ["no dead zone", "paper", "margin", "hysteresis", "certified"]
     assert rows[-1].name.startswith("constant: ")
     certified = rows[4]
@@ -78,7 +82,7 @@ def test_the_table_and_its_document() -> None:
     assert certified.at("tail", 95.0) < 5e-6
     assert rows[0].at("tail", 50.0) > 10.0 * certified.at("tail", 95.0)
     assert len(shown(rows).rows) == len(rows)
-    assert sum(int(cell) for cell in chosen(rows).columns[2]._cells) == 3
+    assert sum(int(cell) for cell in chosen(rows).columns[2]._cells) == 2
     document = json.loads(dumps(rows, "2026-11-21"))
     assert document["rows"][4]["tail"] == pytest.approx(list(certified.scores.tail))
     assert document["rows"][0]["gap_deg"] == pytest.approx([math.degrees(m.gap) for m in certified.machines], abs=1e-6)
@@ -96,3 +100,27 @@ def test_settled_is_a_share() -> None:
 def test_a_file_that_cannot_be_written_is_reported_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="json"):
         policies("", tmp_path / "out.csv", 2, console=Console(quiet=True))
+
+
+def test_blocks_of_worn_machines_differ_by_their_disturbances_only() -> None:
+    drawn = {block: worn_machines(block, 3, 5) for block in WORN_BLOCKS}
+    assert [m.plant.k for m in drawn["bias"]] == [m.plant.k for m in worn_machines("bias", 3, 5)]
+    for block, those in drawn.items():
+        assert all((m.input_bias != 0.0) == (block in ("bias", "all")) for m in those)
+        assert all((m.friction > 0.0) == (block in ("friction", "all")) for m in those)
+        assert all((m.delay > 0) == (block in ("delay", "all")) for m in those)
+        assert all((m.plant.position_resolution > 0.0) == (block in ("quantisation", "all")) for m in those)
+        assert all((m.model.controller.voltage_limit is not None) == (block in ("saturation", "all")) for m in those)
+        assert all(m.plant.k != m.model.k for m in those)
+
+
+def test_the_cost_of_a_loop_is_the_error_s_integral_per_step() -> None:
+    """A run whose error is a tenth of the step for half of each half period, and nothing else."""
+    (machine,) = worn_machines("model error", 1, 5)
+    samples = round(RATE * HALF_PERIOD)
+    sizes = [machine.amplitude] + [2.0 * machine.amplitude] * (STEPS - 1)
+    error = np.concatenate([np.r_[np.full(samples // 2, 0.1 * s), np.zeros(samples - samples // 2)] for s in sizes])
+    run = SimpleNamespace(reference=np.r_[error, 0.0], position=np.zeros(error.size + 1))
+    found = scored(machine, run)
+    assert found.cost == pytest.approx(0.05 * HALF_PERIOD)
+    assert (found.settled, found.tail) == (1.0, 0.0)

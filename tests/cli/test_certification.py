@@ -36,6 +36,7 @@ def quiet() -> Console:
     return Console(file=io.StringIO(), width=200)
 
 
+@pytest.mark.slow
 def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path: Path) -> None:
     path = twin_file(tmp_path, ("one", "one.table"), ("other", ""))
     with pytest.raises(InvalidInput, match=r"one\.table: cannot be read .*`servotwin certify` makes tables"):
@@ -49,12 +50,14 @@ def test_every_model_that_names_a_table_gets_it_and_the_fleet_takes_it(tmp_path:
     )
 
 
+@pytest.mark.slow
 def test_one_model_may_be_named_and_its_file(tmp_path: Path) -> None:
     path = twin_file(tmp_path, ("one", ""), ("other", ""))
     certify(path, "other", tmp_path / "x.table", COARSE, quiet())
     assert (tmp_path / "x.table").exists()
 
 
+@pytest.mark.slow
 def test_a_scenario_is_accepted_in_place_of_a_twin_s_file(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_text(
@@ -104,6 +107,7 @@ def test_options_that_are_no_numbers_are_named(options: tuple[str, str], why: st
         grid_of(4.0, *options)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path) -> None:
     path = twin_file(tmp_path, ("one", "one.table"))
     coarse = ["--finest-deg", "60", "--bias-mv", "10", "--noise-um", "0"]

@@ -29,6 +29,7 @@ def test_the_terminal_shows_every_step_within_eighty_columns(shown):
     assert f"report: {path}" in text
 
 
+@pytest.mark.slow
 def test_the_report_stands_alone(shown):
     path = shown[0]
     page = path.read_text()
@@ -56,6 +57,7 @@ def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_publish
     assert 10.0 * worst[0] < worst[1]
 
 
+@pytest.mark.slow
 def test_the_report_shows_what_was_sent_and_on_how_many_machines_it_was_tried(shown):
     text = shown[0].read_text()
     assert "What the certified twin sent" in text

@@ -69,6 +69,7 @@ def test_the_files_hold_the_map(finished):
     assert image.imread(finished / "map.png").shape == (1170, 1080, 4)
 
 
+@pytest.mark.slow
 def test_the_table_agrees_with_the_cells(finished):
     settings = REQUEST.settings()
     whole = StabilityMap(settings, measured(settings, range(settings.count)))
@@ -123,6 +124,7 @@ def test_a_damaged_piece_is_computed_again(finished, tmp_path):
     assert same_files(finished, out)
 
 
+@pytest.mark.slow
 def test_another_map_s_folder_is_refused(finished):
     before = {path: path.read_bytes() for path in finished.rglob("*.npz")}
     for change, message in (
@@ -149,20 +151,14 @@ def test_processes_give_the_same_bytes(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bytes(tmp_path, finished):
-    pytest.importorskip("distributed")
-    with Cluster(tmp_path) as (address, _):
-        process = started("paper", *SMALL, "--out", tmp_path / "out", "--scheduler", address)
-        _, stderr = process.communicate(timeout=120)
-    assert process.returncode == 0, stderr
-    assert same_files(finished, tmp_path / "out")
-
-
-@pytest.mark.slow
-def test_a_dask_cluster_that_is_lost_keeps_what_is_finished(tmp_path):
+def test_a_dask_cluster_gives_the_same_bytes_and_when_it_is_lost_keeps_what_is_finished(tmp_path, finished):
     pytest.importorskip("distributed")
     long = ("--tolerance", "0.5:3:30", "--amplitude", "1:100:30:log", "--members", "16", "--out", tmp_path / "out")
     with Cluster(tmp_path) as (address, scheduler):
+        process = started("paper", *SMALL, "--out", tmp_path / "small", "--scheduler", address)
+        _, stderr = process.communicate(timeout=120)
+        assert process.returncode == 0, stderr
+        assert same_files(finished, tmp_path / "small")
         process = started("paper", *long, "--scheduler", address)
         chunks = tmp_path / "out" / "chunks"
         while not list(chunks.glob("0*.npz")) and process.poll() is None:

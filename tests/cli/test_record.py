@@ -24,6 +24,7 @@ size_mm = 1.0
 [gap]
 total_deg = 5.0
 [twin]
+policy = "paper"
 initial_gap_deg = 5.0
 """
 COLUMNS = [

@@ -70,6 +70,7 @@ def test_every_estimate_comes_out_again_bit_for_bit(folder: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_changed_version_is_named(folder: Path) -> None:
     assert changed(folder, "update contexts set text = replace(text, ?, ?)", f'"{version("numpy")}"', '"1.2.3"') == 1
     code, output = replayed(folder)
@@ -78,6 +79,7 @@ def test_a_changed_version_is_named(folder: Path) -> None:
     assert f"changed since {windows(folder)} windows: numpy 1.2.3 then, {version('numpy')} now" in output
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_not_reproduced_is_reported(folder: Path) -> None:
     """One bit of one stored number: nothing explains that, and nothing else is blamed."""
     (row, body), *_ = rows_of(folder, "select id, body from evidence where kind = 'estimate' and status = 'ok'")
@@ -106,6 +108,7 @@ def test_a_changed_model_is_named_with_its_changes(folder: Path) -> None:
     assert replayed(folder)[0] == 0, "as they were then"
 
 
+@pytest.mark.slow
 def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(folder: Path) -> None:
     store = open_store(f"sqlite:///{folder / 'twin.db'}")
     try:
@@ -120,6 +123,7 @@ def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(fol
     assert f"{gone.kept} the same, bit for bit" in output
 
 
+@pytest.mark.slow
 def test_one_window_is_enough(folder: Path) -> None:
     name = rows_of(folder, "select key from messages where kind = 'window'")[2][0]
     assert isinstance(name, str)
@@ -127,6 +131,7 @@ def test_one_window_is_enough(folder: Path) -> None:
     assert (code, output.splitlines()[0]) == (0, "servo axis: 1 window")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("statement", "output"),
     [
@@ -145,6 +150,7 @@ def test_data_that_cannot_be_decoded_is_reported_for_each_window(folder: Path, s
     assert "Traceback" not in result
 
 
+@pytest.mark.slow
 def test_windows_that_were_never_estimated_are_counted_apart(folder: Path) -> None:
     assert changed(folder, "update evidence set status = 'failed: a reason' where kind = 'estimate'") == windows(folder)
     code, output = replayed(folder)
@@ -154,6 +160,7 @@ def test_windows_that_were_never_estimated_are_counted_apart(folder: Path) -> No
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "output"),
     [
@@ -165,6 +172,7 @@ def test_an_invalid_window_is_one_sentence(folder: Path, arguments: tuple[str, .
     assert replayed(folder, *arguments) == (2, output)
 
 
+@pytest.mark.slow
 def test_reading_makes_no_store(folder: Path) -> None:
     for file in folder.glob("twin.db*"):
         file.unlink()

@@ -14,7 +14,7 @@ from servotwin.runtime.extras import EXTRAS, require
 ROOT = Path(__file__).parents[2]
 SCENARIO = """
 servo = "paper"
-duration_s = 12.0
+duration_s = 4.0
 [reference]
 kind = "square"
 amplitude_mm = 1.0

@@ -42,6 +42,7 @@ def error(loop: Loop, index: int) -> float:
     return abs(math.degrees(loop.estimates[index].gap) - 10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1000.0])
 def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(rate: float | None) -> None:
     loop = cosimulate(calm(ExcitationSettings(), rate, recording=SHORT, reference=SquareWave(1e-3, 20.0)))
@@ -64,6 +65,7 @@ def test_an_edge_that_refuses_longer_windows_gets_no_second_request() -> None:
     assert last.endswith("longer ones are refused, and a probing move is not allowed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1000.0])
 def test_steps_within_the_gap_lead_to_a_probing_move_and_to_the_gap(rate: float | None) -> None:
     loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=SMALL, duration=19.0))
@@ -152,7 +154,7 @@ def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
         assert {answer.outcome for answer in loop.answers} == {RequestOutcome.TAKEN}
         assert len(set(loop.answers)) == len({answer.serial for answer in loop.answers})
         assert loop.windows[-1].samples == 10_000
-        assert loop.digest() == cosimulate(loop.scenario).digest()
+    assert loop.digest() == cosimulate(loop.scenario).digest()
 
 
 TOML = """

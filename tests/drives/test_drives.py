@@ -51,8 +51,8 @@ def read_all(drive: SupervisedDrive, most: int) -> list[Block]:
 
 @pytest.mark.slow
 def test_control_ticked_through_the_socket_is_the_sampled_simulation(tmp_path: Path) -> None:
-    """25 s at 5 kHz with noise, a dead zone and a gap that grows from nothing, contacts inside samples included."""
-    path = plant_file(tmp_path, "control")
+    """10 s at 5 kHz with noise, a dead zone and a gap that grows from nothing, contacts inside samples included."""
+    path = plant_file(tmp_path, "control", 10.0)
     scenario = Scenario.load(tmp_path / "scenario.toml")
     run = whole(simulation_of(scenario))
     parameters, state = scenario.start_law.law(scenario.start_tolerance), law.start(0.0)
@@ -101,31 +101,25 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
 
 
 @pytest.mark.slow
-def test_a_dead_zone_without_gains_is_set_as_it_is(tmp_path: Path) -> None:
+def test_a_dead_zone_is_set_as_it_is_and_parameters_of_no_controller_change_nothing(tmp_path: Path) -> None:
+    gains = Gains(1.0, 2.0, 3.0, 0.1)
     path = plant_file(tmp_path, "supervise", 4.0)
     with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
         drive.connect()
-        blocks = [drive.read(3000)]
+        blocks = [drive.read(2990)]
+        for bad in (-1.0, np.inf):
+            refused = Parameters(3, Setting(0.0, gains))
+            object.__setattr__(refused, "setting", Setting(bad, gains))
+            with pytest.raises(DriveRefused, match="tolerance"):
+                drive.write(refused)
+        blocks += [drive.read(10)]
+        assert blocks[-1].version == 0
         drive.write(Parameters(1, Setting(1e-4)))
         blocks += read_all(drive, 3000)
     same = simulation_of(Scenario.load(tmp_path / "scenario.toml"))
     same.advance(3000)
     same.set_tolerance(1e-4)
     assert np.array_equal(joined(blocks)[3], whole(same).voltage[:-1])
-
-
-@pytest.mark.slow
-def test_parameters_of_no_controller_are_refused_and_nothing_changes(tmp_path: Path) -> None:
-    gains = Gains(1.0, 2.0, 3.0, 0.1)
-    path = plant_file(tmp_path, "supervise", 4.0)
-    with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
-        drive.connect()
-        for bad in (-1.0, np.inf):
-            refused = Parameters(3, Setting(0.0, gains))
-            object.__setattr__(refused, "setting", Setting(bad, gains))
-            with pytest.raises(DriveRefused, match="tolerance"):
-                drive.write(refused)
-        assert drive.read(10).version == 0
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from servotwin.logs.log import write_log
 from servotwin.messages import Setting, WindowMessage, unpack_channel
 
 RATE, WINDOW = 5000.0, 0.5
-SIMULATED = 11.0  # s: changes of the reference at 0, 2, ... 10 s
+SIMULATED = 5.0  # s: changes of the reference at 0, 2 and 4 s
 
 
 def replayed(folder: Path, _stack: ExitStack) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def windows_of(folder: Path) -> list[WindowMessage]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "count"), [(replayed, 6), (simulated, 6), (over_opcua, 2)])
+@pytest.mark.parametrize(("kind", "count"), [(replayed, 3), (simulated, 3), (over_opcua, 2)])
 def test_windows_hold_what_the_machine_did(tmp_path: Path, kind: Any, count: int) -> None:
     with ExitStack() as stack:
         drive = kind(tmp_path, stack)
@@ -83,7 +83,7 @@ def test_windows_hold_what_the_machine_did(tmp_path: Path, kind: Any, count: int
         return
     simulation = simulation_of(Scenario.load(tmp_path / "scenario.toml"))
     simulation.advance(simulation.samples - 1)
-    for window, begin in zip(windows, (0.0, 2.0, 4.0, 6.0, 8.0, 10.0), strict=True):
+    for window, begin in zip(windows, (0.0, 2.0, 4.0), strict=True):
         assert window.start == begin
         first = round(begin * RATE)
         for name in ("reference", "position", "theta_m", "voltage"):

@@ -74,6 +74,7 @@ def replay(changed_boot: bool) -> GapEstimate:
     return list(twin.log.estimates.values())[-1]
 
 
+@pytest.mark.slow
 def test_a_new_boot_forgets_the_offset():
     kept, forgotten = replay(False), replay(True)
     assert kept.ok

@@ -50,7 +50,6 @@ def errors(run: Run, gap_deg: float, settings: PaperSettings, steps: int = 8) ->
     return np.array([math.degrees(estimate.gap) - gap_deg for estimate in estimates])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize(
     ("preset", "settle_s", "bias", "margin"),
@@ -100,7 +99,6 @@ def test_far_from_zero_the_published_reading_is_refused():
     assert abs(first.theta_d0 - farther.theta_m[0]) <= 0.5 * first.gap * (1.0 + 1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize(
     ("settings", "bias", "scatter"),

@@ -34,7 +34,7 @@ def test_stamps_do_not_depend_on_the_process() -> None:
     """Otherwise every other run would compile again."""
     first = stamps(0)  # seeds 0 and 4 order a set of two words differently
     assert first.count("\n") > 20
-    assert {stamps(seed) for seed in (1, 4)} == {first}
+    assert stamps(4) == first
 
 
 def test_every_helper_stands_above_its_callers() -> None:

@@ -58,7 +58,6 @@ def events(run: Trajectory) -> list[tuple[float, str]]:
     return [(time, label) for time, label, _, _ in run.events()]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", [1e-3, 0.05, 1.0])
 def test_modes_follow_the_roots_of_the_cubic(step: float) -> None:
     a, b, c = 1.234, 2.345, 9.01

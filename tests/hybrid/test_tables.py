@@ -86,7 +86,7 @@ def test_filled_again_they_are_as_new(shape: Shape) -> None:
     (first, step), (second, other) = loop(shape), loop(shape, k=1.1e4, c=20.0, Ki=3e3)
     fresh, reused = build_tables(second, other), build_tables(first, step)
     assert not same(fresh, reused)
-    fill_tables(reused, numbers_of(second, reused.guards), other, new_workspace(reused))
+    fill_tables(reused, numbers_of(second, reused.guards), other, True, new_workspace(reused))
     assert same(fresh, reused)
 
 

@@ -74,7 +74,6 @@ def test_a_connection_that_the_server_closed_is_opened_again(twin: FakeTwin, lin
     assert len(twin.windows) == 3
 
 
-@pytest.mark.slow
 def test_messages_of_the_twin_are_returned_until_they_are_acknowledged(twin: FakeTwin, link: HttpTransport) -> None:
     assert link.listen(0) == []
     for k in range(3):
@@ -82,7 +81,6 @@ def test_messages_of_the_twin_are_returned_until_they_are_acknowledged(twin: Fak
     assert [len(link.listen(after)) for after in (0, 0, 2, 3)] == [3, 3, 1, 0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("code", "status"), [(code, 400) for code in Refusal])
 def test_a_refusal_is_understood(twin: FakeTwin, link: HttpTransport, code: Refusal, status: int) -> None:
     def refuse(handler: Handler, _: bytes) -> bool:

@@ -174,7 +174,6 @@ def test_requests_pass_unchanged(web: int) -> None:
     assert Counting.seen == {"/a": 1, "/b": 1}
 
 
-@pytest.mark.slow
 def test_each_request_meets_the_fate_that_the_seed_gives_it(web: int) -> None:
     chances = Chances(lost_before=0.2, lost_after=0.2, twice=0.2, held=0.3, hold_s=0.05)
     paths = [f"/{k}" for k in range(60)]

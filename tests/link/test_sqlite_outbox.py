@@ -261,7 +261,6 @@ def test_a_file_corrupted_while_open_is_put_aside_and_its_windows_are_counted(ou
 STEPS = st.lists(st.tuples(st.sampled_from("prdlt"), st.integers(0, 9), st.booleans()), max_size=30)
 
 
-@pytest.mark.slow
 @examples(40, deadline=None)
 @given(steps=STEPS)
 def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPathFactory, steps: list) -> None:

@@ -50,7 +50,6 @@ def after(gaps: np.ndarray, rules: NoveltyRules = RULES, std: float = STD, chart
     return news
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("allowance", "limit"), [(0.5, 3.0), (0.5, 4.0), (0.25, 5.0)])
 def test_run_lengths_are_those_of_the_markov_chain(allowance: float, limit: float) -> None:
     two_sided = 0.5 * exact_run_length(allowance, limit)

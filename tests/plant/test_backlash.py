@@ -157,6 +157,7 @@ def test_play_changes_by_at_most_half_the_change_of_the_gap(theta_m: Array, gap:
     assert np.max(np.abs(difference)) <= 0.5e-3 + 1e-12
 
 
+@pytest.mark.slow
 @given(ANGLES, STARTS)
 def test_no_gap_is_a_rigid_connection(theta_m: Array, start: float) -> None:
     np.testing.assert_array_equal(play(theta_m, 0.0, start), theta_m)

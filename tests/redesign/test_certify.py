@@ -24,6 +24,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess, nearness, stillness
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
+from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, unfed, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
@@ -314,6 +315,29 @@ def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -
     first = policy.redesign(replace(evidence, tuned_for=None))
     assert first.certificate is not None
     assert first.certificate.friction == (0.0, 0.0)
+
+
+def test_rests_that_differ_indicate_friction_and_the_bias_between_them(policy: CertifiedPolicy) -> None:
+    """Friction stops the motor at 0.06 V below the bias of 0.04 V, or above it."""
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.1), rests=(-0.02, 0.055)))
+    assert made.certificate is not None
+    assert made.setting.gains.feedforward == pytest.approx(-0.04)
+    low, high = made.certificate.friction
+    assert (low, high) == pytest.approx((0.0, 1.25 * 0.06 * SERVO.k_T / SERVO.R))
+    alike = policy.redesign(Evidence(estimated(10.0), at_rest(0.06), rests=(0.0595, 0.0603)))
+    assert alike.certificate is not None
+    assert alike.certificate.friction == (0.0, 0.0)
+    assert alike.setting.gains.feedforward == pytest.approx(-0.06)
+
+
+def test_a_zone_that_stops_the_integral_is_held_to_the_margins_with_and_without_it() -> None:
+    uncertainty = widened(Uncertainty(), Demands())
+    law = OWN.replace(Ki=0.1 * OWN.Ki, integral_only=True)
+    both = margins_in_every_zone(SERVO, uncertainty, law)
+    each = [loop_margins(SERVO, uncertainty, unfed(law).replace(Ki=ki)) for ki in (law.Ki, 0.0)]
+    assert both.Ms_worst == max(one.Ms_worst for one in each)
+    assert both.phase_margin_worst == min(one.phase_margin_worst for one in each)
+    assert both.Ms == max(one.Ms for one in each)
 
 
 @pytest.mark.slow

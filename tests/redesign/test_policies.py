@@ -185,7 +185,7 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
         {"Ki": 1.01 * max(law.Ki for law in laws)},
         {"Ki": -1.0},
         {"feedforward": 0.101},
-        {"leave": 1.51},
+        {"leave": 2.01},
     ):
         assert not limits.allows_gains(gains_of(first.replace(**change)), own)
     assert limits.maximum * 1.5 == pytest.approx(agent.supervision.fallback.setting.band.error)

@@ -15,6 +15,7 @@ from servotwin.commissioning.edge_settings import guarding
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
@@ -85,6 +86,7 @@ def test_a_loop_that_its_rate_makes_unstable_is_refused_in_a_sentence() -> None:
     assert "is unstable at 50 Hz" in found.reason
 
 
+@pytest.mark.slow
 def test_a_slower_setting_is_verified_at_the_rate_of_the_axis() -> None:
     found = certify(inert_axis(50.0), NARROW, replace(SMALL, scales=(0.05, 0.1, 1.0), shapes=((1.0, 1.0),)))
     assert isinstance(found, Certificate)
@@ -123,6 +125,7 @@ def test_a_sampled_setting_is_simulated_with_its_ticks_counts_and_limits() -> No
 # --- the worst plant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 200.0])
 def test_no_plant_of_the_stated_set_exceeds_the_worst_Ms(rate: float | None) -> None:
     servo = SERVO.replace(sample_rate=rate)
@@ -167,7 +170,7 @@ def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, 2048, 99)
+    members = draw_independently(servo, known, 1024, 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 
@@ -191,6 +194,44 @@ def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     assert box is not None
     assert after.setting.gains is not None
     assert box.limits.allows_gains(after.setting.gains, box.middle)
+
+
+def motor(back_emf: float, friction: float, bias: float, std: float) -> LearntMotor:
+    """Learnt motor; friction and bias in V."""
+    spreads = np.square([1e-3, 0.08, std, std])
+    return LearntMotor((back_emf, 0.0, friction, bias), tuple(np.diag(spreads).ravel().tolist()), 0.0)
+
+
+def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_friction_hides() -> None:
+    policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5,)))
+    gap, spread = 10.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    # Friction of 45 mV holds the motor where 20 mV more than the bias push it.
+    rest = Disturbance(0.05, 1e-5, 0.0, 0.3, 0.0)
+    torque = SERVO.k_T / SERVO.R
+    stated, sticky, smooth, unsure = (
+        policy.redesign(Evidence(estimate, rest, motor=each)).certificate
+        for each in (
+            None,
+            motor(-0.07, 0.045, 0.03, 5e-4),
+            motor(-0.07, 0.0, 0.05, 5e-4),
+            motor(-0.07, 0.045, 0.03, 1.0),
+        )
+    )
+    assert stated is not None
+    assert sticky is not None
+    assert smooth is not None
+    assert unsure is not None
+    assert stated.setting.controller.feedforward == smooth.setting.controller.feedforward == -0.05
+    assert unsure.setting.controller.feedforward == -0.05
+    assert sticky.setting.controller.feedforward == -0.03
+    assert smooth.loop is not None
+    assert stated.loop is not None
+    # The margins are those of machines near the learnt one, not of all of the stated range.
+    assert smooth.loop.Ms_worst < stated.loop.Ms_worst
+    assert policy._friction(Evidence(estimate, rest, motor=motor(0.0, 0.045, 0.03, 5e-4))) == pytest.approx(
+        ((0.045 - 9.8e-4) * torque, (0.045 + 9.8e-4) * torque), rel=1e-3
+    )
 
 
 # --- demands
@@ -247,6 +288,7 @@ def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() 
 # --- no units
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("time", "length", "voltage"),
     [(1e-3, 1.0, 1.0), (1e3, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1e6, 1.0), (1.0, 1.0, 1e-2), (10.0, 1e-3, 1e2)],

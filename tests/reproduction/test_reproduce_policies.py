@@ -36,6 +36,7 @@ def outcomes(biased):
     return {one.policy: one for one in biased.outcomes}
 
 
+@pytest.mark.slow
 def test_only_the_policy_differs():
     """Machine, wear, link, noise and seed are the same; and windows among those that keep the servo's own gains."""
     shared = ("servo", "gap", "reference", "noise", "seed", "name", "uplink", "downlink", "input_bias", "duration")
@@ -59,6 +60,7 @@ def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_does_
     assert not outcomes["paper"].steps[1].settled
 
 
+@pytest.mark.slow
 def test_updates_and_fallbacks_in_force_are_counted(outcomes):
     for one in outcomes.values():
         origins = [change.origin for change in one.run.changes]
@@ -71,6 +73,7 @@ def test_updates_and_fallbacks_in_force_are_counted(outcomes):
     assert outcomes[ALONE].total.updates == outcomes[ALONE].total.windows == 0
 
 
+@pytest.mark.slow
 def test_the_tolerance_in_force_is_the_trajectory_s(outcomes):
     """Two ways to the same staircase: what messages say, and what the simulation ran on."""
     for one in outcomes.values():
@@ -97,6 +100,7 @@ def test_overshoot_is_relative_to_the_step_from_where_it_began():
     assert policy_runs.overshoot(still, 0.0, 10.0) == 0.0
 
 
+@pytest.mark.slow
 def test_totals_of_known_signals(outcomes):
     turning = np.concatenate([np.linspace(0.0, 4.0 * math.pi, 5001), np.linspace(4.0 * math.pi, 0.0, 5001)[1:]])
     voltage = np.full(10001, 0.3)
@@ -110,6 +114,7 @@ def test_totals_of_known_signals(outcomes):
     assert [step.error for step in policy_runs.measured_steps(shifted)] == pytest.approx([2e-6, 2e-6])
 
 
+@pytest.mark.slow
 def test_a_policy_that_cannot_design_states_the_reason(monkeypatch):
     scenario = PolicyJob("paper", "margin", NOISE, SHORT).scenario_to_run()
     limited = scenario.replace(controller=scenario.law.replace(voltage_limit=24.0))
@@ -129,6 +134,7 @@ def test_every_policy_designs_in_noise():
     assert (found.refused, len(found.steps)) == ("", 2)
 
 
+@pytest.mark.slow
 def test_gains_that_a_message_leaves_out_stay():
     scenario = PolicyJob("paper", "paper", CLEAN, SHORT).scenario_to_run()
     changes = policy_runs.run_twin(scenario).changes
@@ -137,6 +143,7 @@ def test_gains_that_a_message_leaves_out_stay():
     assert changes[-1].tolerance > changes[0].tolerance
 
 
+@pytest.mark.slow
 def test_drawn(biased):
     with style.look():
         figure = policies.plot(biased)
@@ -148,6 +155,7 @@ def test_drawn(biased):
     assert letters == [f"({letter})" for letter in "abcdefghij"]
 
 
+@pytest.mark.slow
 def test_beyond_json_follows_its_schema(biased):
     named = {"policies-bias": [replace(one, run=None) for one in biased.outcomes]}
     found = json.loads(documents.beyond_json(named, "paper"))
@@ -167,6 +175,7 @@ def test_beyond_json_follows_its_schema(biased):
     assert json.loads(documents.beyond_json(fake, "paper"))["figures"]["x"][0]["steps"][0]["settling_s"] is None
 
 
+@pytest.mark.slow
 def test_the_chapter_stands_after_the_papers_figures(biased):
     told = tuple(replace(one, run=None) for one in biased.outcomes)
     drawn = [
@@ -180,8 +189,8 @@ def test_the_chapter_stands_after_the_papers_figures(biased):
 
 
 @pytest.mark.slow
-def test_one_figure_is_reproduced_with_its_numbers(tmp_path, monkeypatch):
-    figure = replace(policies.FIGURES[0], data=policies.data_of(CLEAN, SHORT))
+def test_one_figure_is_reproduced_with_its_numbers(tmp_path, monkeypatch, biased):
+    figure = replace(policies.FIGURES[0], data=lambda _: biased)
     monkeypatch.setattr(figures, "FIGURES", (figure,))
     reproduce.reproduce(tmp_path, only=("policies",), console=Console(file=io.StringIO()))
     names = ["beyond.json", "claims.json", "policies.png", "policies.svg", "report.html"]

@@ -87,7 +87,6 @@ def test_any_voltage_inside_keeps_the_loop_oscillating(servo, reading, gap_deg):
     assert swing(servo, reading, gap_deg) > 0.05
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("gap_deg", GAPS)
 @pytest.mark.parametrize("name", ["paper", "paper-gain2"])
 def test_resetting_the_controller_inside_diverges(name, gap_deg):

@@ -51,7 +51,6 @@ def test_members_with_servos_and_controllers_of_their_own_are_runs() -> None:
             assert np.abs(values[at] - expected).max() < 1e-9 * np.abs(expected).max(), (at, name)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "law"),
     [

@@ -75,11 +75,11 @@ def sensitivity(case: Case) -> float:
 @pytest.fixture(scope="module")
 def cases() -> list[tuple[int, Case, float]]:
     """Seed, case, sensitivity."""
-    return [(seed, random_case(seed), sensitivity(random_case(seed))) for seed in range(24)]
+    return [(seed, random_case(seed), sensitivity(random_case(seed))) for seed in range(16)]
 
 
 def test_most_random_runs_can_be_compared(cases: list[tuple[int, Case, float]]) -> None:
-    assert sum(sensitive <= SENSITIVE for *_, sensitive in cases) >= 20
+    assert sum(sensitive <= SENSITIVE for *_, sensitive in cases) >= 13
     assert {case.servo.n for _, case, _ in cases} == {2, 3, 5}
     assert {(case.gap[2] > 0.0, case.tolerance > 0.0) for _, case, _ in cases} == {
         (a, b) for a in (0, 1) for b in (0, 1)

@@ -23,6 +23,7 @@ def share_of_ticks(engine: LiftedEngine) -> float:
     return float(np.mean(slots == TICKED) * slots.size / ((engine.samples - 1) * engine.every))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(0, 300, 50))
 def test_random_loops_are_those_of_the_ticks(first: int) -> None:
     """Same events, switching ticks to the bit, states to 1e-9 of their range."""
@@ -150,3 +151,30 @@ def test_long_runs_without_noise_are_made_in_blocks() -> None:
         assert not np.array_equal(getattr(run, name), expected)
         assert np.abs(getattr(run, name) - expected).max() < 1e-9 * np.abs(expected).max()
     assert run.events.kind.tolist() == ticked.events.kind.tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "gap", "tolerance", "delay"),
+    [
+        ({}, (10.0, 0.0), None, 0),
+        ({"voltage_limit": 24.0}, (20.0, -0.1), None, 2),  # the gap closes on a loop at rest
+        ({"Kp": 900.0, "Kd": -110.0}, (30.0, 0.05), 2e-4, 0),
+        ({"rate_limit": 400.0, "loop_filter_hz": 60.0}, (5.0, 0.02), None, 1),
+    ],
+)
+def test_long_rests_are_passed_on_the_vast_scale(
+    changes: dict[str, float], gap: tuple[float, float], tolerance: float | None, delay: int
+) -> None:
+    """Blocks of 2048 ticks end where something switches at last: the events and states are those of the ticks."""
+    law = PAPER.controller.replace(sample_rate=5e3, Ki=0.0, **changes)
+    wave = as_pieces(SquareWave(1e-3, 40.0), 50.0)
+    total = PiecewiseCubic(np.zeros(1), np.array([[gap[0] * DEGREE, gap[1] * DEGREE, 0.0, 0.0]]))
+    zone = None if tolerance is None else PiecewiseCubic.constant(tolerance)
+    case = SampledCase(PAPER, law, RunInputs(wave, total, zone, 1e3), 0.0, 50_001, delay)
+    ticked, blocks = case.ticked(), case.in_blocks()
+    assert 2 in blocks.memory.filled
+    assert blocks.segments.size[0] < 0.02 * 250_000
+    assert largest_difference(case, ticked, blocks) < 1e-9
+    expected, found = ticked.events(), blocks.events()
+    assert [event[1:] for event in expected] == [event[1:] for event in found]
+    assert np.allclose([event[0] for event in expected], [event[0] for event in found], rtol=0.0, atol=1e-7)

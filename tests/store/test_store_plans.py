@@ -76,6 +76,7 @@ def plan(path: str, statement: str, parameters: Any) -> list[str]:
         return [row[3] for row in connection.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)]
 
 
+@pytest.mark.slow
 def test_no_statement_scans_a_whole_table(traced_store: tuple[Store, dict[str, Any]]) -> None:
     store, statements = traced_store
     exercise(store)

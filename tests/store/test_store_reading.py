@@ -172,6 +172,7 @@ def test_opened_again_everything_is_there(new_address: NewAddress) -> None:
     store.close()
 
 
+@pytest.mark.slow
 def test_events_that_belong_to_no_window(store: Store) -> None:
     """Starts, fallbacks, answers, and what the twin itself could not do; newest first, of one servo."""
     store.put([letter(), window(), letter("b")])

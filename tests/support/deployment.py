@@ -46,6 +46,7 @@ sample_rate_hz = {rate}
 policy = "paper"
 k_dz = 1.0
 initial_gap_deg = 2.0
+validity_s = 1000.0
 [servos]
 "ax-*" = "paper"
 """

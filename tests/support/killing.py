@@ -113,7 +113,7 @@ def check_exactly_once(fleet: Fleet, sufficient: int) -> None:
     committed, kept = witnessed(fleet), Counter(stored(fleet))
     assert len(committed) >= sufficient
     assert dropped(fleet) == {}
-    assert set(kept) == committed
+    assert set(kept) == committed, sorted(set(kept) ^ committed)
     assert max(kept.values()) == 1
 
 

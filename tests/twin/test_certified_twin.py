@@ -55,6 +55,7 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, observed=None, status=GapStatu
     return sent, twin.log.redesigns["axis", "boot-1", 0]
 
 
+@pytest.mark.slow
 def test_what_is_proved_is_sent_with_its_proof_and_band():
     (update,), redesign = answer()
     assert isinstance(update, Update)
@@ -81,6 +82,7 @@ def test_an_empty_set_of_candidates_sends_nothing():
     assert "no candidate has Ms <= 1.01 on this servo" in redesign.reason
 
 
+@pytest.mark.slow
 def test_where_the_whole_range_cannot_be_proved_nothing_is_sent():
     known = Uncertainty(input_bias=(0.0, 0.0))
     settings = SETTINGS.replace(uncertainty=known, demands=replace(FEW, overshoot=0.001))
@@ -89,6 +91,7 @@ def test_where_the_whole_range_cannot_be_proved_nothing_is_sent():
     assert redesign.reason.startswith("no fallback set for the servo's stated range: none of ")
 
 
+@pytest.mark.slow
 def test_where_nothing_is_verified_the_fallback_set_is_sent_with_the_reason():
     """A bias beyond what may be fed forward leaves more error than the fallback set's band has room for."""
     settings = SETTINGS.replace(demands=replace(FEW, integral=(0.0,)))
@@ -100,12 +103,23 @@ def test_where_nothing_is_verified_the_fallback_set_is_sent_with_the_reason():
     assert update.setting.band == band_of(fallback_certificate)
 
 
-def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window():
-    sent, redesign = answer(status=GapStatus.UNIDENTIFIABLE)
-    assert sent == []
-    assert "unidentifiable" in redesign.reason
+def test_an_estimate_that_is_not_ok_sends_nothing_on_the_first_window_unless_it_shows_a_bias():
+    unknown = Disturbance(math.nan, math.inf, math.nan, 0.0, 0.0)
+    for observed in (unknown, disturbed(0.0)):
+        sent, redesign = answer(status=GapStatus.UNIDENTIFIABLE, observed=observed)
+        assert sent == []
+        assert "unidentifiable" in redesign.reason
 
 
+def test_a_bias_is_cancelled_whatever_the_gap():
+    """Without a usable estimate the setting is verified for every gap of the stated range."""
+    (update,), redesign = answer(status=GapStatus.UNIDENTIFIABLE)
+    assert update.setting.gains.feedforward == -0.05
+    assert update.status == GapStatus.UNIDENTIFIABLE.value
+    assert redesign.certificate.gap == SETTINGS.uncertainty.gap
+
+
+@pytest.mark.slow
 def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
     """Whatever the noise: a dead zone opens the loop inside the band only."""
     for gap in (2.0, 10.0, 40.0):

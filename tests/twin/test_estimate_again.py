@@ -90,6 +90,7 @@ def test_the_prior_counts():
     assert "evaluations" in again.changed
 
 
+@pytest.mark.slow
 def test_another_model_is_named_with_both_values():
     window, body, context = estimated("calm")[0][-1]
     model = estimated("calm")[1]

@@ -1,10 +1,16 @@
 """What a twin records of the machine that it learns, and its alarm where the machine is another one."""
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
-from twin_messages import window_message
+import pytest
+from twin_messages import known_gap, window_message
 
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
-from servotwin.estimation.machine import LearntMachine
+from servotwin.estimation.machine import LearningSettings, LearntMachine
+from servotwin.estimation.motor import BACK_EMF
+from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import Expectation
 from servotwin.twin.evidence import MachineRecord, StoredExpectation, rows
@@ -57,3 +63,36 @@ def test_an_expectation_is_stored_with_the_machine_bit_for_bit() -> None:
     assert again.machine is not None
     assert np.array_equal(again.machine.mean, expected.machine.mean)
     assert np.array_equal(again.machine.covariance, expected.machine.covariance)
+
+
+def motor_window(number: int, factor: float) -> WindowMessage:
+    """Window of a motor that swings, with `factor` times the model's back EMF."""
+    servo, time = Servo.preset("paper"), np.arange(2000) / 1000.0
+    lag, middle = servo.J * servo.R / servo.k_T, 9.0 * (time + 0.5e-3)  # of the time in which a voltage is held
+    volts = factor * servo.k_B * 9.0 * np.cos(middle) - lag * 81.0 * np.sin(middle)
+    channels = tuple(
+        pack_channel(name, unit, values)
+        for name, unit, values in (
+            ("position", "m", np.zeros(2000)),
+            ("theta_m", "rad", np.sin(9.0 * time)),
+            ("voltage", "V", volts),
+        )
+    )
+    return msgspec.structs.replace(
+        window_message(number, 10.0 * number, channels=channels), rate=1000.0, crc=checksum(channels)
+    )
+
+
+def test_the_motor_is_learnt_recorded_and_stored_bit_for_bit() -> None:
+    model = TwinModel.of(Servo.preset("paper"), SETTINGS, estimator=known_gap)
+    state, kinds, factors = model.initial_state("axis"), [], [1.05, 1.05, 1.3, 1.05]
+    for number, factor in enumerate(factors):
+        result = step(model, state, WindowArrival(motor_window(number, factor), 10.0 * number), 10.0 * number)
+        state = decode_state("axis", encode_state(result.state))
+        assert state == result.state
+        kinds += [row.kind for row in rows(result.evidence, 1, "") if row.kind in ("motor", "alarm")]
+    assert kinds == ["motor", "motor", "alarm", "motor"]
+    assert state.wear.motor is not None
+    assert state.wear.motor.mean[BACK_EMF] == pytest.approx(0.05, abs=5e-3)
+    unlearning = TwinModel.of(Servo.preset("paper"), replace(SETTINGS, learning=LearningSettings(learn=False)))
+    assert unlearning.motor is None

@@ -126,6 +126,7 @@ def test_a_policy_that_finds_nothing_sends_nothing_and_is_quoted():
     assert store.redesigns["axis", "boot-1", 1].reason == "no candidate has Ms <= 1"
 
 
+@pytest.mark.slow
 def test_the_packaged_twin_looks_for_the_bias():
     """20 mV before a step; a window without voltage says so."""
     servo = Servo.preset("paper").replace(Ki=0.0)

@@ -100,8 +100,8 @@ def probed() -> Scenario:
 
 
 SCENARIOS = {
-    "fig15": lambda: Scenario.preset("fig15").replace(duration=90.0),
-    "certified": lambda: Scenario.preset("certified").replace(duration=62.0),
+    "fig15": lambda: Scenario.preset("fig15").replace(duration=50.0),
+    "certified": lambda: Scenario.preset("certified").replace(duration=45.0),
     "probed": probed,
 }
 
@@ -124,6 +124,7 @@ def test_a_twin_that_dies_after_every_message_says_the_same(name):
     assert name != "probed" or living.requests
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_and_finds_the_same(name):
     living, reborn, _ = both(name)
@@ -139,6 +140,7 @@ def test_and_finds_the_same(name):
         assert (one.setting, one.reason) == (other.setting, other.reason)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_the_state_is_its_own_fixed_point(name):
     _, _, remote = both(name)

@@ -14,6 +14,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
+from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as certified_module
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
@@ -26,15 +27,19 @@ from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import work
 
 DEG = math.pi / 180.0
-SCENARIO = Scenario.preset("certified").replace(gap=12.0 * DEG, duration=145.0, name="axis")
 GRID = Grid(finest=30.0 * DEG, biases=(1e-2,), noises=(0.0,))
 SETTINGS = TwinSettings(demands=Demands(machines=16, conditions=4, screened=2, settled=0.8), triage=TriageSettings())
-SERVO = SCENARIO.model
+SERVO = Servo.preset("paper")
+
+
+@cache
+def scenario() -> Scenario:
+    return Scenario.preset("certified").replace(gap=12.0 * DEG, duration=45.0, name="axis")
 
 
 @cache
 def windows() -> tuple[WindowMessage, ...]:
-    return cosimulate(SCENARIO).windows
+    return cosimulate(scenario()).windows
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +52,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(file: Path) -> ModelRegistry:
-    start = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
+    start = Setting(scenario().start_tolerance, gains_of(scenario().start_law))
     return ModelRegistry((ServoModel("m", SERVO, SETTINGS.replace(table=str(file)), start),), (("axis", "m"),))
 
 
@@ -117,6 +122,7 @@ def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: M
     assert question.region.gap[1] - question.region.gap[0] < 1.0 * DEG
 
 
+@pytest.mark.slow
 def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRegistry) -> None:
     queue, update, queued = begun(fleet)
     before = queue.state
@@ -131,12 +137,14 @@ def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRe
     assert not outcome.outgoing
 
 
+@pytest.mark.slow
 def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: ModelRegistry) -> None:
     one, other = begun(fleet), begun(fleet)
     assert one[2] == other[2]
     assert one[0].give(one[2]) == other[0].give(other[2])
 
 
+@pytest.mark.slow
 def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
@@ -177,6 +185,7 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelR
     assert not outcome.enqueue
 
 
+@pytest.mark.slow
 def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry, monkeypatch) -> None:
     queue, _, queued = begun(fleet)
     question = decode_request(queued.body)
@@ -190,6 +199,7 @@ def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry,
     assert queue.state == before
 
 
+@pytest.mark.slow
 def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegistry) -> None:
     queue, update, _ = begun(fleet)
     quiet = queue.window(1, update.version)
@@ -203,6 +213,7 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegist
     assert {row.kind: row.status for row in outcome.evidence}["glance"] == "the edge has fallen back"
 
 
+@pytest.mark.slow
 def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: ModelRegistry, monkeypatch) -> None:
     queue = Queue(fleet)
     outcome = queue.window(0)
@@ -213,6 +224,7 @@ def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: Mod
     assert after.wake is None
 
 
+@pytest.mark.slow
 def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, queued = begun(fleet)
     before = queue.state
@@ -221,6 +233,7 @@ def test_what_is_no_question_fails_alone(fleet: ModelRegistry) -> None:
     assert queue.state == before
 
 
+@pytest.mark.slow
 def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     queue, _, queued = begun(fleet)
     model = replace(fleet.models[0], settings=SETTINGS)
@@ -228,6 +241,7 @@ def test_without_a_table_a_question_fails_alone(fleet: ModelRegistry) -> None:
     assert "the twin uses no table any more" in queue.give(queued).evidence[0].status
 
 
+@pytest.mark.slow
 def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:
     _, _, queued = begun(fleet)
     question = decode_request(queued.body)

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import ssl
-import subprocess
 import sys
 import threading
 import time
@@ -33,7 +32,9 @@ from service_system import (
     unpacked,
     window,
 )
+from typer.testing import CliRunner
 
+from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
 from servotwin.messages import encode
 from servotwin.store.store import open_store
@@ -134,26 +135,9 @@ def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_orde
 
 
 @pytest.mark.slow
-def test_a_poll_that_waits_does_not_hold_up_the_end(tmp_path):
-    with process(twin_file(tmp_path)) as (running, url):
-        answers = []
-
-        def poll():
-            answers.append(httpx.get(f"{url}/v1/servos/ax-1/outgoing?wait=30", headers=bearer(), timeout=PATIENCE))
-
-        thread = threading.Thread(target=poll)
-        thread.start()
-        until(lambda: "servotwin_polls 1" in httpx.get(f"{url}/metrics").text)
-        running.send_signal(signal.SIGINT)
-        assert running.wait(PATIENCE) == 0
-        thread.join(PATIENCE)
-        assert unpacked(answers[0].content) == []
-
-
-@pytest.mark.slow
 def test_killed_in_midstream_every_acknowledged_window_is_stored_once(tmp_path):
     path, sequence, acknowledged = twin_file(tmp_path, "rate_burst = 1e6"), 0, []
-    for _ in range(3):
+    for _ in range(2):
         with process(path) as (running, url):
             killer = threading.Timer(0.7, running.kill)
             killer.start()
@@ -243,12 +227,10 @@ def test_a_file_that_is_not_allowed_is_refused_before_a_store_is_made(tmp_path, 
     assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
 
 
-@pytest.mark.slow
 def test_a_file_with_an_unknown_key_is_one_sentence_and_2(tmp_path):
     path = twin_file(tmp_path, "prot = 3")
-    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert result.returncode == 2
+    result = CliRunner().invoke(app, ["twin", "--config", str(path)])
+    assert result.exit_code == 2
     assert result.stdout == ""
     assert "did you mean 'port'" in result.stderr
     assert result.stderr.count("\n") == 1
@@ -256,8 +238,8 @@ def test_a_file_with_an_unknown_key_is_one_sentence_and_2(tmp_path):
 
 
 @pytest.mark.slow
-def test_bytes_that_are_no_request_do_no_harm(tmp_path):
-    with process(twin_file(tmp_path)) as (_running, url):
+def test_bytes_that_are_no_request_do_no_harm_and_a_poll_that_waits_does_not_hold_up_the_end(tmp_path):
+    with process(twin_file(tmp_path)) as (running, url):
         address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
         endless = b"GET /healthz HTTP/1.1\r\n" + b"x: " + b"y" * 200_000
         for rubbish in (
@@ -278,38 +260,43 @@ def test_bytes_that_are_no_request_do_no_harm(tmp_path):
                     raise
                 except OSError:
                     pass  # the twin hung up
+        for begun in ENDLESS:
+            with socket.create_connection(address, timeout=10.0) as line:
+                line.sendall(begun)
+                with pytest.raises(ConnectionError):
+                    line.sendall(b"y" * 64 * 1024 * 1024)
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
+        answers = []
+
+        def poll():
+            answers.append(httpx.get(f"{url}/v1/servos/ax-1/outgoing?wait=30", headers=bearer(), timeout=PATIENCE))
+
+        thread = threading.Thread(target=poll)
+        thread.start()
+        until(lambda: "servotwin_polls 1" in httpx.get(f"{url}/metrics").text)
+        running.send_signal(signal.SIGINT)
+        assert running.wait(PATIENCE) == 0
+        thread.join(PATIENCE)
+        assert unpacked(answers[0].content) == []
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "begun",
-    [
-        b"GET /healthz HTTP/1.1\r\nX: ",
-        b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer token-of-ax-1\r\n"
-        b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: ",
-    ],
-    ids=["header", "trailer"],
+ENDLESS = (
+    b"GET /healthz HTTP/1.1\r\nX: ",
+    b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer token-of-ax-1\r\n"
+    b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: ",
 )
-def test_one_endless_header_is_cut_before_it_fills_the_memory(tmp_path, begun):
-    with process(twin_file(tmp_path)) as (_running, url):
-        address = ("127.0.0.1", int(url.rsplit(":", 1)[1]))
-        with socket.create_connection(address, timeout=10.0) as line:
-            line.sendall(begun)
-            with pytest.raises(ConnectionError):
-                line.sendall(b"y" * 64 * 1024 * 1024)
-        assert httpx.get(f"{url}/healthz").json()["ok"] is True
+"""A header and a trailer that are cut before they fill the memory."""
 
 
 @pytest.mark.slow
-def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_path):
+def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_path, monkeypatch):
+    for name in ("configure_logging", "raise_descriptor_limit"):
+        monkeypatch.setattr(service, name, lambda *_: None)
     path = twin_file(tmp_path)
     with process(path) as (running, url):
-        second = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
-        result = subprocess.run(second, capture_output=True, text=True, timeout=PATIENCE, check=False)
-        assert result.returncode == 2
-        assert "another twin works on it" in result.stderr
+        with pytest.raises(InvalidInput, match="another twin works on it"):
+            service.run(path)
         assert httpx.get(f"{url}/healthz").json()["ok"] is True
         running.kill()
         running.wait(timeout=PATIENCE)

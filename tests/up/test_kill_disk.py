@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from records import count_stored, count_witnessed, dropped, pending, stored, wit
 from smalldisk import Disk, small_disk
 
 FAULT_S = 6.0
+KINDS = ("read-only", "full")
+"""In this order: for the first one the process is killed, and what a full disk left in memory would be lost."""
 
 
 @contextmanager
@@ -31,32 +33,48 @@ def fault(kind: str, disk: Disk, process: Process) -> Iterator[None]:
         disk.remount("rw")
 
 
-def delivered(fleet: Fleet) -> bool:
-    """True once no window waits; a twin that gave up on a read-only disk, at once or only now, is started again."""
-    if not fleet.twin.running:
-        fleet.twin.start()
-    return pending(fleet) == 0
+def wait(fleet: Fleet, condition: Callable[[], bool]) -> None:
+    """A twin that gave up on a read-only disk, at once or only now, is started again."""
+
+    def holds() -> bool:
+        if not fleet.twin.running:
+            fleet.twin.start()
+        return condition()
+
+    until(holds, lambda: logs(fleet))
+
+
+def reach(fleet: Fleet, count: Callable[[Fleet], int], more: int) -> None:
+    """Wait for so many more windows."""
+    number = count(fleet) + more
+    wait(fleet, lambda: count(fleet) >= number)
+
+
+def collect(fleet: Fleet, more: int) -> int:
+    """Wait for so many more windows in the outboxes, with a twin or without; return their number."""
+    number = count_witnessed(fleet) + more
+    until(lambda: count_witnessed(fleet) >= number, lambda: logs(fleet))
+    return number
 
 
 def finish(fleet: Fleet) -> None:
     fleet.stop_machines()
-    until(lambda: delivered(fleet), lambda: logs(fleet))
+    wait(fleet, lambda: pending(fleet) == 0)
     assert set(end_all(fleet.edges.values())) == {0}
     assert fleet.twin.end() == 0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["full", "read-only"])
-def test_the_edges_disk(tmp_path: Path, kind: str) -> None:
+def test_the_edges_disk(tmp_path: Path) -> None:
     """It goes on with what it has in memory, and delivers that too; what it has to give up it counts."""
     fleet = Fleet(tmp_path, ["control", "supervise"])
     url = f"http://127.0.0.1:{fleet.port}"
     with small_disk(tmp_path / "ax-0", 8) as disk, deployed(fleet, url):
-        until(lambda: count_witnessed(fleet) >= 6, lambda: logs(fleet))
-        with fault(kind, disk, fleet.edges["ax-0"]):
-            time.sleep(FAULT_S)
-        before = count_witnessed(fleet)
-        until(lambda: count_witnessed(fleet) >= before + 6, lambda: logs(fleet))
+        reach(fleet, count_witnessed, 6)
+        for kind in KINDS:
+            with fault(kind, disk, fleet.edges["ax-0"]):
+                time.sleep(FAULT_S)
+            reach(fleet, count_witnessed, 6)
         finish(fleet)
         check_controllers_ticked(fleet)
         kept, boots = Counter(stored(fleet)), by_boot(set(stored(fleet)))
@@ -67,15 +85,14 @@ def test_the_edges_disk(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["full", "read-only"])
-def test_the_twins_disk(tmp_path: Path, kind: str) -> None:
+def test_the_twins_disk(tmp_path: Path) -> None:
     """It takes nothing that it cannot keep; the edges keep it meanwhile."""
     fleet = Fleet(tmp_path, ["control", "supervise"], store="store/twin.db")
     with small_disk(tmp_path / "store", 16) as disk, deployed(fleet, f"http://127.0.0.1:{fleet.port}"):
-        until(lambda: count_stored(fleet) >= 6, lambda: logs(fleet))
-        with fault(kind, disk, fleet.twin):
-            before = count_witnessed(fleet)
-            until(lambda: count_witnessed(fleet) >= before + 8, lambda: logs(fleet))
+        for kind in KINDS:
+            reach(fleet, count_stored, 6)
+            with fault(kind, disk, fleet.twin):
+                sufficient = collect(fleet, 8)
         finish(fleet)
-        check_exactly_once(fleet, before + 8)
+        check_exactly_once(fleet, sufficient)
         check_controllers_ticked(fleet)

@@ -108,7 +108,7 @@ def in_memory(loop: Loop) -> dict[tuple[str, int], bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("twin", "duration", "period", "fine", "updates"),
-    [('policy = "paper"', 40.0, 4.0, "false", 3), ('policy = "certified"', 24.0, 8.0, "true", 1)],
+    [('policy = "paper"', 24.0, 4.0, "false", 2), ('policy = "certified"', 24.0, 8.0, "true", 1)],
 )
 def test_deployed_is_simulated(
     tmp_path: Path, twin: str, duration: float, period: float, fine: str, updates: int

@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from servotwin.cli.app import app
 from servotwin.drives.simulated.machine_state import read_state
 from servotwin.edge_process.config_file import load
 from servotwin.errors import InvalidInput
@@ -20,12 +22,24 @@ from servotwin.up.plan import SERVOS
 
 RUNNING = "x real time"
 PATIENCE_S = 120.0
+NUMBER = 2
+"""Servos: one whose edge runs the law, one whose machine does; a third one would only take its time."""
+COMMAND = f"""
+from servotwin.up import plan
+
+plan.SERVOS = plan.SERVOS[:{NUMBER}]
+
+from servotwin.cli.app import main
+
+main()
+"""
+STARTED = SERVOS[:NUMBER]
 
 
 @contextmanager
 def started(path: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`servotwin up` in a group of its own; whatever is left of it in the end is killed."""
-    arguments = [sys.executable, "-m", "servotwin", "up", "--folder", str(path), *options]
+    arguments = [sys.executable, "-c", COMMAND, "up", "--folder", str(path), *options]
     process = subprocess.Popen(
         arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
@@ -74,7 +88,7 @@ def eventually(holds: Callable[[], bool]) -> bool:
 
 def times(path: Path) -> list[float]:
     """Machine time of each servo, s."""
-    states = [read_state(path / servo.name / "state.json") for servo in SERVOS]
+    states = [read_state(path / servo.name / "state.json") for servo in STARTED]
     return [0.0 if state is None else state.time_s for state in states]
 
 
@@ -82,14 +96,15 @@ def stored(path: Path) -> dict[str, set[str]]:
     """The boots of which the twin has windows, by servo."""
     store = open_store(f"sqlite:///{path / 'twin.db'}")
     try:
-        return {servo.name: {link.window.boot for link in store.audit(servo.name, None, 1000)} for servo in SERVOS}
+        return {servo.name: {link.window.boot for link in store.audit(servo.name, None, 1000)} for servo in STARTED}
     finally:
         store.close()
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
-def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path) -> None:
+def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folder, "SERVOS", STARTED)
     path = tmp_path / "up"
     with started(path, "--for", "5", "--speed", "10") as first:
         lines = lines_until(first, "all processes have ended")
@@ -97,24 +112,23 @@ def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path) -> None:
     assert "made: " in lines[0]
     [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
     assert lines.index(address) < min(i for i, line in enumerate(lines) if RUNNING in line)
-    assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == len(SERVOS)
+    assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == NUMBER
     assert not left_behind(path)
     before = times(path)
     assert min(before) > 5.0
-    secrets = [path / "tokens.toml", path / "operator.token", *(path / servo.name / "token" for servo in SERVOS)]
+    secrets = [
+        path / "tokens.toml",
+        path / "operator.token",
+        *(path / servo.name / "token" for servo in STARTED),
+    ]
     assert {file.stat().st_mode & 0o777 for file in secrets} == {0o600}
 
     with started(path, "--speed", "10") as second:
         lines = lines_until(second, RUNNING)
-        assert sum(line.startswith("continuing with") for line in lines) == len(SERVOS)
-        refused = subprocess.run(
-            [sys.executable, "-m", "servotwin", "up", "--folder", str(path)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert refused.returncode == 2
-        assert f"in use by another servotwin up (process {second.pid})" in refused.stderr
+        assert sum(line.startswith("continuing with") for line in lines) == NUMBER
+        in_use = f"in use by another servotwin up .process {second.pid}"
+        with pytest.raises(InvalidInput, match=in_use), folder.opened(path):
+            pass
         second.kill()
         second.wait()
         with started(path, "--speed", "10") as third:
@@ -171,11 +185,9 @@ def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> 
         pass
 
 
-@pytest.mark.slow
-def test_an_invalid_speed_is_refused_by_the_process(tmp_path: Path) -> None:
-    arguments = [sys.executable, "-m", "servotwin", "up", "--folder", str(tmp_path / "up"), "--speed", "0"]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
+def test_an_invalid_speed_is_refused_by_the_command(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["up", "--folder", str(tmp_path / "up"), "--speed", "0"])
+    assert done.exit_code == 2
     assert "--speed" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "up").exists()

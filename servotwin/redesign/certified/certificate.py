@@ -67,6 +67,10 @@ class Demands:
         Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
     known : float
         Share of the smallest step: a bias that leaves a smaller error under the servo's own Kp counts as known.
+    stops : tuple of (float, float)
+        Dead zones that stop the integral only, tried beside none wherever integral action is: half-width as a share of
+        the smallest step, two counts of the sensor on top, and `leave`. The integral of a loop with friction hunts less
+        where it begins again later than it stops.
     hysteresis : tuple of (float, float)
         enter and leave of a dead zone of p gap, tried beside no dead zone where there is noise.
     effort_weight : float
@@ -77,7 +81,8 @@ class Demands:
     machines : int
         Machines of the verification, drawn independently of one another and of those that rank.
     attempts : int
-        Candidates that are verified before the search gives up, each on machines of its own.
+        Candidates that are verified before the search gives up, each on machines of its own; then as many without
+        integral action and dead zone.
     """
 
     Ms: Annotated[
@@ -121,7 +126,8 @@ class Demands:
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
-    integral: tuple[float, ...] = (0.0, 0.01, 0.05)
+    integral: tuple[float, ...] = (0.0, 0.01, 0.03, 0.1)
+    stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     known: float = 0.0726
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
     effort_weight: float = 14.0
@@ -312,6 +318,8 @@ class Certificate:
         )
         if self.loop is not None:
             text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
+        if self.setting.controller.integral_only:
+            text += ", with the integral acting and stopped; the simulations contain the switching in between"
         if self.ramp is not None:
             text += f"; a ramp and its reversal on {self.ramp.machines} machines"
         if self.beyond is not None:

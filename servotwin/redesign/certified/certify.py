@@ -21,7 +21,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, left_over
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import BeyondResult, Certificate, Demands, LoopMargins, NotVerified
-from servotwin.redesign.certified.margins import laws_within, loop_margins, unfed, widened, with_margins
+from servotwin.redesign.certified.margins import laws_within, margins_in_every_zone, unfed, widened, with_margins
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently
@@ -30,6 +30,8 @@ from servotwin.redesign.design import Design
 # Where the band of measurement noise begins and ends, in units of 1 / Tf: well above the crossover, and where a sampled
 # loop of that speed has half its rate.
 _NOISE_BAND = (6.0, 1600.0)
+# Gains with which integral action is tried: the best so many without it.
+_GAINS_WITH_INTEGRAL = 3
 # Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
 _FAST = 10.0
 # The error that an input bias leaves is the same number on every plant, but for rounding.
@@ -75,7 +77,7 @@ def certify(
     candidates = [_with_feedforward(setting, feedforward) for setting in laws]
     search = _Search(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     best: Certificate | None = None
-    for setting in _shortlist(search.ranked(candidates), demands.attempts):
+    for setting in _shortlist(search.ranked_in_stages(candidates), demands.attempts):
         tried = replace(search.verified(setting), looked_at=len(candidates), seconds=clock() - begin)
         if not search.shortcoming(tried):
             return tried
@@ -112,10 +114,9 @@ def confirm(
 
 
 def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
-    """The first candidates; the best one without integral action and dead zone, which settles most surely, is among
-    them."""
-    plain = next((k for k, setting in enumerate(ranked) if not setting.controller.Ki and not setting.tolerance), 0)
-    return ranked[:attempts] if plain < attempts else [*ranked[: attempts - 1], ranked[plain]]
+    """The first candidates, then as many without integral action and dead zone, which settle most surely."""
+    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
+    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
@@ -144,7 +145,8 @@ def candidates_of(
     """Every combination of scales, shapes, integral action and dead zone within the bounds on Ms.
 
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
-    candidates only where there is friction or bias, or noise.
+    candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
+    reference that stops the integral only.
 
     Raises
     ------
@@ -154,11 +156,27 @@ def candidates_of(
     integral = demands.integral if disturbed else (0.0,)
     laws = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = [Design(law) for law in laws]
+    plain += [stopped for law in laws if law.Ki for stopped in _stopped(servo, law, uncertainty.step[0], demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     hysteretic = [
         Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
     return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
+
+
+def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:
+    """A law with dead zones that stop its integral only, for a smallest step (m)."""
+    counts = COUNTS * servo.position_resolution
+    zones = [(share * step + counts, leave) for share, leave in demands.stops]
+    return [
+        Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
+        for tolerance, leave in zones
+        if tolerance <= demands.tolerance
+    ]
+
+
+def _gains(law: Controller) -> tuple[float, float, float]:
+    return law.Kp, law.Kd, law.Tf
 
 
 def _with_feedforward(setting: Design, feedforward: float) -> Design:
@@ -171,6 +189,15 @@ class _Search:
     def __init__(self, servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: Trial, noise: float) -> None:
         self.servo, self.uncertainty, self.demands = servo, uncertainty, demands
         self.trial, self.noise = trial, noise
+
+    def ranked_in_stages(self, candidates: list[Design]) -> list[Design]:
+        """Candidates in the order of `ranked`: integral action is tried with the best gains without it only."""
+        plain = [setting for setting in candidates if not setting.controller.Ki]
+        if not plain or len(plain) == len(candidates):
+            return self.ranked(candidates)
+        gains = {_gains(setting.controller) for setting in self.ranked(plain)[:_GAINS_WITH_INTEGRAL]}
+        with_integral = [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
+        return self.ranked(plain + with_integral)
 
     def ranked(self, candidates: list[Design]) -> list[Design]:
         """Candidates that meet the demands on a few machines first, then by cost."""
@@ -203,7 +230,7 @@ class _Search:
         members = draw_independently(self.servo, known, demands.machines, seed)
         (measures,) = assess([setting], members, self.trial)
         law = unfed(setting.controller)
-        loop = loop_margins(self.servo, widened(known, demands), law)
+        loop = margins_in_every_zone(self.servo, widened(known, demands), setting.controller)
         settled = int(measures.settled.sum())
         ends = (np.array(known.input_bias), np.array(known.friction), known.step[1])
         return Certificate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -118,6 +118,9 @@ def laws_within(
     delays = delays_of(servo.controller, uncertainty)
     peaks: dict[Controller, float] = {}
     for law in dict.fromkeys(scaled):
+        # A dead zone may stop the integral: the law without it must be within the bounds too.
+        if law.Ki and 0.0 in integral and law.replace(Ki=0.0) not in laws:
+            continue
         each = np.array([plants.peaks(law, delay) for delay in delays])
         peaks[law] = float(each.max())
         within = each[0, 0] <= demands.Ms * _ROUNDED and peaks[law] <= demands.Ms_worst * _ROUNDED
@@ -152,7 +155,19 @@ def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share:
 
 def unfed(law: Controller) -> Controller:
     """The law without feedforward and thresholds, on which margins do not depend: equal ones share a stored result."""
-    return law.replace(feedforward=0.0, enter=1.0, leave=1.0)
+    return law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
+
+
+def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+    """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral."""
+    acting = loop_margins(servo, uncertainty, unfed(law))
+    if not law.integral_only:
+        return acting
+    stopped = loop_margins(servo, uncertainty, unfed(law).replace(Ki=0.0))
+    most = {name: max(getattr(acting, name), getattr(stopped, name)) for name in ("Ms", "Ms_worst")}
+    names = [field.name for field in fields(LoopMargins) if field.name.endswith("margin_worst")]
+    least = {name: min(getattr(acting, name), getattr(stopped, name)) for name in (*names, "phase_margin", "passivity")}
+    return replace(acting, **most, **least)
 
 
 def with_margins(demands: Demands) -> Demands:

@@ -10,13 +10,16 @@ from time import perf_counter
 from typing import ClassVar, Protocol
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
+from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LAG, LearntMotor
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.free_model import FactorPrior, adapted
+from servotwin.estimation.whitened.free_model import adapted
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
@@ -32,6 +35,8 @@ _SAME = 1e-3
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
+# Friction holds the motor at up to so much more than half the difference of two rests.
+_HOLDS = 1.25
 
 
 class Verifier(Protocol):
@@ -114,14 +119,16 @@ class CertifiedPolicy:
         the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
-        return self.decide(evidence, self if evidence.machine is None else _LearntVerifier(self, evidence.machine))
+        learnt = _learnt(self.servo, self.uncertainty, evidence)
+        return self.decide(evidence, self if learnt is None else _LearntVerifier(self, *learnt))
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None:
+        if estimate is None and not self._shows_disturbance(evidence):
             return Redesign(None, math.nan, evidence.unusable)
-        gap = self._gap(estimate, evidence.trend)
+        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
+        best = math.nan if estimate is None else estimate.gap
         if gap[1] > self.uncertainty.gap[1]:
             low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
             reason = (
@@ -134,8 +141,8 @@ class CertifiedPolicy:
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
         if _in_force(result.setting, evidence, _SAME_FEEDFORWARD * self.smallest_answer):
-            return Redesign(None, estimate.gap, "the verified setting is in force already", certificate=result)
-        redesign = _redesign(result, region.noise, estimate.gap, "")
+            return Redesign(None, best, "the verified setting is in force already", certificate=result)
+        redesign = _redesign(result, region.noise, best, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
@@ -191,53 +198,93 @@ class CertifiedPolicy:
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
         leaves it as it is."""
-        disturbance = evidence.disturbance
+        bias, std, held = self._rest(evidence)
         gains = evidence.gains
         fed = gains.feedforward if gains is not None else 0.0
-        if not math.isfinite(disturbance.bias_std):
+        if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * disturbance.bias_std, self.bias_floor)
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
         # Only a significant change: every new feedforward is an update at the edge.
-        if abs(disturbance.bias + fed) > spread:
-            fed = min(max(-disturbance.bias, -limit), limit)
-        return fed, (disturbance.bias - spread, disturbance.bias + spread)
+        if abs(bias + fed) > spread:
+            fed = min(max(-bias, -limit), limit)
+        return fed, (bias - spread, bias + spread)
+
+    def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
+        """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
+
+        A bias is the same at every rest. Friction stops the motor at one end of what it can hold or at the other.
+        """
+        bias, std = evidence.disturbance.bias, evidence.disturbance.bias_std
+        motor = self._motor(evidence)
+        if motor is not None and motor.friction[0] > 0.0:
+            # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
+            return float(motor.mean[BIAS]), motor.std(BIAS), 0.0
+        if motor is not None or not math.isfinite(std):
+            return bias, std, 0.0
+        rests = (*evidence.rests, bias)
+        half = 0.5 * (max(rests) - min(rests))
+        if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
+            return bias, std, 0.0
+        return 0.5 * (max(rests) + min(rests)), std, half
+
+    def _shows_disturbance(self, evidence: Evidence) -> bool:
+        """True where a window tells more of bias and friction than the setting in force answers to."""
+        gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
+        if gains is None or not rested or evidence.estimate.ok:
+            return False
+        fed, _ = self._input_bias(evidence)
+        if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
+            return True
+        sticks = self._friction(evidence)[1] > 0.0
+        return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
+
+    def _motor(self, evidence: Evidence) -> LearntMotor | None:
+        """The learnt motor, where it tells friction and bias well enough to act on them."""
+        motor, small = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
+        known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= small
+        return motor if known else None
 
     def _friction(self, evidence: Evidence) -> Range:
-        """Range of friction torques (N m): as stated, widened to the torque that the last feedforward left at rest."""
+        """Range of friction torques (N m): as learnt, otherwise as stated or as the last feedforward left at rest."""
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
+        motor, torque = self._motor(evidence), self.servo.k_T / self.servo.R
+        if motor is not None:
+            least, most = motor.friction
+            # A range that begins at zero is none: the stated one may still narrow it.
+            return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
+        high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
-        return low, max(
-            high, left * self.servo.k_T / self.servo.R
-        ) if left > _BIAS_MOVED * self.smallest_answer else high
+        return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
 
 
 # Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
 # leaves out does not average away with the windows.
 _LEAST_K, _LEAST_C = 0.002, 0.01
+# Of a stated half-width: a number of the motor that is not known better than that stays as stated.
+_TOLD = 0.5
 
 
 @dataclass(frozen=True)
 class _LearntVerifier:
     """Verification by simulation on what was learnt of the machine, in place of the model's stated error.
 
-    Its numbers are those of k/m and c/m: the masses are taken as the model's. The fallback set stays that of the stated
-    ranges.
+    The fallback set stays that of the stated ranges.
     """
 
     policy: CertifiedPolicy
-    machine: FactorPrior
+    servo: Servo
+    learnt: LearntFactors
     provisional: ClassVar[bool] = False
 
     def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
-        policy, covariance = self.policy, self.machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2])
-        spread = tuple(tuple(row) for row in covariance.tolist())
-        learnt = LearntFactors(("k", "c"), (0.0, 0.0), spread)
+        policy, known = self.policy, region.within(self.policy.uncertainty)
         return certify(
-            adapted(policy.servo, self.machine.mean),
-            region.within(policy.uncertainty).replace(learnt=learnt, m=0.0),
+            self.servo,
+            # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
+            known.replace(learnt=self.learnt, m=0.0 if "k" in self.learnt.names else known.m),
             policy.demands_within_band(),
             policy.simulations,
             region.feedforward,
@@ -247,6 +294,31 @@ class _LearntVerifier:
 
     def fallback(self) -> Certificate:
         return self.policy.fallback()
+
+
+def _learnt(servo: Servo, known: Uncertainty, evidence: Evidence) -> tuple[Servo, LearntFactors] | None:
+    """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
+
+    The motor's numbers count where the windows told more of them than was stated.
+    """
+    names, variances = list[str](), list[Array]()
+    machine, motor = evidence.machine, evidence.motor
+    if machine is not None:
+        servo = adapted(servo, machine.mean)
+        names += ["k", "c"]
+        variances.append(machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2]))
+    if motor is not None:
+        for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
+            relative = motor.std(index) / (1.0 + motor.mean[index])
+            if math.sqrt(3.0) * relative < _TOLD * width:
+                servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
+                names.append(name)
+                variances.append(np.array([[relative**2]]))
+    if not names:
+        return None
+    covariance = block_diag(*variances)
+    spread = tuple(tuple(row) for row in covariance.tolist())
+    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
 
 
 def _noise(evidence: Evidence) -> float:

@@ -1,0 +1,195 @@
+"""`servotwin bench loops`: the whole twin in the loop, on machines that differ from their model and wear."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import report
+from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
+from servotwin.analysis.maps.pool import shared, workplace
+from servotwin.cosim.driver import Cosimulation
+from servotwin.redesign.certified.margins import scaled_law
+from servotwin.simulation import Run
+
+SCHEMA, NAME = "servotwin-bench-loops/1", "loops"
+MACHINES, QUICK, SEED = 40, 1, 2027
+TWIN, OWN, SLOWER = "twin", "own PD", "0.6 x PD"
+# Constants: factors on the servo's Kp and Kd, and on its Ki.
+_SCALES, _INTEGRAL = (0.6, 0.7, 0.85, 1.0), (0.0, 0.01, 0.03)
+_GAP_OFF = math.radians(0.05)
+# A step has settled where the error's half peak-to-peak over the last third of its time is below this share of it, and
+# at least two counts of the sensor.
+_STILL = 0.01
+
+
+class LoopScores(NamedTuple):
+    """Measures of one run.
+
+    Attributes
+    ----------
+    cost : float
+        s, integral of the absolute error per step, mean of all steps.
+    settled : float
+        1.0 where the last step has settled.
+    tail : float
+        m, largest error in the last third of the last step.
+    updates, off, worst : float
+        Number of updates applied, of those whose gap was off by more than 0.05 deg, and the largest such error, rad.
+    fallbacks : float
+    """
+
+    cost: float
+    settled: float
+    tail: float
+    updates: float = 0.0
+    off: float = 0.0
+    worst: float = 0.0
+    fallbacks: float = 0.0
+
+
+class LoopRow(NamedTuple):
+    """Scores of one contender on every machine of a block."""
+
+    block: str
+    name: str
+    scores: tuple[LoopScores, ...]
+
+    def at(self, measure: str, percent: float) -> float:
+        """A percentile of a measure over the machines."""
+        return float(np.percentile([getattr(each, measure) for each in self.scores], percent))
+
+    def total(self, measure: str) -> float:
+        """Sum of a measure over the machines."""
+        return float(sum(getattr(each, measure) for each in self.scores))
+
+
+class _Task(NamedTuple):
+    place: int
+    machine: WornMachine
+
+
+def loops(
+    date: str = "",
+    output: Path | None = None,
+    count: int = MACHINES,
+    blocks: Sequence[str] = BLOCKS,
+    console: Console | None = None,
+    seed: int = SEED,
+    workers: int | None = None,
+) -> tuple[LoopRow, ...]:
+    """Compare the twin with constant controllers, show it, and write JSON if `output` is given.
+
+    Parameters
+    ----------
+    date : str
+        Written into the JSON.
+    output : Path, optional
+        File to write, suffix .json.
+    count, seed : int
+        Machines of each block.
+    blocks : sequence of str
+    console : Console, optional
+    workers : int, optional
+        Processes; one per core by default.
+
+    Raises
+    ------
+    InvalidInput
+        An output that cannot be written.
+    """
+    console = console or Console()
+    report.check(output)
+    rows: list[LoopRow] = []
+    with workplace(workers):
+        for block in blocks:
+            rows += _block(block, count, seed)
+            console.print(shown([row for row in rows if row.block == block]))
+    table = [
+        {"block": row.block, "contender": row.name, "machines": [each._asdict() for each in row.scores]} for row in rows
+    ]
+    report.write(output, report.text(SCHEMA, date, rows=table), console)
+    return tuple(rows)
+
+
+def _block(block: str, count: int, seed: int) -> list[LoopRow]:
+    """Rows of the twin, of two constants, and of the best constant with hindsight."""
+    tasks = [_Task(place, machine) for place, machine in enumerate(worn_machines(block, count, seed))]
+    found = dict(sorted((task.place, scores) for task, scores in shared(_compared, tasks)))
+    rows = {name: LoopRow(block, name, tuple(scores[name] for scores in found.values())) for name in found[0]}
+    constants = [row for row in rows.values() if row.name != TWIN]
+    best = min(constants, key=lambda row: row.at("cost", 95.0))
+    best = best._replace(name=f"best constant: {best.name}")
+    return [rows[TWIN], rows[OWN], rows[SLOWER], best]
+
+
+def _compared(task: _Task) -> dict[str, LoopScores]:
+    machine, own = task.machine, task.machine.model.controller
+    scores = {TWIN: with_twin(machine)}
+    for scale in _SCALES:
+        for share in _INTEGRAL:
+            name = {(1.0, 0.0): OWN, (0.6, 0.0): SLOWER}.get((scale, share), f"Kp, Kd x {scale:g}, Ki x {share:g}")
+            scores[name] = scored(machine, machine.under(scaled_law(own, scale, (1.0, 1.0), share)))
+    return scores
+
+
+def with_twin(machine: WornMachine) -> LoopScores:
+    """Run a machine with edge, link and twin."""
+    simulation = machine.simulation()
+    cosimulation = Cosimulation(machine.scenario, simulation)
+    while not cosimulation.done:
+        cosimulation.advance()
+    loop = cosimulation.loop(simulation.run())
+    applied = {receipt.version for receipt in loop.receipts if receipt.applied}
+    times = {(window.boot, window.sequence): window.middle for window in loop.windows}
+    estimates = [u for u in loop.updates if u.version in applied and u.gap is not None and u.status == "ok"]
+    off = [abs(u.gap - float(np.interp(times[u.window], loop.run.time, loop.run.gap))) for u in estimates if u.gap]
+    return scored(machine, loop.run)._replace(
+        updates=float(len(applied)),
+        off=float(sum(error > _GAP_OFF for error in off)),
+        worst=max(off, default=0.0),
+        fallbacks=float(len(loop.fallbacks)),
+    )
+
+
+def scored(machine: WornMachine, run: Run) -> LoopScores:
+    """Measure a run; the first step begins at zero and is half as large as the others."""
+    error = (run.reference - run.position)[:-1].reshape(STEPS, -1)
+    sizes = np.full(STEPS, 2.0 * machine.amplitude)
+    sizes[0] = machine.amplitude
+    last = error[-1, -round(RATE * HALF_PERIOD / 3.0) :]
+    still = _STILL * sizes[-1] + 2.0 * machine.model.position_resolution
+    return LoopScores(
+        cost=float(np.mean(np.abs(error).mean(axis=1) * HALF_PERIOD / sizes)),
+        settled=float(0.5 * np.ptp(last) <= still),
+        tail=float(np.abs(last).max()),
+    )
+
+
+def shown(rows: Sequence[LoopRow]) -> Table:
+    """A line for each contender."""
+    result = Table(title="whole twin in the loop, worn machines", title_justify="left", box=None, pad_edge=False)
+    for heading in ("block", "contender", "machines", "settled\n%", "cost med\ns", "cost p95\ns", "tail p95\num"):
+        result.add_column(heading, justify="left" if heading in ("block", "contender") else "right")
+    for heading in ("updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
+        result.add_column(heading, justify="right")
+    for row in rows:
+        result.add_row(
+            row.block,
+            row.name,
+            str(len(row.scores)),
+            f"{100.0 * row.total('settled') / len(row.scores):.1f}",
+            f"{row.at('cost', 50.0):.3f}",
+            f"{row.at('cost', 95.0):.3f}",
+            f"{1e6 * row.at('tail', 95.0):.1f}",
+            *(f"{row.total(name):.0f}" for name in ("updates", "off")),
+            f"{math.degrees(row.at('worst', 100.0)):.3f}",
+            f"{row.total('fallbacks'):.0f}",
+        )
+    return result
