@@ -3,8 +3,8 @@
 The motor's angle goes through the play operator at a gap, the screw's angle through the structure. What the position
 has beyond that is regressed on its sensitivity to the gap, db = phi'r / phi'phi. Beside that sensitivity stand columns
 for where the screw began, the encoder's offset, the structure's motion from before the window and a delay between the
-channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than 2 mrad, the
-regression is repeated at the new one.
+channels. An autoregression of the residual makes its noise white. Where the gap has moved by more than 2 mrad (ten
+counts of a fine encoder), the regression is repeated at the new one.
 
 A window in which the screw is pushed one way only shows the gap if the encoder's offset is known from other windows of
 the same boot.
@@ -36,7 +36,9 @@ from servotwin.plant.signals import Array
 _PER_PERIOD = 9.0
 _LINEARISATIONS = 8  # at most
 _WHITENED_FITS = 2  # fits in the noise that the one before has left
-_CLOSE = 2e-3  # rad: nearer than that one more linearisation changes nothing that matters
+_CLOSE = 2e-3  # rad: nearer than that one more linearisation changes nothing that matters,
+_CLOSE_COUNTS = 10.0  # or so many counts of the encoder, where they are known and less
+_LEAST_COUNTS = 4.0  # the least gap to begin at: at none the screw would follow every count of a motor at rest
 _STARTS = 0.0, 0.9, -0.9  # places in the gap, tried in turn until a fit converges with a usual residual
 _USUAL = 1.5  # times the usual residual: up to this, no other start is tried
 _ORDER = 8  # of the autoregression, at most
@@ -150,7 +152,7 @@ def score(
         return None
     window, best = _Window.prepared(angle, load, model, offset), None
     for start in _STARTS:
-        candidate = window.converged(_Place(max(gap, 0.0), start))
+        candidate = window.converged(_Place(max(gap, _LEAST_COUNTS * model.encoder_resolution), start))
         if candidate is not None and (best is None or candidate.noise < best.noise):
             best = candidate
         if best is not None and best.noise <= _USUAL * usual:
@@ -169,9 +171,9 @@ class _Place(NamedTuple):
         """rad from the motor, at the first sample."""
         return 0.5 * self.gap * self.place
 
-    def near(self, other: _Place) -> bool:
-        """Tell whether both are as good to linearise at."""
-        return abs(self.gap - other.gap) < _CLOSE and abs(self.screw - other.screw) < _CLOSE
+    def near(self, other: _Place, close: float) -> bool:
+        """Tell whether both are as good to linearise at: gap and screw nearer than `close` (rad)."""
+        return abs(self.gap - other.gap) < close and abs(self.screw - other.screw) < close
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,17 +210,18 @@ class _Window:
 
     def converged(self, place: _Place) -> Score | None:
         """Linearise until gap and place converge, and fit in the noise of the last fit's residual."""
-        noise, fits = None, 0
+        count = self.model.encoder_resolution
+        noise, fits, close = None, 0, min(_CLOSE, _CLOSE_COUNTS * count) if count > 0.0 else _CLOSE
         for _ in range(_LINEARISATIONS):
             columns = self.columns(place)
             if columns is None:
                 return None
             moved = place
-            while place.near(moved) and fits <= _WHITENED_FITS:
+            while place.near(moved, close) and fits <= _WHITENED_FITS:
                 fit = columns.fitted(noise)
                 noise = burg(fit.left[None], min(_ORDER, fit.left.size // 8)).at_least(self.floor)
                 moved, fits = fit.moved(place), fits + 1
-            if place.near(moved):
+            if place.near(moved, close):
                 return columns.score(fit)
             place, fits = moved, min(fits, _WHITENED_FITS)
         return None

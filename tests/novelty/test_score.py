@@ -15,10 +15,13 @@ import servotwin
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.response import response
+from servotwin.estimation.window import Window
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, model_of, response_of, score
 from servotwin.novelty.settings import NoveltyModel, ResponseMode
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.simulation import simulate
 
 RATE = 5000.0
 SERVO = Servo.preset("paper")
@@ -87,6 +90,24 @@ def test_a_machine_in_other_units_has_the_same_score(units: Units) -> None:
     ]
     assert leads[0] == pytest.approx(leads[1])
     assert leads[0]
+
+
+def test_a_ball_screw_with_a_fine_encoder_shows_small_changes() -> None:
+    """A lost motion of 5 um, 0.36 deg, in steps of 100 um, a million counts per turn, from 30 % off."""
+    lost_motion, step = 5e-6, 1e-4
+    law, pitch, count = SERVO.controller, 5e-3 / (2.0 * math.pi), 2.0 * math.pi / 2**20
+    servo = SERVO.replace(p=pitch, Kp=law.Kp * SERVO.p / pitch, Ki=0.0, Kd=law.Kd * SERVO.p / pitch)
+    truth = lost_motion / pitch
+    run = simulate(servo, 12.0, reference=SquareWave(step, 4.0), gap=truth, sample_rate=RATE)
+    model = model_of(servo.replace(encoder_resolution=count), RATE)
+    for start in (1.7, 3.7, 5.7, 7.7, 9.7):
+        window = Window.from_run(run, start, 2.0)
+        assert window.theta_m is not None
+        theta_m, position = np.round(window.theta_m / count) * count, np.round(window.position / 1e-8) * 1e-8
+        for share in (0.7, 1.3):
+            found = score(theta_m, position, model, share * truth)
+            assert found is not None
+            assert found.gap == pytest.approx(truth, abs=math.radians(5e-4))
 
 
 @pytest.mark.parametrize("gap_deg", [4.0, 10.0, 18.0])
