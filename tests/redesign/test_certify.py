@@ -351,6 +351,7 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 
+@pytest.mark.slow
 def test_the_settling_map_holds_for_every_gap() -> None:
     """Homogeneity: a cell of the map, simulated at another gap."""
     found = settling_map(SERVO)
