@@ -245,7 +245,7 @@ class Servo:
         """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
-    @property
+    @cached_property
     def version(self) -> str:
         """Twelve hexadecimal digits that name this plant's numbers (the controller's do not count)."""
         return hashlib.sha256(dumps(values_of(self, only=_PLANT)).encode()).hexdigest()[:12]

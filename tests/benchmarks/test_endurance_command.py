@@ -34,6 +34,7 @@ def found(monkeypatch: pytest.MonkeyPatch, tmp_path):
     return outcomes, text_of(console), json.loads(output.read_text())
 
 
+@pytest.mark.slow
 def test_every_kind_has_its_row_in_the_order_of_the_kinds(found) -> None:
     outcomes, text, _ = found
     assert [outcome.kind for outcome in outcomes] == [*hostile.KINDS, *hostile.KINDS, hostile.KINDS[0]]

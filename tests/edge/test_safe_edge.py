@@ -126,6 +126,7 @@ def cosimulated(
     return loop, plant, twin
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_bytes() -> None:
     digests = set()
     for _ in range(2):

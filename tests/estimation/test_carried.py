@@ -173,6 +173,7 @@ def test_an_encoder_that_slipped_is_read_anew_or_doubted():
     assert doubted.prior.offset_std == doubted.settings.offset_std_rad
 
 
+@pytest.mark.slow
 def test_a_loop_reports_bias_and_reason_for_every_window():
     assert len(loop().disturbances) == len(loop().redesigns) == len(loop().estimates) == 10
     for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):

@@ -124,6 +124,7 @@ def test_a_learnt_machine_and_a_glance_are_the_same(units: Units) -> None:
     assert again.misfit / units.length == pytest.approx(glance.misfit, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", ELSEWHERE[-3:])
 def test_joint_estimates_are_the_same(units: Units) -> None:
     servo = scaled(SERVO, *units)

@@ -21,13 +21,14 @@ from servotwin.estimation.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import assess, nearness, stillness
+from servotwin.redesign.certified.assess import assess, joined, nearness, stillness
+from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, unfed, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw, drawn_plants
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, drawn_plants
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy, gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence
@@ -351,6 +352,7 @@ def test_the_margin_policy_takes_the_wider_of_gap_and_noise() -> None:
     assert rule.redesign(Evidence(estimated(1.0, status=GapStatus.LOWER_BOUND))).setting is None
 
 
+@pytest.mark.slow
 def test_the_settling_map_holds_for_every_gap() -> None:
     """Homogeneity: a cell of the map, simulated at another gap."""
     found = settling_map(SERVO)
@@ -420,3 +422,32 @@ def test_a_learnt_machine_is_verified_on_what_was_learnt() -> None:
     assert redesign.certificate.Ms == pytest.approx(machine.margins(law).Ms, rel=1e-9)
     assert redesign.certificate.Ms != pytest.approx(SERVO.margins(law).Ms, rel=1e-3)
     assert policy.fallback().gap == known.gap
+
+
+def test_machines_in_two_parts_have_the_measures_of_all() -> None:
+    known = Uncertainty(gap=(0.1, 0.3), k_T=0.1, p=0.05, input_bias=(-1e-3, 1e-3))
+    members, setting = draw_independently(SERVO, known, 24, 5), Design(SERVO.controller.replace(Ki=0.0))
+    trial = Trial(duration=10.0, last=2.0)
+    (whole,) = assess([setting], members, trial)
+    parts = [assess([setting], members.part(*ends), trial, float(members.step.max()))[0] for ends in ((0, 9), (9, 24))]
+    both = joined(*parts)
+    for name in ("ripple", "tail", "overshoot", "settling", "cost", "still", "near", "saturated"):
+        assert np.array_equal(getattr(both, name), getattr(whole, name)), name
+
+
+def test_an_attempt_is_given_up_only_where_its_certificate_fails() -> None:
+    """Parts refuse early; the certificate of the whole agrees, whichever part it was."""
+    demands = replace(SMALL, machines=90, settled=0.9)
+    known = Uncertainty(gap=gaps(30.0, 40.0))
+    found = certify(SERVO, known, demands, SHORT)
+    assert isinstance(found, Certificate)
+    question = Question(SERVO, known, demands, SHORT, 0.0)
+    laws = [OWN.replace(Kp=scale * OWN.Kp, Kd=scale * OWN.Kd, Ki=0.0) for scale in (0.05, 1.0, 1.5, 2.0)]
+    refused = []
+    for setting in (found.setting, *map(Design, laws)):
+        attempt = Attempt(question, setting)
+        refused.append(attempt.cannot_pass())
+        assert refused[-1] <= (question.shortcoming(attempt.certificate()) != "")
+    assert not refused[0]
+    assert any(refused)
+    assert replace(Attempt(question, found.setting).certificate(), looked_at=found.looked_at) == found

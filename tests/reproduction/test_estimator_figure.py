@@ -30,6 +30,7 @@ def test_only_two_contacts_show_the_gap(drawn):
         assert panel.estimate.status is not GapStatus.OK
 
 
+@pytest.mark.slow
 def test_one_contact_answers_but_the_screws_start_can_imitate_it(drawn):
     one, none = drawn[1:]
     assert np.abs(one.raw).max() > 1e-6

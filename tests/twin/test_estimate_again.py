@@ -100,6 +100,7 @@ def test_another_model_is_named_with_both_values():
     assert {"gap", "model_version"} <= set(again.changed)
 
 
+@pytest.mark.slow
 def test_a_setting_that_does_not_matter_is_named_all_the_same():
     window, body, context = estimated("calm")[0][-1]
     model = estimated("calm")[1]

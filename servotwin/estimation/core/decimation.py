@@ -14,7 +14,7 @@ import numpy as np
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
-_AVERAGES = 4
+AVERAGES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Decimation:
         """(k, m) of rows (k, n), m = n // factor - 3."""
         if self.factor == 1:
             return columns
-        out = np.empty((len(columns), columns.shape[1] // self.factor - _AVERAGES + 1))
+        out = np.empty((len(columns), columns.shape[1] // self.factor - AVERAGES + 1))
         decimate(columns, self.taps, self.factor, out)
         return out
 
@@ -44,14 +44,14 @@ class Decimation:
 def decimation(factor: int) -> Decimation:
     """Return the decimation by a whole factor; 1 leaves everything as it is."""
     taps = np.ones(1)
-    for _ in range(_AVERAGES):
+    for _ in range(AVERAGES):
         taps = np.convolve(taps, np.full(factor, 1.0 / factor))
-    return Decimation(factor, np.pad(taps, (0, _AVERAGES * factor - taps.size)))
+    return Decimation(factor, np.pad(taps, (0, AVERAGES * factor - taps.size)))
 
 
 def shortest_for(factor: int, outputs: int) -> int:
     """Fewest samples from which a decimation by `factor` makes `outputs` samples."""
-    return outputs if factor == 1 else factor * (outputs + _AVERAGES - 1)
+    return outputs if factor == 1 else factor * (outputs + AVERAGES - 1)
 
 
 @bare
@@ -59,7 +59,7 @@ def decimate(columns: Array, taps: Array, factor: int, out: Array) -> None:
     """`Decimation.rows` into `out` (k, m): the four blocks under one output are summed side by side."""
     for k in range(len(columns)):
         first = second = third = 0.0
-        for block in range(out.shape[1] + _AVERAGES - 1):
+        for block in range(out.shape[1] + AVERAGES - 1):
             a = b = c = d = 0.0
             for i in range(factor):
                 x = columns[k, block * factor + i]
@@ -67,6 +67,6 @@ def decimate(columns: Array, taps: Array, factor: int, out: Array) -> None:
                 b += taps[factor + i] * x
                 c += taps[2 * factor + i] * x
                 d += taps[3 * factor + i] * x
-            if block >= _AVERAGES - 1:
-                out[k, block - _AVERAGES + 1] = first + d
+            if block >= AVERAGES - 1:
+                out[k, block - AVERAGES + 1] = first + d
             first, second, third = second + c, third + b, a

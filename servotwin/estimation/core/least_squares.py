@@ -53,14 +53,14 @@ class LeastSquares:
 
 def least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,)."""
-    size = np.sqrt(np.sum(columns * columns, axis=1))
-    size[size == 0.0] = 1.0
-    scaled = columns / size[:, None]
+    products = columns @ columns.T
+    size = np.sqrt(np.diagonal(products))
+    size = np.where(size == 0.0, 1.0, size)
     # Columns of length one: the test for dependence must not depend on their units.
-    values, vectors = np.linalg.eigh(scaled @ scaled.T)
+    values, vectors = np.linalg.eigh(products / np.outer(size, size))
     good = values > _DEPENDENT_EIGENVALUE * values[-1]
-    root = (vectors[:, good] / np.sqrt(values[good])).T
-    return LeastSquares((root.T @ (root @ (scaled @ target))) / size, root / size, np.zeros(size.size, dtype=bool))
+    root = (vectors[:, good] / np.sqrt(values[good])).T / size
+    return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(size.size, dtype=bool))
 
 
 def independent_least_squares(columns: Array, target: Array) -> LeastSquares:

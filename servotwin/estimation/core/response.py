@@ -7,9 +7,10 @@ sample interval is short, and no product of matrices.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,9 +83,65 @@ class Response:
 
         A real pole gives one row; with n masses on a rigid screw there are 2 (n - 1) rows.
         """
-        motion = np.exp(np.outer(self.poles, np.arange(samples) * self.interval))
-        oscillating = np.abs(self.poles.imag) > 0.0
-        return np.vstack([motion.real, motion.imag[oscillating]])
+        return self.real_parts(geometric(self.poles * self.interval, samples))
+
+    def real_parts(self, motions: Complex) -> Array:
+        """(2 modes, n) real and imaginary parts of motions (modes, n) of the modes; those of a real pole are real."""
+        return np.vstack([motions.real, motions.imag[np.abs(self.poles.imag) > 0.0]])
+
+
+def geometric(exponents: Complex, samples: int) -> Complex:
+    """(modes, n) exp(exponent i), i = 0, 1, ...: a product of two exponentials, of which there are few."""
+    width = max(1, math.isqrt(samples))
+    height = -(-samples // width)
+    far, near = (np.exp(np.outer(exponents, steps)) for steps in (width * np.arange(height), np.arange(width)))
+    return np.asarray((far[:, :, None] * near[:, None, :]).reshape(exponents.size, -1)[:, :samples])
+
+
+class Structures(NamedTuple):
+    """Some structures z' = A z + drive u, y = row z + direct u, of the same size.
+
+    Attributes
+    ----------
+    A : (s, N, N) array
+    drive : (s, N) array
+    row : (N,) array
+    direct, unseen : (s,) arrays
+        `unseen` as in `Response`.
+    """
+
+    A: Array
+    drive: Array
+    row: Array
+    direct: Array
+    unseen: Array
+
+    def responses(self, sample_rate: float) -> list[Response]:
+        """The response of each structure at a sample rate (Hz)."""
+        interval = 1.0 / sample_rate
+        poles, shapes = _modes(self.A)
+        weight = (self.row @ shapes) * np.linalg.solve(shapes, self.drive[:, :, None])[:, :, 0]
+        # One of each conjugate pair, with twice its weight: the real part of the sum is the same.
+        weight = weight * (1.0 + np.sign(poles.imag))
+        now, after = _hold(poles, interval)
+        decay = np.exp(poles * interval)
+        position, velocity = weight * np.array([np.ones_like(poles), poles])
+        held = {
+            "position": (position * (now + decay * after), self.direct + np.sum(position * after, axis=1).real),
+            "velocity": (velocity * (now + decay * after), np.sum(position + velocity * after, axis=1).real),
+        }
+        still = self.direct - np.sum(weight / poles, axis=1).real
+        return [
+            Response(
+                poles=poles[i, upper],
+                decay=_parts(decay[i, upper]),
+                **{name: Readout(_parts(gain[i, upper]), float(direct[i])) for name, (gain, direct) in held.items()},
+                interval=interval,
+                static_gain=float(still[i]),
+                unseen=float(self.unseen[i]),
+            )
+            for i, upper in enumerate(poles.imag >= 0.0)
+        ]
 
 
 @lru_cache(maxsize=64)
@@ -93,41 +150,25 @@ def response(servo: Servo, sample_rate: float) -> Response:
 
     With d = p theta_d and z = x - B_velocity d, z' = A z + (A B_velocity + B_position) d holds no derivative.
     """
-    chain, interval = servo.chain(), 1.0 / sample_rate
-    poles, shapes = _modes(chain.A)
-    drive = np.linalg.solve(shapes, servo.p * (chain.A @ chain.B_velocity + chain.B_position))
-    row = chain.C_last
-    weight = (row @ shapes) * drive
-    # One of each conjugate pair, with twice its weight: the real part of the sum is the same.
-    upper = poles.imag >= 0.0
-    poles, weight = poles[upper], weight[upper] * np.where(poles[upper].imag > 0.0, 2.0, 1.0)
+    chain = servo.chain()
+    row, drive = chain.C_last, servo.p * (chain.A @ chain.B_velocity + chain.B_position)
     direct = servo.p * float(row @ chain.B_velocity + chain.D[-1])
-    return Response(
-        poles=poles,
-        decay=_parts(np.exp(poles * interval)),
-        position=_readout(poles, weight, interval, direct),
-        velocity=_readout(poles, weight * poles, interval, float(np.sum(weight).real)),
-        interval=interval,
-        static_gain=direct - float(np.sum(weight / poles).real),
-        unseen=float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:]))),
-    )
+    unseen = float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:])))
+    one = Structures(chain.A[None], drive[None], row, np.array([direct]), np.array([unseen]))
+    return one.responses(sample_rate)[0]
 
 
-def _modes(matrix: Array) -> tuple[Complex, Complex]:
-    """Eigenvalues and eigenvectors; where two modes coincide (critical damping) they are split by a relative 1e-9."""
-    poles, shapes = np.linalg.eig(matrix)
-    # Coinciding modes have no complete set of eigenvectors.
-    if np.linalg.cond(shapes) > _DEFECTIVE:
-        pattern = np.linspace(-_SPLIT, _SPLIT, matrix.size).reshape(matrix.shape)
-        poles, shapes = np.linalg.eig(matrix * (1.0 + pattern))
-    return poles.astype(complex), shapes.astype(complex)
+def _modes(matrices: Array) -> tuple[Complex, Complex]:
+    """Eigenvalues (s, N) and eigenvectors (s, N, N) of matrices (s, N, N).
 
-
-def _readout(poles: Complex, weight: Complex, interval: float, direct: float) -> Readout:
-    """Make the readout of the sum of weight z_true + direct u, for z_true[i] = after u[i] + (now + e after) z[i]."""
-    now, after = _hold(poles, interval)
-    gain = weight * (now + np.exp(poles * interval) * after)
-    return Readout(_parts(gain), direct + float(np.sum(weight * after).real))
+    Where two modes coincide (critical damping) they are split by a relative 1e-9: they have no complete set of
+    eigenvectors.
+    """
+    poles, shapes = (part.astype(complex) for part in np.linalg.eig(matrices))
+    for i in np.flatnonzero(np.linalg.cond(shapes) > _DEFECTIVE):
+        pattern = np.linspace(-_SPLIT, _SPLIT, matrices[i].size).reshape(matrices[i].shape)
+        poles[i], shapes[i] = np.linalg.eig(matrices[i] * (1.0 + pattern))
+    return poles, shapes
 
 
 def _hold(poles: Complex, interval: float) -> tuple[Complex, Complex]:

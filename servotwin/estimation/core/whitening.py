@@ -73,7 +73,7 @@ def burg(series: Array, most: int) -> Autoregression:
     """
     # One recursion gives the predictors and powers of all orders, so the choice of the order costs nothing more.
     predictors, power = recursion(series, most)
-    best = min(range(most + 1), key=lambda order: _criterion(float(power[order]), order, series.shape[1]))
+    best = int(np.argmin(_criteria(power, series.shape[1])))
     return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
 
 
@@ -98,11 +98,11 @@ def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float =
     return np.vstack([left + taken, left - taken])
 
 
-def _criterion(power: float, order: int, size: int) -> float:
-    """AICc of a Gaussian autoregression; the power itself is one more parameter."""
-    count = order + 1
+def _criteria(power: Array, size: int) -> Array:
+    """AICc of Gaussian autoregressions of order 0, 1, ... with these powers; the power itself is one more parameter."""
+    count = 1.0 + np.arange(power.size)
     # The bound keeps the logarithm finite for a residual that is exactly zero.
-    return size * math.log(max(power, 1e-300)) + 2.0 * count * size / max(1, size - count - 1)
+    return np.asarray(size * np.log(np.maximum(power, 1e-300)) + 2.0 * count * size / np.maximum(1, size - count - 1))
 
 
 @summed

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -65,8 +66,10 @@ class WhitenedFit:
     misfit : Misfit
     fit : SearchResult
     noise : Autoregression
-    rows : (k, m) array
-        Table of the reduction at the fit, whitened.
+    table : (k, m) array
+        Of the reduction at the fit.
+    rows : (k, M) array
+        The same whitened.
     evaluations : int
     """
 
@@ -74,13 +77,19 @@ class WhitenedFit:
     misfit: Misfit
     fit: SearchResult
     noise: Autoregression
+    table: Array
     rows: Array
     evaluations: int
 
-    @property
+    @cached_property
+    def shares(self) -> Array:
+        """(k - 3,) fitted shares of the nuisances."""
+        return least_squares(self.rows[CONSTANT:], self.rows[RESIDUAL]).coefficients
+
+    @cached_property
     def left(self) -> Array:
         """(m,) m, residual of the reduced position."""
-        return residual(self.reduction.table(self.point), self.rows)
+        return np.asarray(self.table[RESIDUAL] - self.shares @ self.table[CONSTANT:])
 
     @property
     def point(self) -> Point:
@@ -143,8 +152,9 @@ def refine(
     fit = off_the_plain(white, fit, largest, tolerance)
     noise, evaluations = Autoregression.white(1.0), fit.evaluations
     for number in range(passes):
-        noise = estimate_noise(reduction, fit.point, noise, order, number >= _PLAIN)
-        reduction = reduction.growing(noise, fit.point)
+        table = reduction.table(fit.point)
+        noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
+        reduction = reduction.growing(noise, table)
         misfit = reduction.misfit(noise, fit.point)
         last = number == passes - 1
         starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
@@ -155,8 +165,9 @@ def refine(
         evaluations += fit.evaluations
     fit = off_the_plain(misfit, fit, largest, tolerance)
     fit = descend(misfit, fit.point, largest, tolerance, gain=_FINE)
-    rows = reduction.prepared(noise, reduction.table(fit.point), CONSTANT)
-    return WhitenedFit(reduction, misfit, fit, noise, rows, evaluations + fit.evaluations)
+    table = reduction.table(fit.point)
+    rows = reduction.prepared(noise, table, CONSTANT)
+    return WhitenedFit(reduction, misfit, fit, noise, table, rows, evaluations + fit.evaluations)
 
 
 def _elsewhere(point: Point) -> list[Point]:
@@ -164,20 +175,13 @@ def _elsewhere(point: Point) -> list[Point]:
     return [point._replace(place=place) for place in _PLACES]
 
 
-def residual(table: Array, rows: Array) -> Array:
-    """(m,) m, residual of a fit off its nuisances, for the table and what `Reduction.prepared` makes of it."""
-    shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
-    return np.asarray(table[RESIDUAL] - shares @ table[CONSTANT:])
-
-
-def estimate_noise(reduction: Reduction, point: Point, noise: Autoregression, order: int, put: bool) -> Autoregression:
-    """Estimate the noise from the residual of a fit that was made with a first idea of it.
+def estimate_noise(reduction: Reduction, table: Array, noise: Autoregression, order: int, put: bool) -> Autoregression:
+    """Estimate the noise from the residual of a fit, whose table is given, that was made with a first idea of it.
 
     With `put`, the noise that the fit may have taken away is put back.
     """
-    table = reduction.table(point)
     rows = reduction.prepared(noise, table, CONSTANT)
-    left = residual(table, rows)
+    left = table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:]
     if not np.any(left):
         return Autoregression.white(1.0)
     if not put:
@@ -288,10 +292,7 @@ def _offset(settings: WhitenedSettings, gain: float, angle: float, position: flo
 
 def _delay(result: WhitenedFit) -> float:
     """Delay of the position, s."""
-    nuisances = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients
-    fixed = len(result.reduction.fixed())
-    moving = nuisances[fixed:]
-    return -float(moving[-1])
+    return -float(result.shares[-1])
 
 
 def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:

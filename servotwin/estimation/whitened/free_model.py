@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import polygon, travel
-from servotwin.estimation.core.least_squares import least_squares, orthonormal, project_out
-from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.contacts import travel
+from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
 from servotwin.plant.servo import Servo
@@ -29,8 +29,6 @@ from servotwin.plant.signals import Array
 FACTORS = ("k/m", "c/m", "pitch", "mass ratio")
 FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors where nothing else is known of them
 LARGEST = 4.0  # standard deviations by which a factor may move
-_STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
-_SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
 _FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
@@ -57,7 +55,7 @@ class FactorPrior:
         """Make a prior of independent factors about 1, with relative standard deviations."""
         return cls(np.zeros(4), np.diag(np.square([k, c, pitch, ratio])))
 
-    @property
+    @cached_property
     def root(self) -> Array:
         """(4, 4) whitening matrix: root (factors - mean) has unit covariance."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)))
@@ -79,16 +77,24 @@ class FreeFit:
         Logarithms of `FACTORS` over the model's.
     cost : float
         Squared length of the whitened residual, prior included.
-    covariance : (6, 6) array
-        Of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal of what is not known.
+    rows : (6, M) array
+        Derivatives of the motion by gap (rad), place and factors, nuisances out.
+    movable : (6,) array of bool
+        Those that were free.
     evaluations : int
     """
 
     point: Point
     factors: Array
     cost: float
-    covariance: Array
+    rows: Array
+    movable: Flags
     evaluations: int
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(6, 6) of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal: not known."""
+        return _covariance(self.rows, self.movable)
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
@@ -131,30 +137,26 @@ class FreeProblem:
     def rows(self, q: Array) -> tuple[Array, Array]:
         """Residual (M,) and derivatives of the motion (6, M) at a point (6,), nuisances out, prior appended."""
         point, factors = Point(q[0], q[1]), q[2:]
-        rate = 1.0 / self.reduction.response.interval
-        reduction = replace(self.reduction, response=_response(self.servo, tuple(factors), rate))
-        table = reduction.table(point)
+        rate, soft = 1.0 / self.reduction.response.interval, self.compliance > 0.0
+        near = nearby(self.servo, tuple(factors.tolist()), rate, self.reduction.decimation, soft)
+        reduction = replace(self.reduction, response=near.model.response)
+        screw = reduction.traced(point)
+        table = reduction.tabulated(screw)
         rows = reduction.prepared(self.noise, table, CONSTANT)
         weights = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
-        screw = polygon(reduction.theta_m, point.screw(0.0, reduction.rate))[:1]
-        others = self._others(factors, rate)
-        motions = [motion_by(reduction, other, screw, weights) / step for other, step in others]
-        whole = reduction.prepared(self.noise, np.vstack([table, motions]), CONSTANT)
-        last = len(table) + factors.size
-        known = np.zeros((len(whole), len(motions)))
-        known[len(table) : last, : factors.size] = self.prior.root.T
-        known[RESIDUAL, : factors.size] = self.prior.root @ (self.prior.mean - factors)
-        known[last:, factors.size :] = np.eye(len(motions) - factors.size)
-        whole = np.hstack([whole, known])
+        answer = reduction.position - table[RESIDUAL]
+        motions = near.motions(screw[:1], answer, weights[1 : len(reduction.fixed())])
+        motions[factors.size :] *= self.compliance
+        last, seen = len(table) + factors.size, rows.shape[1]
+        whole = np.zeros((len(table) + len(motions), seen + len(motions)))
+        whole[: len(table), :seen], whole[len(table) :, : answer.size] = rows, self.noise.whiten(motions)
+        root = self.prior.root
+        whole[len(table) : last, seen : seen + factors.size] = root.T
+        whole[RESIDUAL, seen : seen + factors.size] = root @ (self.prior.mean - factors)
+        whole[last:, seen + factors.size :] = np.eye(len(motions) - factors.size)
         basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
         left = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
         return left[RESIDUAL], left[GAP:]
-
-    def _others(self, factors: Array, rate: float) -> list[tuple[Response, float]]:
-        moved = [(_response(self.servo, tuple(factors + _STEP * row), rate), _STEP) for row in np.eye(factors.size)]
-        if self.compliance == 0.0:
-            return moved
-        return [*moved, (_softened(self.servo, tuple(factors), rate), _SOFT / self.compliance)]
 
     def descend(
         self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
@@ -183,37 +185,7 @@ class FreeProblem:
                     break
             else:
                 damping *= 10.0
-        return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, _covariance(rows, movable), count)
-
-
-def motion_by(reduction: Reduction, other: Response, screw: Array, weights: Array) -> Array:
-    """(m,) change of the fitted position with another response, that of the structure's free motion included.
-
-    Parameters
-    ----------
-    reduction : Reduction
-        With the fitted response.
-    other : Response
-        A little off.
-    screw : (1, n) array
-        rad, the fitted screw.
-    weights : (r,) array
-        Fitted shares of the nuisances, the constant and the free motions first. Without their change, a window that
-        begins in motion would show derivatives of the wrong size and sign.
-    """
-    forced = reduction.decimation.rows(other.respond(screw) - reduction.response.respond(screw))[0]
-    mine, samples = reduction.fixed(), reduction.theta_m.size
-    same = _same_modes(reduction.response, other)
-    theirs = reduction.decimation.rows(np.vstack([np.ones((1, samples)), same.free(samples)]))
-    return np.asarray(forced + weights[: len(mine)] @ (theirs - mine))
-
-
-def _same_modes(response: Response, other: Response) -> Response:
-    """Response with those modes of `other` that are nearest to another's; a screw that becomes soft has one more."""
-    if other.poles.size == response.poles.size:
-        return other
-    nearest = [int(np.argmin(np.abs(other.poles - pole))) for pole in response.poles]
-    return replace(other, poles=other.poles[nearest])
+        return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, rows, movable, count)
 
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
@@ -271,7 +243,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     variance = max(1.0, believed.cost / max(1, misfit.position.size))
     wide, allowed = problem.largest, BELIEVED * variance
     places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
-    order = np.argsort([misfit.cost(Point(wide, place)) for place in places], kind="stable")
+    order = np.argsort(misfit.costs([Point(wide, place) for place in places]), kind="stable")
     within = (believed.cost + _ENOUGH * allowed, believed.cost + _HOPELESS * allowed)
     fits = []
     for index in order[:_STARTS]:
@@ -315,7 +287,7 @@ def _step(residual: Array, rows: Array, movable: Array, q: Array, low: Array, hi
     return step
 
 
-def _covariance(rows: Array, movable: Array) -> Array:
+def _covariance(rows: Array, movable: Flags) -> Array:
     size = np.linalg.norm(rows, axis=1)
     use = np.flatnonzero(movable & (size > 0.0))
     covariance = np.zeros((rows.shape[0], rows.shape[0]))
@@ -327,16 +299,3 @@ def _covariance(rows: Array, movable: Array) -> Array:
         inverse = (vectors / values) @ vectors.T / np.outer(size[use], size[use])
         covariance[np.ix_(use, use)] = inverse
     return covariance
-
-
-@lru_cache(maxsize=64)
-def _response(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
-    return response(adapted(servo, np.array(factors)), rate)
-
-
-@lru_cache(maxsize=64)
-def _softened(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
-    machine = adapted(servo, np.array(factors))
-    stiffness = float(machine.stiffnesses.max())
-    soft = _SOFT + (0.0 if machine.rigid else stiffness / machine.k_d)
-    return response(machine.replace(k_d=stiffness / soft), rate)

@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_RATE, Travel, polygon
+from servotwin.estimation.core.contacts import BY_RATE, Travel
 from servotwin.estimation.core.least_squares import LeastSquares, least_squares, orthonormal, project_out, spread
-from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.reduced import ReducedResponse
+from servotwin.estimation.core.variants import variants
 from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
@@ -31,8 +32,8 @@ from servotwin.estimation.whitened.free_model import (
     FactorPrior,
     FreeProblem,
     contact_evidence,
-    motion_by,
 )
+from servotwin.estimation.whitened.nearby import Neighbour, motions
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
@@ -140,19 +141,18 @@ def model_shift(result: WhitenedFit, servo: Servo, order: int, second: float) ->
 
     Whitening takes the error of a wrong model for noise; a free model takes it up itself.
     """
-    model, reduction = result.reduction.response, result.reduction
-    polygons = polygon(reduction.theta_m, result.point.screw(0.0, reduction.rate))
-    screw = polygons[:1]
-    weights = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients
-    neighbours = _neighbours(servo, 1.0 / model.interval)
-    motions = [motion_by(reduction, other, screw, weights) / step for other, step in neighbours]
-    motions.insert(2, reduction.decimation.rows(model.respond(screw))[0])
+    model, reduction = result.reduction.reduced, result.reduction
+    screw = reduction.traced(result.point)
+    table, weights = result.table, result.shares[1 : len(reduction.fixed())]
+    answer = reduction.position - table[RESIDUAL]
+    moved = motions(model, _neighbours(servo, model), screw[:1], answer, weights)
+    free = np.insert(moved, 2, answer, axis=0)
     sizes = list(_TOLERANCES.values())
     if reduction.growth is None:
-        motions.append(reduction.decimation.rows(model.respond(polygons[BY_RATE:]))[0])
-        sizes.append(_GROWTH / second * model.interval)
-    free = np.array(motions) * np.array(sizes)[:, None]
-    table, size = np.vstack([reduction.table(result.point), free]), len(free)
+        free = np.vstack([free, model.respond(screw[BY_RATE:])])
+        sizes.append(_GROWTH / second * model.response.interval)
+    free *= np.array(sizes)[:, None]
+    table, size = np.vstack([table, free]), len(free)
     shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
     noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
     rows = reduction.prepared(noise, table, CONSTANT)
@@ -186,16 +186,15 @@ def _words(shares: Array, deviations: Array, second: float) -> str:
 
 
 @lru_cache(maxsize=32)
-def _neighbours(servo: Servo, sample_rate: float) -> tuple[tuple[Response, float], ...]:
-    """Responses a step away from a servo's in stiffness, damping and the screw's compliance (of the structure's)."""
-    stiffer = servo.replace(k=tuple((1.0 + _STEP) * servo.stiffnesses))
-    damped = servo.replace(c=tuple((1.0 + _STEP) * servo.dampings))
-    stiffness = float(servo.stiffnesses.max())
-    soft = 1.0 / _STIFF if servo.rigid else stiffness / servo.k_d * (1.0 + _STEP)
-    softer = servo.replace(k_d=stiffness / soft)
-    step = soft - (0.0 if servo.rigid else stiffness / servo.k_d)
-    pairs = ((stiffer, _STEP), (damped, _STEP), (softer, step))
-    return tuple((response(other, sample_rate), size) for other, size in pairs)
+def _neighbours(servo: Servo, model: ReducedResponse) -> tuple[Neighbour, ...]:
+    """Neighbours of a servo's response in stiffness, damping and the screw's compliance (of the structure's)."""
+    rate, stiffness = 1.0 / model.response.interval, float(servo.stiffnesses.max())
+    own = 0.0 if servo.rigid else stiffness / servo.k_d
+    soft = 1.0 / _STIFF if servo.rigid else own * (1.0 + _STEP)
+    stiffer, damped = variants(servo, list(math.log1p(_STEP) * np.eye(4)[:2]), rate)
+    (softer,) = variants(servo, [np.zeros(4)], rate, [stiffness / soft])
+    steps = ((stiffer, _STEP), (damped, _STEP), (softer, soft - own))
+    return tuple(Neighbour.of(model, other, step, row) for row, (other, step) in enumerate(steps))
 
 
 def observer_shift(result: WhitenedFit, servo: Servo, second: float) -> tuple[float, float]:
@@ -207,9 +206,8 @@ def observer_shift(result: WhitenedFit, servo: Servo, second: float) -> tuple[fl
     interval, alpha = reduction.response.interval * reduction.decimation.factor, _ALPHA / second
     model = observer(servo, alpha)
     weight = LagFilter.sampled(model.denominator, model.order, alpha, interval)
-    table = reduction.table(result.point)
-    rows = np.array([weight.respond(row) for row in table])
-    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, alpha * interval, table.shape[1])]))
+    rows = np.array([weight.respond(row) for row in result.table])
+    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, alpha * interval, rows.shape[1])]))
     left = project_out(basis, rows[[RESIDUAL, GAP]])
     information = float(left[1] @ left[1])
     if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
@@ -355,8 +353,8 @@ def _growing(result: WhitenedFit) -> str:
     reduction = result.reduction
     if reduction.growth is None:
         return ""
-    left = least_squares(result.rows[CONSTANT:], result.rows[RESIDUAL]).coefficients[len(reduction.fixed())]
-    rate, assumed = reduction.rate + float(left), _SIGMAS * reduction.growth.std
+    left = float(result.shares[len(reduction.fixed())])
+    rate, assumed = reduction.rate + left, _SIGMAS * reduction.growth.std
     if abs(rate) <= assumed:
         return ""
     per_s = 1.0 / reduction.response.interval

@@ -65,7 +65,7 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
     """
     reduction = _slow(window, servo, offset)
     misfit, span = reduction.coarse(), float(np.ptp(reduction.theta_m))
-    costs = [misfit.cost(Point(gap, place)) for place in PLACES]
+    costs = misfit.costs([Point(gap, place) for place in PLACES])
     start = Point(gap, PLACES[int(np.argmin(costs))])
     both = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
     # Where noise hides the place, its steps are wild and keep the gap from its minimum.

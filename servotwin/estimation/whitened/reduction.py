@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_RATE, Gap, polygon, trace
+from servotwin.estimation.core.contacts import BY_RATE, Gap, polygon
 from servotwin.estimation.core.decimation import Decimation, decimation
-from servotwin.estimation.core.least_squares import least_squares, orthonormal, remove
+from servotwin.estimation.core.least_squares import least_squares, orthonormal
+from servotwin.estimation.core.reduced import ReducedResponse, reduced_response
 from servotwin.estimation.core.response import Response
 from servotwin.estimation.core.whitening import Autoregression
-from servotwin.hybrid.compiled import bare
+from servotwin.estimation.whitened.descent import MisfitData, Room, evaluate_all, mix_places
 from servotwin.plant.signals import Array
 
 
@@ -48,8 +50,7 @@ class Misfit:
         Reduced like everything else.
     basis : (r, m) array
         Orthonormal nuisances.
-    response : Response
-    decimation : Decimation
+    reduced : ReducedResponse
     noise : Autoregression, optional
         None: not whitened.
     extra : int
@@ -61,46 +62,39 @@ class Misfit:
     theta_m: Array
     position: Array
     basis: Array
-    response: Response
-    decimation: Decimation
+    reduced: ReducedResponse
     noise: Autoregression | None = None
     extra: int = 0
     rate: float = 0.0
 
-    def reduce(self, columns: Array) -> Array:
-        """(k, m) of rows (k, n) at the full rate."""
-        rows = self.decimation.rows(columns)
-        rows = rows if self.noise is None else self.noise.whiten(rows)
-        return np.hstack([rows, np.zeros((len(rows), self.extra))]) if self.extra else rows
+    @cached_property
+    def data(self) -> MisfitData:
+        """The same for compiled functions."""
+        readout, blocks = self.reduced.response.position, self.reduced.position
+        noise = self.noise or Autoregression.white(1.0)
+        return MisfitData(
+            self.theta_m,
+            self.position,
+            self.basis,
+            self.reduced.response.decay,
+            readout.gain,
+            readout.direct,
+            *(3 * (np.empty((0, 0)),) if blocks is None else (blocks.angles, blocks.decay, blocks.gain)),
+            noise.predictors,
+            noise.spread,
+            self.rate,
+        )
 
-    def cost(self, point: Point) -> float:
-        """Squared length of the residual."""
-        screw = np.empty((1, self.theta_m.size))
-        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
-        row = self.position - self.reduce(self.response.respond(screw))[0]
-        remove(self.basis, len(self.basis), row)
-        return float(row @ row)
+    @cached_property
+    def room(self) -> Room:
+        """Memory of its evaluations."""
+        return Room.of(self.data, self.position.size - self.extra)
 
-    def slopes(self, point: Point) -> MisfitSlopes:
-        """Residual and derivatives at a point."""
-        screw = np.empty((4, self.theta_m.size))
-        trace(self.theta_m, *point.screw(self.theta_m[0], self.rate), screw)
-        mix_places(screw, point.gap, point.place)
-        rows = self.reduce(self.response.respond(screw[:3]))
-        rows[0] -= self.position
-        for row in rows:
-            remove(self.basis, len(self.basis), row)
-        np.negative(rows, out=rows)
-        return MisfitSlopes(rows[0], rows[1:], float(rows[0] @ rows[0]))
-
-
-@bare
-def mix_places(seen: Array, gap: float, place: float) -> None:
-    """Turn derivatives by gap at fixed theta_d0, and by theta_d0, into those by gap at fixed place, and by place."""
-    half = 0.5 * gap
-    for i in range(seen.shape[1]):
-        seen[1, i] += 0.5 * place * seen[2, i]
-        seen[2, i] *= half
+    def costs(self, points: Sequence[Point]) -> Array:
+        """(k,) squared lengths of the residual at points."""
+        costs = np.empty(len(points))
+        evaluate_all(self.data, self.room, np.array(points, dtype=float), costs)
+        return costs
 
 
 RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's free motions come next
@@ -170,18 +164,30 @@ class Reduction:
         rounding = _ROUNDING * largest
         return cls(theta_m - theta_m[0], rows[0], model, reduce, offset, growth, skew, rounding=rounding)
 
+    @property
+    def reduced(self) -> ReducedResponse:
+        """Response and decimation in one."""
+        return reduced_response(self.response, self.decimation)
+
     def fixed(self) -> Array:
         """(r, m) nuisances that do not depend on the gap: the constant, the free motions."""
-        return _fixed(self.response, self.decimation, self.theta_m.size)
+        return _fixed(self.reduced, self.theta_m.size)
+
+    def traced(self, point: Point) -> Array:
+        """(4, n) screw's angle and its derivatives by gap, place and rate."""
+        screw = polygon(self.theta_m, point.screw(0.0, self.rate))
+        mix_places(screw, point.gap, point.place)
+        return screw
 
     def table(self, point: Point) -> Array:
         """(k, m) residual, derivatives of the response by gap and place, nuisances; not whitened."""
-        screw = polygon(self.theta_m, point.screw(0.0, self.rate))
-        mix_places(screw, point.gap, point.place)
-        rows = self.response.respond(screw if self.growth else screw[:BY_RATE])
-        rows = np.vstack([rows, self.response.velocities(screw[:1])]) if self.skew else rows
-        moving = self.decimation.rows(rows)
-        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:]])
+        return self.tabulated(self.traced(point))
+
+    def tabulated(self, screw: Array) -> Array:
+        """`table` for a screw's angle with its derivatives (4, n)."""
+        moving = self.reduced.respond(screw if self.growth else screw[:BY_RATE])
+        late = [self.reduced.velocities(screw[:1])] if self.skew else []
+        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:], *late])
 
     def prepared(self, noise: Autoregression, rows: Array, first: int) -> Array:
         """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
@@ -205,8 +211,8 @@ class Reduction:
         """
         fixed = self.fixed()
         known = 0.0 if self.offset is None else self.offset.mean * fixed[0]
-        basis = _fixed_basis(self.response, self.decimation, self.theta_m.size, self.offset is None)
-        return Misfit(self.theta_m, self.position - known, basis, self.response, self.decimation, rate=self.rate)
+        basis = _fixed_basis(self.reduced, self.theta_m.size, self.offset is None)
+        return Misfit(self.theta_m, self.position - known, basis, self.reduced, rate=self.rate)
 
     def misfit(self, noise: Autoregression, point: Point) -> Misfit:
         """The misfit in noise of a known kind, its nuisances taken at a point."""
@@ -215,9 +221,9 @@ class Reduction:
         rows = self.prepared(noise, np.delete(table, [GAP, PLACE], axis=0), 1)
         extra = rows.shape[1] - self.position.size
         basis = orthonormal(rows[1:])
-        return Misfit(self.theta_m, rows[0], basis, self.response, self.decimation, noise, extra, self.rate)
+        return Misfit(self.theta_m, rows[0], basis, self.reduced, noise, extra, self.rate)
 
-    def growing(self, noise: Autoregression, point: Point) -> Reduction:
+    def growing(self, noise: Autoregression, table: Array) -> Reduction:
         """Follow the screw at the rate of growth that a point and a noise make likely.
 
         The rate is linear only as long as no contact comes or goes with it: a motor that holds still in contact holds
@@ -225,20 +231,21 @@ class Reduction:
         """
         if self.growth is None:
             return self
-        rows = self.prepared(noise, self.table(point), CONSTANT)
+        rows = self.prepared(noise, table, CONSTANT)
         shares = least_squares(rows[GAP:], rows[RESIDUAL]).coefficients[CONSTANT - GAP :]
         most = _MOST_GROWTH * self.growth.std
         return replace(self, rate=min(max(self.rate + float(shares[len(self.fixed())]), -most), most))
 
 
 @lru_cache(maxsize=32)
-def _fixed(model: Response, reduce: Decimation, samples: int) -> Array:
-    return reduce.rows(np.vstack([np.ones((1, samples)), model.free(samples)]))
+def _fixed(model: ReducedResponse, samples: int) -> Array:
+    free = model.free(samples)
+    return np.vstack([np.ones((1, free.shape[1])), free])
 
 
 @lru_cache(maxsize=32)
-def _fixed_basis(model: Response, reduce: Decimation, samples: int, constant: bool) -> Array:
-    return orthonormal(_fixed(model, reduce, samples)[0 if constant else 1 :])
+def _fixed_basis(model: ReducedResponse, samples: int, constant: bool) -> Array:
+    return orthonormal(_fixed(model, samples)[0 if constant else 1 :])
 
 
 def factor_for(model: Response, samples: int) -> int:

@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, contacts
+from servotwin.estimation.whitened.descent import Limits, descend_from
 from servotwin.estimation.whitened.reduction import Misfit, MisfitSlopes, Point
 from servotwin.plant.signals import Array
 
 _SHORT = 20  # steps of a descent that only looks whether there is something lower
-_FIRST_DAMPING, _LARGEST_DAMPING, _FLOOR, _GAIN = 1e-3, 1e10, 1e-12, 1e-8
+_GAIN = 1e-8
 _ROUGH = 1e-6  # of the cost: a gain that decides between minima, not where one lies; some valleys are long and flat
 
 
@@ -56,51 +57,12 @@ def descend(
     It ends when a step moves the gap, and the screw's start, by less than `tolerance` (rad), or promises less than the
     part `gain` of the cost. What is not `free` keeps its value.
     """
-    point, here, damping = start, misfit.slopes(start), _FIRST_DAMPING
-    for count in range(1, steps):
-        step = _step(here, point, damping, largest, free)
-        trial = _bounded(point, step, largest)
-        if _distance(point, trial) <= tolerance or _promise(here, point, trial) <= gain * here.cost:
-            return SearchResult(point, here, count, True)
-        ahead = misfit.slopes(trial)
-        if ahead.cost < here.cost:
-            # Levenberg-Marquardt: closer to Gauss-Newton after a success, shorter and steeper steps after a failure.
-            point, here, damping = trial, ahead, max(0.1 * damping, 1e-9)
-        else:
-            damping = 8.0 * damping
-            if damping > _LARGEST_DAMPING:
-                return SearchResult(point, here, count + 1, True)
-    return SearchResult(point, here, steps, False)
-
-
-def _step(here: MisfitSlopes, point: Point, damping: float, largest: float, free: Free) -> tuple[float, float]:
-    """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
-    J = here.jacobian
-    a, b, c = float(J[0] @ J[0]), float(J[0] @ J[1]), float(J[1] @ J[1])
-    g, h = -float(J[0] @ here.residual), -float(J[1] @ here.residual)
-    gap_free = free.gap and not ((point.gap <= 0.0 and g < 0.0) or (point.gap >= largest and g > 0.0))
-    place_free = free.place and not ((point.place <= -1.0 and h < 0.0) or (point.place >= 1.0 and h > 0.0)) and c > 0.0
-    a, c = a * (1.0 + damping), c * (1.0 + damping)
-    # Where gap and place act alike the determinant is rounding: each then steps by itself.
-    if gap_free and place_free and a * c - b * b > _FLOOR * a * c:
-        determinant = a * c - b * b
-        return (c * g - b * h) / determinant, (a * h - b * g) / determinant
-    return (g / a if gap_free and a > 0.0 else 0.0), (h / c if place_free else 0.0)
-
-
-def _promise(here: MisfitSlopes, point: Point, trial: Point) -> float:
-    """Predict the decrease of the cost by a step, for a linear residual."""
-    change = (trial.gap - point.gap) * here.jacobian[0] + (trial.place - point.place) * here.jacobian[1]
-    return -float(change @ (2.0 * here.residual + change))
-
-
-def _bounded(point: Point, step: tuple[float, float], largest: float) -> Point:
-    return Point(min(max(point.gap + step[0], 0.0), largest), min(max(point.place + step[1], -1.0), 1.0))
-
-
-def _distance(one: Point, other: Point) -> float:
-    """rad: how far two points are apart, the place counted as an angle of the screw."""
-    return max(abs(one.gap - other.gap), 0.5 * other.gap * abs(one.place - other.place))
+    rows = np.empty((3, misfit.position.size))
+    # Plain numbers: a compiled version is made for every other combination of types.
+    limits = Limits(float(largest), float(tolerance), steps, gain, (free.gap, free.place))
+    end = descend_from(misfit.data, misfit.room, float(start.gap), float(start.place), limits, rows)
+    slopes = MisfitSlopes(rows[0], rows[1:], end.cost)
+    return SearchResult(Point(end.gap, end.place), slopes, end.evaluations, end.converged)
 
 
 def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: float) -> list[SearchResult]:
@@ -109,13 +71,9 @@ def search(misfit: Misfit, gaps: Sequence[float], largest: float, tolerance: flo
     First the gap alone descends. From where the screw rests for long, gap and place move it alike, and nothing leads
     back to where it does not rest: the place must not go there early.
     """
-    best: list[tuple[float, Point]] = []
-    for place in PLACES:
-        points = [Point(gap, place) for gap in gaps]
-        costs = [misfit.cost(point) for point in points]
-        lowest = int(np.argmin(costs))
-        best.append((costs[lowest], points[lowest]))
-    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, _ROUGH) for _, point in best]
+    costs = misfit.costs([Point(gap, place) for place in PLACES for gap in gaps]).reshape(len(PLACES), -1)
+    best = [Point(gaps[lowest], place) for place, lowest in zip(PLACES, np.argmin(costs, axis=1), strict=True)]
+    near = [descend(misfit, point, largest, tolerance, 12, GAP_ONLY, _ROUGH) for point in best]
     return [continued(misfit, fit, largest, tolerance) for fit in near]
 
 
@@ -146,7 +104,7 @@ def off_the_plateau(misfit: Misfit, fit: SearchResult, largest: float, tolerance
     difference, nothing leads away from there, and a place that makes one may lie beyond.
     """
     points = [fit.point._replace(place=place) for place in _ROUND]
-    costs = [misfit.cost(point) for point in points]
+    costs = misfit.costs(points)
     lowest = int(np.argmin(costs))
     if not costs[lowest] < (1.0 - _LOWER) * fit.slopes.cost:
         return fit

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,15 @@ class MachineMeasures:
         return self.at_rest & (self.tail <= self.near)
 
 
-def assess(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[MachineMeasures]:
+def joined(first: MachineMeasures, second: MachineMeasures) -> MachineMeasures:
+    """Measures of machines that were simulated in two parts."""
+    names = [each.name for each in fields(MachineMeasures)]
+    return MachineMeasures(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
+
+
+def assess(
+    settings: Sequence[Design], members: SimulatedMachines, trial: Trial, largest: float | None = None
+) -> list[MachineMeasures]:
     """Simulate every setting on every machine, exactly; the reference steps once from rest.
 
     Parameters
@@ -88,12 +96,15 @@ def assess(settings: Sequence[Design], members: SimulatedMachines, trial: Trial)
         All continuous, or all sampled.
     members : SimulatedMachines
     trial : Trial
+    largest : float, optional
+        m, the step whose `nearness` counts for settling; that of these machines by default.
     """
     laws = np.empty((len(settings), 1, 1), dtype=object)
     laws[:, 0, 0] = [setting.simulated.controller for setting in settings]
     plants = np.empty((len(members.plants), 1), dtype=object)
     plants[:, 0] = members.plants
-    near = np.stack([nearness(setting, members, members.step.max()) for setting in settings])
+    largest = float(members.step.max()) if largest is None else largest
+    near = np.stack([nearness(setting, members, largest) for setting in settings])
     figures = _figures(laws, plants, np.array([setting.tolerance for setting in settings]), members, near, trial)
     # The voltage of a saturated machine equals its limit exactly, so that reaching it is what counts.
     limits = [setting.controller.voltage_limit or math.inf for setting in settings]
@@ -127,7 +138,7 @@ def _figures(
         return summarise_members(
             plants, laws, trial.duration, cases, trial.last, limits, outputs, trial.rate, trial.threads
         )
-    sampled = SampledCases(*cases, delay=members.delay, resolution=members.plants[0].position_resolution)
+    sampled = SampledCases(*cases, delay=members.delay, resolution=members.model.position_resolution)
     return summarise_sampled(
         plants, laws, trial.duration, sampled, trial.last, limits, outputs, trial.rate, trial.threads
     )
@@ -135,9 +146,9 @@ def _figures(
 
 def stillness(members: SimulatedMachines) -> Array:
     """(P, C) m, half peak-to-peak of the error below which a loop has come to rest: by step, lost motion and sensor."""
-    lost = members.plants[0].p * members.gap
+    lost = members.model.p * members.gap
     moved = np.clip(_STILL_GAP * lost, _STILL_LEAST * members.step, _STILL_STEP * members.step)
-    return np.asarray(moved + COUNTS * members.plants[0].position_resolution)
+    return np.asarray(moved + COUNTS * members.model.position_resolution)
 
 
 def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -> Array:
@@ -146,7 +157,7 @@ def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -
     It is 2 % of the step, plus the error that input bias and friction leave where nothing integrates, plus the dead
     zone and two counts of the sensor.
     """
-    model = members.plants[0]
+    model = members.model
     return left_over(setting, model, members.input_bias, members.friction, step)
 
 

@@ -185,6 +185,8 @@ class SimulatedMachines:
     plants : tuple of P Servo
     gap, step, input_bias, theta_d0, friction, delay : (P, C) array
         rad, m, V, rad, N m, samples.
+    whole : SimulatedMachines, optional
+        Those that these are a part of.
     """
 
     plants: tuple[Servo, ...]
@@ -194,11 +196,23 @@ class SimulatedMachines:
     theta_d0: Array
     friction: Array
     delay: Array
+    whole: SimulatedMachines | None = None
+
+    @property
+    def model(self) -> Servo:
+        """The servo in whose units errors are judged: the first of all machines."""
+        return self.plants[0] if self.whole is None else self.whole.model
 
     @property
     def count(self) -> int:
         """Number of machines."""
         return self.gap.size
+
+    def part(self, first: int, last: int) -> SimulatedMachines:
+        """Machines of some of the plants."""
+        names = ("gap", "step", "input_bias", "theta_d0", "friction", "delay")
+        conditions = {name: getattr(self, name)[first:last] for name in names}
+        return SimulatedMachines(self.plants[first:last], **conditions, whole=self)
 
 
 def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> SimulatedMachines:

@@ -144,8 +144,8 @@ def cost(window: Window, model: Response) -> tuple[Array, Array, Array]:
     assert window.theta_m is not None
     misfit = Reduction.of(window.theta_m, window.position, model).coarse()
     gaps, places = np.meshgrid(np.linspace(0.0, _WIDEST, GAPS), np.linspace(-1.0, 1.0, PLACES))
-    points = zip(gaps.ravel().tolist(), places.ravel().tolist(), strict=True)
-    squares = np.array([misfit.cost(Point(gap, place)) for gap, place in points]).reshape(gaps.shape)
+    points = [Point(*pair) for pair in zip(gaps.ravel().tolist(), places.ravel().tolist(), strict=True)]
+    squares = misfit.costs(points).reshape(gaps.shape)
     return gaps, 0.5 * gaps * places, np.sqrt(squares / misfit.position.size)
 
 

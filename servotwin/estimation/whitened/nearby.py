@@ -1,0 +1,123 @@
+"""A machine's reduced response, and the motions by which the position changes with each of the machine's numbers.
+
+The motions are difference quotients of the exact responses, that of the free motion included: without its change, a
+window that begins in motion would show derivatives of the wrong size and sign.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from servotwin.estimation.core.decimation import Decimation
+from servotwin.estimation.core.reduced import ReducedResponse, free_motions, reduced_response
+from servotwin.estimation.core.response import Complex, Response
+from servotwin.estimation.core.variants import variants
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+PITCH, RATIO = 2, 3  # of the factors
+STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
+SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A response with one number a step away.
+
+    Attributes
+    ----------
+    reduced : ReducedResponse
+    poles : (modes,) complex array
+        1/s, each next to that of the machine: a screw that becomes soft has one more.
+    step : float
+        Of the number.
+    row : int
+        Index of the number.
+    """
+
+    reduced: ReducedResponse
+    poles: Complex
+    step: float
+    row: int
+
+    @classmethod
+    def of(cls, model: ReducedResponse, other: Response, step: float, row: int) -> Neighbour:
+        """Join another response to that of a machine."""
+        mine, theirs = model.response.poles, other.poles
+        if theirs.size != mine.size:
+            theirs = theirs[np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1)]
+        return cls(ReducedResponse.of(other, model.decimation), theirs, step, row)
+
+
+def motions(model: ReducedResponse, others: Sequence[Neighbour], screw: Array, answer: Array, weights: Array) -> Array:
+    """(others, m) changes of the fitted position per step to each neighbour.
+
+    Parameters
+    ----------
+    model : ReducedResponse
+    others : sequence of Neighbour
+    screw : (1, n) array
+        rad, the fitted screw.
+    answer : (m,) array
+        The model's response to it.
+    weights : (2 modes,) array
+        Fitted shares of the free motions.
+    """
+    modes, samples = model.response.poles.size, screw.shape[1]
+    shares = weights[:modes].astype(complex)
+    shares[np.abs(model.response.poles.imag) > 0.0] -= 1j * weights[modes:]
+    poles: Complex = np.concatenate([model.response.poles, *(other.poles for other in others)])
+    free = free_motions(poles * model.response.interval, model.decimation, samples)
+    changes = (shares @ free.reshape(1 + len(others), modes, -1)).real
+    moved = [
+        (other.reduced.respond(screw)[0] - answer + change - changes[0]) / other.step
+        for other, change in zip(others, changes[1:], strict=True)
+    ]
+    return np.array(moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """A machine with its neighbours in the factors, and in the screw's compliance if that is free.
+
+    Attributes
+    ----------
+    model : ReducedResponse
+    others : tuple of Neighbour
+        The compliance last; none for the pitch, with which only the size of the response changes, nor for the mass
+        ratio of two masses.
+    count : int
+        Numbers that are free.
+    """
+
+    model: ReducedResponse
+    others: tuple[Neighbour, ...]
+    count: int
+
+    def motions(self, screw: Array, answer: Array, weights: Array) -> Array:
+        """(count, m) derivatives of the fitted position; arguments as of `motions`."""
+        out = np.zeros((self.count, answer.size))
+        out[[other.row for other in self.others]] = motions(self.model, self.others, screw, answer, weights)
+        out[PITCH] = math.expm1(STEP) / STEP * answer
+        return out
+
+
+@lru_cache(maxsize=64)
+def nearby(servo: Servo, factors: tuple[float, ...], rate: float, reduce: Decimation, soft: bool) -> Nearby:
+    """Responses around a servo with other logarithms of its factors, at a sample rate (Hz), decimated."""
+    here = np.array(factors)
+    moved = [row for row in range(here.size) if row != PITCH and (row != RATIO or servo.n > 2)]
+    first, *others = variants(servo, [here, *(here + STEP * np.eye(here.size)[row] for row in moved)], rate)
+    model = reduced_response(first, reduce)
+    neighbours = [Neighbour.of(model, other, STEP, row) for other, row in zip(others, moved, strict=True)]
+    if soft:
+        stiffness = math.exp(here[0]) * float(servo.stiffnesses.max())
+        compliance = SOFT + (0.0 if servo.rigid else stiffness / servo.k_d)
+        softened = variants(servo, [here], rate, [stiffness / compliance])[0]
+        neighbours.append(Neighbour.of(model, softened, SOFT, here.size))
+    return Nearby(model, tuple(neighbours), here.size + soft)

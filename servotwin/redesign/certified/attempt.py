@@ -1,0 +1,249 @@
+"""Verification of one setting, in parts: what is cheap and refuses most comes first, and each part is computed once."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, joined, left_over
+from servotwin.redesign.certified.bounds import share_at_least
+from servotwin.redesign.certified.certificate import (
+    BeyondResult,
+    Certificate,
+    Demands,
+    LoopMargins,
+    RampResult,
+)
+from servotwin.redesign.certified.margins import margins_in_every_zone, unfed, widened
+from servotwin.redesign.certified.tracking import follow_ramp
+from servotwin.redesign.certified.trial import Trial
+from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
+from servotwin.redesign.design import Design
+
+# Where the band of measurement noise begins and ends, in units of 1 / Tf: well above the crossover, and where a sampled
+# loop of that speed has half its rate.
+_NOISE_BAND = (6.0, 1600.0)
+# The error that an input bias leaves is the same number on every plant, but for rounding.
+ROUNDED = 1.0 + 1e-6
+
+# Machines that are simulated before the rest: a setting that leaves some of the gaps oscillating shows it on them.
+_FIRST = 75
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a setting is to be verified for: the model and its uncertainty, demands, simulations, noise (m rms)."""
+
+    servo: Servo
+    uncertainty: Uncertainty
+    demands: Demands
+    trial: Trial
+    noise: float
+
+    def shortcoming(self, tried: Certificate) -> str:
+        """Name the demand that is not met; empty where all are met."""
+        demands, loop = self.demands, tried.loop
+        assert loop is not None
+        if missing := margins_missing(loop, tried.rate, demands):
+            return missing
+        if tried.crossover == 0.0:
+            return "has no gain crossover: its loop gain is below one at every frequency"
+        if tried.settled_least < demands.settled:
+            return (
+                f"settles on {100.0 * tried.settled:.1f} % of {tried.members} simulated machines, so that with "
+                f"{100.0 * tried.confidence:g} % confidence at least {100.0 * tried.settled_least:.1f} % settle, and "
+                f"{100.0 * demands.settled:g} % are demanded"
+            )
+        allowed = self.largest_error(tried.setting)
+        if tried.tail > ROUNDED * allowed:
+            return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * allowed:.3g} mm are allowed"
+        if tried.overshoot > demands.overshoot:
+            return f"overshoots by {100.0 * tried.overshoot:.0f} %, and {100.0 * demands.overshoot:.0f} % are allowed"
+        if tried.ramp is not None and tried.ramp.settled < 1.0:
+            share = 100.0 * tried.ramp.settled
+            return f"settles after a ramp and its reversal on {share:.0f} % of {tried.ramp.machines} machines only"
+        if tried.beyond is not None and tried.beyond.settled < 1.0:
+            share = 100.0 * tried.beyond.settled
+            return f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only"
+        return ""
+
+    def largest_error(self, setting: Design) -> float:
+        """m, that may be left in the end."""
+        sensor = setting.controller.leave * setting.tolerance + COUNTS * self.servo.position_resolution
+        return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor)
+
+    def cost(self, setting: Design, measures: MachineMeasures) -> float:
+        """s: 95th percentile of the error's integral per step, plus the price of the noise."""
+        return float(np.percentile(measures.cost, 95.0)) + self._price(setting)
+
+    def _price(self, setting: Design) -> float:
+        """s, price of the noise in the voltage."""
+        law = setting.controller
+        if not self.noise:
+            return 0.0
+        begin, end = (edge / (2.0 * math.pi * self.servo.controller.Tf) for edge in _NOISE_BAND)
+        end = end if law.sample_rate is None else 0.5 * law.sample_rate
+        effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
+        authority = abs(self.servo.controller.Kp) * self.uncertainty.step[1]
+        return self.demands.effort_weight * self.trial.unit * effort / authority
+
+
+class Attempt:
+    """One setting, verified on machines drawn for it alone."""
+
+    def __init__(self, question: Question, setting: Design) -> None:
+        self.question, self.setting = question, setting
+        self._seed = _seed(question.servo, question.uncertainty, setting, question.demands.seed)
+
+    def cannot_pass(self) -> bool:
+        """True where a part shows already that the certificate would not meet the demands."""
+        question, demands = self.question, self.question.demands
+        law, allowed = self.setting.controller, question.largest_error(self.setting)
+        if margins_missing(self._loop, law.sample_rate, demands) or self._loop.crossover == 0.0:
+            return True
+        few = self._first
+        most = demands.machines - int(np.sum(~few.settled))
+        if share_at_least(most, demands.machines, demands.confidence) < demands.settled:
+            return True
+        if few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot:
+            return True
+        if self._ramp.settled < 1.0:
+            return True
+        return self._beyond is not None and self._beyond.settled < 1.0
+
+    def certificate(self) -> Certificate:
+        """Certificate of the setting, whether or not it meets the demands."""
+        question, setting, loop = self.question, self.setting, self._loop
+        demands, known, members, law = question.demands, question.uncertainty, self._members, unfed(setting.controller)
+        measures = self._first if self._rest is None else joined(self._first, self._rest)
+        settled = int(measures.settled.sum())
+        ends = (np.array(known.input_bias), np.array(known.friction), known.step[1])
+        return Certificate(
+            setting=setting,
+            gap=known.gap,
+            input_bias=known.input_bias,
+            step=known.step,
+            friction=known.friction,
+            members=members.count,
+            settled=settled / members.count,
+            cost=question.cost(setting, measures),
+            tail=float(measures.tail.max()),
+            tail_p95=float(np.percentile(measures.tail, 95.0)),
+            error_rms=float(measures.error_rms.max()),
+            effort=float(measures.effort.max()),
+            overshoot=float(measures.overshoot.max()),
+            settling=float(np.percentile(measures.settling, 95.0)),
+            settling_worst=float(measures.settling.max()),
+            within=float(np.max(left_over(setting, question.servo, *ends))),
+            Ms=loop.Ms,
+            crossover=loop.crossover,
+            phase_margin=loop.phase_margin,
+            saturated=bool(measures.saturated.any()),
+            looked_at=0,
+            seconds=0.0,
+            settled_least=share_at_least(settled, members.count, demands.confidence),
+            confidence=demands.confidence,
+            loop=loop,
+            beyond=self._beyond,
+            ramp=self._ramp,
+            rate=law.sample_rate,
+            delay=0 if law.sample_rate is None else known.delay,
+            error_per_volt=0.0 if law.Ki else 1.0 / abs(law.Kp),
+            lag=_lag(question.servo, law),
+        )
+
+    @cached_property
+    def _loop(self) -> LoopMargins:
+        question = self.question
+        known = widened(question.uncertainty, question.demands)
+        return margins_in_every_zone(question.servo, known, self.setting.controller)
+
+    @cached_property
+    def _members(self) -> SimulatedMachines:
+        question = self.question
+        return draw_independently(question.servo, question.uncertainty, question.demands.machines, self._seed)
+
+    @cached_property
+    def _first(self) -> MachineMeasures:
+        return self._measured(0, _FIRST)
+
+    @cached_property
+    def _rest(self) -> MachineMeasures | None:
+        return self._measured(_FIRST, self._members.count) if self._members.count > _FIRST else None
+
+    def _measured(self, first: int, last: int) -> MachineMeasures:
+        members = self._members
+        largest = float(members.step.max())
+        return assess([self.setting], members.part(first, last), self.question.trial, largest)[0]
+
+    @cached_property
+    def _ramp(self) -> RampResult:
+        question = self.question
+        return follow_ramp(question.servo, question.uncertainty, self.setting, question.trial, question.demands.seed)
+
+    @cached_property
+    def _beyond(self) -> BeyondResult | None:
+        """Result in the ranges that nobody stated."""
+        question = self.question
+        beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
+        if beyond.machines == 0:
+            return None
+        force = beyond.friction * abs(servo.controller.Kp) * known.step[0] * servo.k_T / servo.R
+        force = max(known.friction[1], force) if servo.rigid else known.friction[1]
+        wide = widened(known, question.demands)
+        ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
+        members = draw_independently(servo, ranges, beyond.machines, self._seed + 1)
+        (measures,) = assess([self.setting], members, question.trial)
+        return BeyondResult(
+            k_T=wide.k_T,
+            delay=wide.delay,
+            friction=force,
+            machines=members.count,
+            settled=float(np.mean(measures.at_rest)),
+            tail=float(measures.tail.max()),
+        )
+
+
+def with_feedforward(setting: Design, feedforward: float) -> Design:
+    """The setting with another feedforward, V."""
+    return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)
+
+
+def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> str:
+    """Name the demand on margins that is not met; empty where all are met."""
+    at = "" if rate is None else f" at {rate:g} Hz with up to {loop.delay} samples of delay"
+    if not math.isfinite(loop.Ms_worst):
+        return f"is unstable{at} on a plant of the stated ranges even without a gap"
+    if loop.Ms > ROUNDED * demands.Ms:
+        return f"has Ms = {loop.Ms:.3g} on the model, and {demands.Ms:g} is allowed"
+    if loop.Ms_worst > ROUNDED * demands.Ms_worst:
+        return f"has Ms = {loop.Ms_worst:.3g}{at} on a plant of the stated ranges, and {demands.Ms_worst:g} is allowed"
+    return ""
+
+
+def _lag(servo: Servo, law: Controller) -> float:
+    """s: steady error behind a ramp, per speed; the motor integrates, so a law without integral action lags."""
+    if law.Ki:
+        return 0.0
+    plant = servo.plant()
+    corners = np.abs(plant.poles())
+    slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
+    return 1.0 / (abs(law.Kp) * slow * float(np.abs(plant.response(slow))))
+
+
+def _seed(servo: Servo, uncertainty: Uncertainty, setting: Design, seed: int) -> int:
+    """Seed that depends on the whole question: equal ones are answered equally, others by other machines.
+
+    A feedforward counts by what it leaves of the bias.
+    """
+    fed = setting.controller.feedforward
+    left = [f"{bias + fed:.9g}" for bias in uncertainty.input_bias]
+    rest = with_feedforward(setting, 0.0), uncertainty.replace(input_bias=(0.0, 0.0))
+    question = repr((servo.version, rest, left, seed))
+    return int.from_bytes(hashlib.sha256(question.encode()).digest()[:7], "big")
