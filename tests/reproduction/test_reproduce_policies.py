@@ -52,10 +52,14 @@ def test_only_the_policy_differs():
 
 
 @pytest.mark.slow
-def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_does_not(outcomes):
+def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_takes_most_of_it(outcomes):
     certified, alone = outcomes["certified"], outcomes[ALONE]
     assert certified.steps[1].error < 1e-6
-    assert alone.steps[1].error == pytest.approx(0.05 / certified.run.changes[0].gains.Kp, rel=0.02)
+    # Its integral stops in a zone about the reference; without integral action the error is Kp's share of the bias.
+    start = certified.run.changes[0]
+    assert start.gains.integral_only
+    zone = start.gains.leave * start.tolerance
+    assert certified.steps[1].error < alone.steps[1].error < zone < 0.25 * 0.05 / start.gains.Kp
     assert certified.run.changes[-1].gains.feedforward == pytest.approx(-0.05, abs=2e-4)
     assert not outcomes["paper"].steps[1].settled
 
