@@ -234,6 +234,23 @@ def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_fr
     )
 
 
+@pytest.mark.parametrize(("share", "stays"), [(0.98, True), (0.5, False)])
+def test_a_running_setting_that_is_hardly_dearer_stays(share: float, stays: bool) -> None:
+    policy = CertifiedPolicy(SERVO, Uncertainty(), replace(SMALL, scales=(0.5, 0.7)))
+    gap, spread = 10.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    best = policy.redesign(Evidence(estimate)).certificate
+    assert best is not None
+    law = best.setting.controller
+    running = replace(best.setting, controller=law.replace(Kp=share * law.Kp, Kd=share * law.Kd)).setting()
+    again = policy.redesign(Evidence(estimate, setting=running))
+    assert (again.setting is None) == stays
+    assert ("in force already" in again.reason) == stays
+    assert again.certificate is not None
+    assert (again.certificate.setting.controller.Kp == running.gains.Kp) == stays
+    assert again.certificate.cost <= 1.1 * best.cost
+
+
 # --- demands
 
 

@@ -14,17 +14,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
-import msgspec
-
-from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, known_bias
-from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Range, Region
-from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
@@ -141,7 +137,7 @@ class CertifiedTable:
         verified = [(key, certificate) for key, certificate in cells if certificate is not None]
         if verified:
             widest = verified[0][0].level + _PREFERRED_LEVELS
-            same = [one for key, one in verified if key.level <= widest and _alike(one.setting, running)]
+            same = [one for key, one in verified if key.level <= widest and alike(one.setting, running)]
             return _with_feedforward((same or [verified[0][1]])[0], region.feedforward)
         low, high = (math.degrees(end) for end in region.gap)
         bias = 1e3 * region.largest_bias
@@ -268,15 +264,6 @@ class _WithdrawnTable:
 
 def _contains(cell: Range, low: float, high: float) -> bool:
     return cell[0] <= low and high <= cell[1]
-
-
-def _alike(one: Design, other: Setting | None) -> bool:
-    """True when two settings are the same but for the feedforward."""
-    if other is None or other.gains is None or one.tolerance != other.tolerance:
-        return False
-    return gains_of(one.controller) == msgspec.structs.replace(
-        other.gains, feedforward=float(one.controller.feedforward)
-    )
 
 
 def _with_feedforward(certificate: Certificate, feedforward: float) -> Certificate:

@@ -12,6 +12,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from scipy.linalg import block_diag
 
+from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LAG, LearntMotor
@@ -29,8 +30,9 @@ from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
-# Relative: a smaller change of a gain is not worth an update.
-_SAME = 1e-3
+# Relative: a smaller change of a gain is not worth an update; cost of the running setting over that of the cheapest
+# one, up to which the running one stays.
+_SAME, _WORTH = 1e-3, 1.1
 # Voltages, relative to the answer of the servo's own Kp to the smallest step: a smaller change of the feedforward is
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
@@ -145,18 +147,24 @@ class CertifiedPolicy:
         redesign = _redesign(result, region.noise, best, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
-    def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
-        """Find the cheapest setting for a region, by simulation."""
-        known = region.within(self.uncertainty)
-        return certify(
-            self.servo,
-            known,
-            self.demands_within_band(),
-            self.simulations,
-            region.feedforward,
-            region.noise,
-            self.clock,
-        )
+    def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
+        """Find the cheapest setting for a region by simulation, or the running one where it is hardly dearer."""
+        return self.verify_on(self.servo, region.within(self.uncertainty), region, running)
+
+    def verify_on(
+        self, servo: Servo, known: Uncertainty, region: Region, running: Setting | None
+    ) -> Certificate | NotVerified:
+        """Verify as `verify` does, on a servo with an uncertainty of its own."""
+        demands, trial = self.demands_within_band(), self.simulations
+        found = certify(servo, known, demands, trial, region.feedforward, region.noise, self.clock)
+        if isinstance(found, NotVerified) or running is None or running.gains is None or alike(found.setting, running):
+            return found
+        law = with_gains(servo.controller, running.gains).replace(feedforward=region.feedforward)
+        other = confirm(servo, known, Design(law, running.tolerance), demands, trial, region.noise, self.clock)
+        # Two settings that are as good would otherwise take turns, whenever the evidence moves a little.
+        if isinstance(other, NotVerified) or other.cost > _WORTH * found.cost:
+            return found
+        return replace(other, looked_at=found.looked_at + 1, seconds=found.seconds + other.seconds)
 
     def confirm(self, region: Region, setting: Design) -> Certificate | NotVerified:
         """Verify one setting for a region, by simulation."""
@@ -279,18 +287,11 @@ class _LearntVerifier:
     learnt: LearntFactors
     provisional: ClassVar[bool] = False
 
-    def verify(self, region: Region, _running: Setting | None = None) -> Certificate | NotVerified:
-        policy, known = self.policy, region.within(self.policy.uncertainty)
-        return certify(
-            self.servo,
-            # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
-            known.replace(learnt=self.learnt, m=0.0 if "k" in self.learnt.names else known.m),
-            policy.demands_within_band(),
-            policy.simulations,
-            region.feedforward,
-            region.noise,
-            policy.clock,
-        )
+    def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
+        known = region.within(self.policy.uncertainty)
+        # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
+        known = known.replace(learnt=self.learnt, m=0.0 if "k" in self.learnt.names else known.m)
+        return self.policy.verify_on(self.servo, known, region, running)
 
     def fallback(self) -> Certificate:
         return self.policy.fallback()
@@ -327,15 +328,20 @@ def _noise(evidence: Evidence) -> float:
     return noise if math.isfinite(noise) else 0.0
 
 
+def alike(one: Design, other: Setting | None) -> bool:
+    """True when two settings are the same but for the feedforward."""
+    if other is None or other.gains is None:
+        return False
+    names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only")
+    gains = ((getattr(other.gains, name), getattr(one.controller, name)) for name in names)
+    pairs = (*gains, (other.tolerance, one.tolerance))
+    return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
+
+
 def _in_force(setting: Design, evidence: Evidence, small: float) -> bool:
     """True when the edge runs the setting already, by its last report, but for a `small` (V) change of feedforward."""
     now, new = evidence.gains, setting.controller
-    if now is None or evidence.setting is None or abs(now.feedforward - new.feedforward) > small:
-        return False
-    names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only")
-    gains = ((getattr(now, name), getattr(new, name)) for name in names)
-    pairs = (*gains, (evidence.setting.tolerance, setting.tolerance))
-    return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
+    return now is not None and abs(now.feedforward - new.feedforward) <= small and alike(setting, evidence.setting)
 
 
 def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
