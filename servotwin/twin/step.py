@@ -30,7 +30,7 @@ from servotwin.messages import (
 )
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow
+from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear
 from servotwin.twin.evidence import (
     DisturbanceRecord,
     ExcitationRecord,
@@ -170,11 +170,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
             wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
-    records.append(TrendRecord(message, trend))
-    if state.wear.machine is not None and state.wear.machine != before.machine:
-        records.append(MachineRecord(message, state.wear.machine))
-    if state.wear.motor is not None and state.wear.motor != before.motor:
-        records.append(MotorRecord(message, state.wear.motor))
+    records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     if model.triage is not None and state.triage is not None and not stale:
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
         state = replace(state, triage=triage)
@@ -205,6 +201,16 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     unverified = VerificationRequest.of(versions.pending, redesign)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + requests, all_records)
+
+
+def _learnt(message: WindowMessage, before: Wear, after: Wear) -> list[Record]:
+    """Make the records of what a window told of machine and motor."""
+    records = list[Record]()
+    if after.machine is not None and after.machine != before.machine:
+        records.append(MachineRecord(message, after.machine))
+    if after.motor is not None and after.motor != before.motor:
+        records.append(MotorRecord(message, after.motor))
+    return records
 
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:

@@ -165,7 +165,7 @@ class Descent(NamedTuple):
     converged: bool
 
 
-class Limits(NamedTuple):
+class SearchLimits(NamedTuple):
     """Largest gap and tolerance (rad), most steps, least gain as part of the cost, and which of gap and place move."""
 
     largest: float
@@ -176,7 +176,7 @@ class Limits(NamedTuple):
 
 
 @bare
-def descend_from(data: MisfitData, room: Room, gap: float, place: float, limits: Limits, rows: Array) -> Descent:
+def descend_from(data: MisfitData, room: Room, gap: float, place: float, limits: SearchLimits, rows: Array) -> Descent:
     """Descend from a gap (rad) and a place by Levenberg and Marquardt's method; residual and derivatives into `rows`.
 
     After a success the next step is closer to Gauss-Newton, after a failure shorter and steeper.

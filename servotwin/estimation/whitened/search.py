@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, contacts
-from servotwin.estimation.whitened.descent import Limits, descend_from
+from servotwin.estimation.whitened.descent import SearchLimits, descend_from
 from servotwin.estimation.whitened.reduction import Misfit, MisfitSlopes, Point
 from servotwin.plant.signals import Array
 
@@ -59,7 +59,7 @@ def descend(
     """
     rows = np.empty((3, misfit.position.size))
     # Plain numbers: a compiled version is made for every other combination of types.
-    limits = Limits(float(largest), float(tolerance), steps, gain, (free.gap, free.place))
+    limits = SearchLimits(float(largest), float(tolerance), steps, gain, (free.gap, free.place))
     end = descend_from(misfit.data, misfit.room, float(start.gap), float(start.place), limits, rows)
     slopes = MisfitSlopes(rows[0], rows[1:], end.cost)
     return SearchResult(Point(end.gap, end.place), slopes, end.evaluations, end.converged)
