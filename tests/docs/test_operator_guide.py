@@ -269,7 +269,9 @@ def test_the_first_five_minutes(tmp_path: Path) -> None:
             _, said = run_line(see_one, tmp_path)
         assert HEAD in said
         assert HEAD in GUIDE
-        assert re.search(r"^ax-1 +\d+\.\d+ ± \d+\.\d+ +ok", run_line(see_all, tmp_path)[1], re.MULTILINE)
+        # The bias at rest may be worth an update before a window shows the gap.
+        while not re.search(r"^ax-1 +\d+\.\d+ ± \d+\.\d+ +ok", run_line(see_all, tmp_path)[1], re.MULTILINE):
+            assert time.monotonic() < deadline
         for each in processes[::-1]:
             each.send_signal(signal.SIGINT)
             assert each.wait(PATIENCE) in (0, -signal.SIGINT)
