@@ -11,14 +11,14 @@ from benchmarks import estimator_conditions as conditions
 from benchmarks.estimator_windows import RATE, WindowCase, cut
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel
-from servotwin.estimation.core.visible import BOUND, TRAVEL
+from servotwin.estimation.core.visible import BOUND, TRAVEL, counted
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
 from servotwin.estimation.whitened.gate import FitEvidence, ModelShift, judge
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.plant.signals import SCurve, SquareWave, Step
 from servotwin.simulation import simulate
 
 
@@ -263,3 +263,24 @@ def test_a_slow_motion_beyond_what_noise_leaves_is_a_wrong_model():
     found = estimate_gap(window.replace(position=window.position + swing), case.servo)
     assert found.status is GapStatus.MODEL_MISMATCH
     assert "slow motion unexplained" in " ".join(found.reasons)
+
+
+def test_counts_of_the_encoder_show_in_its_angle() -> None:
+    time = np.arange(5000) / 5000.0
+    angle = 3.0 * np.sin(9.0 * time)
+    for count in (math.radians(1.0), 1e-3):
+        assert counted(count * np.round(angle / count)) == pytest.approx(count, rel=1e-9)
+    for smooth in (angle, time, np.zeros(5000), np.round(angle, 2) + 1e-4 * np.sin(50.0 * angle)):
+        assert counted(smooth) == 0.0
+
+
+def test_an_encoder_of_coarse_counts_is_refused_whether_or_not_they_are_stated() -> None:
+    run = simulate(SERVO, 3.0, reference=Step(1e-3), gap=math.radians(10.0))
+    window = Window.from_run(run, 0.0, 1.0)
+    assert window.theta_m is not None
+    assert estimate_gap(window, SERVO).ok
+    for count, allowed in ((math.radians(0.05), True), (math.radians(1.0), False)):
+        coarse = window.replace(theta_m=count * np.round(window.theta_m / count))
+        for stated in (0.0, count):
+            estimate = estimate_gap(coarse, SERVO.replace(encoder_resolution=stated))
+            assert estimate.ok == allowed, estimate

@@ -13,7 +13,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
-from servotwin.estimation.core.visible import least_bound
+from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
@@ -210,7 +210,13 @@ def _evidence(
         unexplained=slow_share(result, second),
         needed=travel_needed(gap, servo, settings),
         smallest=least_bound(servo.encoder_resolution),
+        count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
     )
+
+
+def _count(angle: Array, servo: Servo) -> float:
+    """Count of the encoder (rad): what shows, or what is stated where that is more."""
+    return max(servo.encoder_resolution, counted(angle))
 
 
 def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:

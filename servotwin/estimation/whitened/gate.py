@@ -227,6 +227,7 @@ def _transients(order: int, step: float, samples: int) -> Array:
 _SIGMAS = 3.0  # standard deviations by which another view may disagree
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
+_ROUNDED = 0.4  # of a count: sqrt(2/12), as the encoder's error is not random at the two reversals that show a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +255,8 @@ class FitEvidence:
         rad, least travel in each contact.
     smallest : float
         rad: a lower bound below this says nothing.
+    count : float
+        rad, of the encoder, as stated or as it shows in the angle; 0: none.
     """
 
     aligned: AlignedFit
@@ -266,6 +269,7 @@ class FitEvidence:
     unexplained: float
     needed: float
     smallest: float
+    count: float = 0.0
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
@@ -297,7 +301,7 @@ def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:
 
 def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:
     """Gap (rad) below which the window contradicts every gap, even with the model's usual error."""
-    return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error)
+    return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error - evidence.count)
 
 
 def travel_needed(gap: float, servo: Servo, settings: WhitenedSettings) -> float:
@@ -331,6 +335,12 @@ def _spread(evidence: FitEvidence, settings: WhitenedSettings) -> str:
     widest = max(evidence.std, (evidence.interval[1] - gap) / NORMAL_95, (gap - evidence.interval[0]) / NORMAL_95)
     if widest > settings.largest_std:
         return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
+    rounded = math.hypot(widest, _ROUNDED * evidence.count)
+    if rounded > settings.largest_std:
+        return (
+            f"the gap is known to {_deg(rounded)} only with counts of {_deg(evidence.count)}, and "
+            f"{_deg(settings.largest_std)} are allowed"
+        )
     return ""
 
 
