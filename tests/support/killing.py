@@ -118,7 +118,8 @@ def check_exactly_once(fleet: Fleet, sufficient: int) -> None:
 
 
 def check_kills_cost_little(fleet: Fleet) -> None:
-    """No window is missing before the last one of a boot, and of that at most the one that was being cut."""
+    """No window is missing before the last ones of a boot: the one that was being cut, and the one before it, which may
+    have been on its way to the outbox when the edge ended."""
     boots = by_boot(witnessed(fleet))
     assert all(numbers == list(range(len(numbers))) for numbers in boots.values())
     for servo, entries in fleet.connections().items():
@@ -126,7 +127,7 @@ def check_kills_cost_little(fleet: Fleet) -> None:
         assert len(entries) >= max(result)
         for number, entry in enumerate(entries, 1):
             possible = complete_windows(entry["first"], entry["last"])
-            assert possible - 1 <= result.get(number, 0) <= possible, (servo, number, entry, result)
+            assert possible - 2 <= result.get(number, 0) <= possible, (servo, number, entry, result)
 
 
 def check_controllers_ticked(fleet: Fleet) -> None:
