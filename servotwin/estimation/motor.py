@@ -195,6 +195,13 @@ class MotorLearning:
             return replace(fresh, windows=before.windows + 1)
         return self._contradicted(before, fresh, window, now)
 
+    def current(self, motor: LearntMotor | None, now: float) -> LearntMotor | None:
+        """Return what is known of the motor at a time (s); None where the last windows contradict it."""
+        if motor is None or motor.surprises > 0:
+            return None
+        _, covariance = motor.predicted(self._walks, now)
+        return replace(motor, covariance=tuple(covariance.ravel().tolist()), time=max(now, motor.time))
+
     def _contradicted(self, before: LearntMotor, fresh: LearntMotor, window: Window, now: float) -> LearntMotor | None:
         """Keep what was learnt, with an alarm; some such windows in a row mean another motor."""
         count = before.surprises + 1

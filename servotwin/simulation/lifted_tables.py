@@ -69,8 +69,11 @@ class LiftedMemory(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where a run is: ``at = [tick, mode, active, kind, side of the error, ticks since a switch, vast scale wanted]``;
-    `sign` of the limit that acts."""
+    """Progress of a run.
+
+    ``at = [tick, mode, active, kind, side of the error, ticks since a switch, vast scale wanted]``; `sign` of the limit
+    that acts.
+    """
 
     at: NDArray[np.int64]
     sign: Array

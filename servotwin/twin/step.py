@@ -176,9 +176,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, triage=triage)
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
-    evidence = Evidence(
-        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, state.wear.motor, state.rests
-    )
+    motor = None if model.motor is None else model.motor.current(state.wear.motor, arrived)
+    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests)
     state, redesign = _redesign(model, state, evidence, stale)
     if disturbed.known and not stale:
         state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])

@@ -144,6 +144,11 @@ def test_another_motor_is_an_alarm_and_learnt_anew_when_it_stays() -> None:
     assert states[3].mean[BACK_EMF] == pytest.approx(0.2, abs=5e-3)
     assert "learnt anew" in states[3].alarm
     # Two motors under one name: what was learnt stays, and the alarm comes with every window of the other.
+    assert learning().current(states[1], 16.0) is None
+    later = learning().current(known, 1e6)
+    assert later is not None
+    assert later.mean == known.mean
+    assert all(later.std(index) > known.std(index) for index in range(4))
     back = learning().updated(states[1], own[3], 20.0)
     assert back is not None
     assert (back.surprises, back.alarm) == (0, "")

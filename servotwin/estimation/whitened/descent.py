@@ -21,7 +21,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING, _FLOOR = 1e-3, 1e-9, 1e10, 1e-
 
 
 class MisfitData(NamedTuple):
-    """What a misfit is made of.
+    """Numbers of a misfit: channels, nuisances, response and noise.
 
     Attributes
     ----------

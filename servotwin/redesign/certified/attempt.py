@@ -38,7 +38,7 @@ _FIRST = 75
 
 @dataclass(frozen=True)
 class Question:
-    """What a setting is to be verified for: the model and its uncertainty, demands, simulations, noise (m rms)."""
+    """Conditions of a verification: the model and its uncertainty, demands, simulations, noise (m rms)."""
 
     servo: Servo
     uncertainty: Uncertainty

@@ -259,7 +259,7 @@ class CertifiedPolicy:
         motor, torque = self._motor(evidence), self.servo.k_T / self.servo.R
         if motor is not None:
             least, most = motor.friction
-            # A range that begins at zero is none: the stated one may still narrow it.
+            # Friction that is not significant counts at most as stated.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
