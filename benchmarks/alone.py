@@ -1,4 +1,4 @@
-"""Benchmarks of quality, which run alone: estimator, edge, policies, novelty, triage, ticks, fleet."""
+"""Benchmarks of quality, which run alone: estimator, windows, edge, policies, novelty, triage, ticks, fleet."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks import accuracy, endurance, glances, tick
+from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
 from benchmarks.novelty import command as worth_sending
@@ -44,6 +45,10 @@ def _triage(date: str, output: Path | None, quick: bool) -> None:
     glances.triage(date, output, glances.QUICK if quick else glances.GAPS)
 
 
+def _windows(date: str, output: Path | None, quick: bool) -> None:
+    from_windows.windows(date, output, from_windows.QUICK if quick else from_windows.WINDOWS)
+
+
 def _tick(date: str, output: Path | None, quick: bool) -> None:
     tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
 
@@ -56,16 +61,23 @@ ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     side_by_side.NAME: _policies,
     in_the_loop.NAME: _loops,
     tick.NAME: _tick,
+    from_windows.NAME: _windows,
     worth_sending.NAME: _novelty,
 }
 
 
 def run_alone(
-    names: Sequence[str], date: str, output: Path | None, quick: bool, others: bool, full: bool = False
+    names: Sequence[str],
+    date: str,
+    output: Path | None,
+    quick: bool,
+    others: bool,
+    full: bool = False,
+    seed: int | None = None,
 ) -> bool:
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
-    `full` applies to the fleet only: the full length of the documented figures.
+    `full` applies to the fleet only: the full length of the documented figures. `seed` applies to the windows only.
 
     Raises
     ------
@@ -75,12 +87,16 @@ def run_alone(
     name = next((name for name in names if name in ALONE), None)
     if full and (tuple(names) != (whole.NAME,) or quick):
         raise InvalidInput(f"--full: only bench {whole.NAME} takes it, and not with --quick")
+    if seed is not None and tuple(names) != (from_windows.NAME,):
+        raise InvalidInput(f"--seed: only bench {from_windows.NAME} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
     if full:
         whole.fleet(date, output, FleetScale().full())
+    elif seed is not None:
+        from_windows.windows(date, output, from_windows.QUICK if quick else from_windows.WINDOWS, seed)
     else:
         ALONE[name](date, output, quick)
     return True

@@ -15,14 +15,15 @@ def bench(
     workloads: Annotated[
         list[str] | None,
         typer.Argument(
-            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, hostile, policies, "
-            "loops, tick, novelty, triage, fleet."
+            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, hostile, "
+            "policies, loops, tick, novelty, triage, fleet."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small workloads, as a check.")] = False,
     full: Annotated[bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="windows: seed of the machines.")] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
 ) -> None:
@@ -33,7 +34,7 @@ def bench(
 
     date = datetime.now(UTC).isoformat(timespec="seconds")
     others = slow or runs is not None or reference is not None
-    if run_alone(tuple(workloads or ()), date, json, quick, others, full):
+    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed):
         return
     from benchmarks.catalogue import Options
     from benchmarks.command import bench as run

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from statistics import median
 
 import numpy as np
 
 from benchmarks.estimator_windows import WindowCase, cut, random_servo
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, simulate
@@ -23,17 +24,21 @@ STEP_S, LOOPS = 10.0, ("calm", "dead zone", "no dead zone")
 
 @dataclass(frozen=True)
 class ModelError:
-    """Largest relative errors of stiffness, damping and pitch."""
+    """Largest relative errors of stiffness, damping, pitch, and of the motor's torque gain and back EMF."""
 
     k: float
     c: float
     pitch: float = 0.0
+    motor: float = 0.0
 
     def machine(self, rng: np.random.Generator, model: Servo) -> Servo:
         """Draw a machine whose loop is stable without a gap."""
         while True:
             k, c, p = (1.0 + rng.uniform(-width, width) for width in (self.k, self.c, self.pitch))
             plant = model.replace(k=tuple(k * model.stiffnesses), c=tuple(c * model.dampings), p=p * model.p)
+            if self.motor:
+                k_T, k_B = (1.0 + rng.uniform(-self.motor, self.motor) for _ in range(2))
+                plant = plant.replace(k_T=k_T * plant.k_T, k_B=k_B * plant.k_B)
             try:
                 plant.check_loop()
                 return plant
@@ -69,7 +74,26 @@ def step_windows(run: Run, loop: str, model: Servo, noise: float, rng: np.random
 
 @dataclass
 class Tally:
-    """Counts over many windows."""
+    """Counts over many windows.
+
+    Attributes
+    ----------
+    windows, two_contacts, accepted : int
+    accepted_late, two_contacts_late : int
+        Of windows with two contacts before which the twin has had ten.
+    false : int
+        Accepted, off by more than 0.1 deg and outside of their 95 % interval.
+    inside : int
+        Accepted with the gap inside the interval.
+    worst : float
+        rad, the largest error of the false ones.
+    above : int
+        Lower bounds by more than 0.1 deg above the gap.
+    half_widths : list of float
+        rad, of the accepted intervals.
+    examples : list of str
+        The false ones in words.
+    """
 
     windows: int = 0
     two_contacts: int = 0
@@ -79,6 +103,8 @@ class Tally:
     false: int = 0
     inside: int = 0
     worst: float = 0.0
+    above: int = 0
+    half_widths: list[float] = field(default_factory=list)
     examples: list[str] = field(default_factory=list)
 
     def add(self, case: WindowCase, estimate: GapEstimate, late: bool) -> None:
@@ -87,15 +113,31 @@ class Tally:
         self.two_contacts += case.two_contacts
         self.two_contacts_late += late and case.two_contacts
         if not estimate.ok:
+            self.above += estimate.status is GapStatus.LOWER_BOUND and estimate.gap > case.gap + FALSE
             return
         inside, error = estimate.interval[0] <= case.gap <= estimate.interval[1], abs(estimate.gap - case.gap)
         self.accepted += 1
         self.accepted_late += late and case.two_contacts
         self.inside += inside
+        self.half_widths.append(0.5 * (estimate.interval[1] - estimate.interval[0]))
         if error > FALSE and not inside:
             self.false += 1
             self.worst = max(self.worst, error)
             self.examples.append(f"{case.words}: {estimate!r}, and it was {math.degrees(case.gap):.4g} deg")
+
+    def join(self, other: Tally) -> None:
+        """Add another tally's counts."""
+        for name in ("windows", "two_contacts", "accepted", "accepted_late", "two_contacts_late", "false", "inside"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.above += other.above
+        self.worst = max(self.worst, other.worst)
+        self.half_widths += other.half_widths
+        self.examples += other.examples
+
+    @property
+    def half_width(self) -> float:
+        """Median half of the accepted intervals, rad."""
+        return median(self.half_widths) if self.half_widths else math.nan
 
     @property
     def coverage(self) -> float:

@@ -15,7 +15,8 @@ from servotwin.estimation.core.visible import BOUND, TRAVEL, counted
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
-from servotwin.estimation.whitened.gate import FitEvidence, ModelShift, judge
+from servotwin.estimation.whitened.gate import FitEvidence, judge
+from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave, Step

@@ -23,6 +23,7 @@ from servotwin.plant.signals import Array
 
 _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there
 _JUMP = 50.0  # times the usual fastest motion
+_HELD, _ABRUPT = 4, 4.0  # equal samples; times the usual change of speed there, at which motion begins or ends
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
 _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder: below, nothing; above, the lowest cut
 _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
@@ -48,7 +49,25 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
             f"{name} jumps by {factor * steps[index]:.6g} {unit} between samples {index} and {index + 1}: a wrapped "
             "encoder, or samples are missing"
         )
-    return _saturation(name, samples, steps, factor, unit)
+    return _saturation(name, samples, steps, factor, unit) or _held(name, steps)
+
+
+def _held(name: str, steps: Array) -> str:
+    """Describe samples that repeat the one before them in full motion; empty without them.
+
+    What comes to rest slows down, and what starts has no speed yet. A channel that stands still with the next sample,
+    or leaves with a leap, was held: samples are missing. A count more or less is no motion.
+    """
+    still = np.concatenate([[False], steps == 0.0, [False]])
+    begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
+    long = ends - begins >= _HELD - 1
+    count = float(np.min(steps[steps > 0.0]))
+    for begin, end in zip(begins[long], ends[long], strict=True):
+        for side in (steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]):
+            if side.size == _RUN and side[0] > _ABRUPT * max(count, float(np.max(np.abs(np.diff(side[1:]))))):
+                held = f"{name} repeats one value in full motion, in samples {begin} to {end}"
+                return f"{held}: it was held while samples were missing"
+    return ""
 
 
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:

@@ -20,12 +20,9 @@ from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
-    ModelShift,
     contacts_seen,
     judge,
     lower_bound,
-    model_shift,
-    observer_shift,
     one_sided,
     slow_share,
     static_lost_motion,
@@ -33,6 +30,7 @@ from servotwin.estimation.whitened.gate import (
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.settings import WhitenedSettings
+from servotwin.estimation.whitened.shift import ModelShift, fastest, model_shift, observer_shift
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
@@ -122,7 +120,7 @@ class WindowFit:
             return self.blank
         evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
-            evidence = _with_free_model(evidence, self.learnt, self.settings)
+            evidence = _with_free_model(evidence, self.learnt, self.settings, self.second)
         status, reasons = judge(evidence, self.settings)
         if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
             status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
@@ -219,10 +217,16 @@ def _count(angle: Array, servo: Servo) -> float:
     return max(servo.encoder_resolution, counted(angle))
 
 
-def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
+def _with_free_model(
+    evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings, second: float
+) -> FitEvidence:
     """Widen a spread and an interval by what the model's factors leave open."""
     std = learnt.gap_std(settings.calibration)
-    if not math.isfinite(std) or not std > evidence.std:
+    if not math.isfinite(std):
+        return evidence
+    ramp = fastest(evidence.aligned.whitened.reduction, second)
+    evidence = replace(evidence, doubt=learnt.doubt(ramp, settings.calibration))
+    if not std > evidence.std:
         return evidence
     gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
     extra = NORMAL_95 * math.sqrt(std**2 - evidence.std**2)
@@ -271,7 +275,7 @@ def _stated(
 ) -> GapEstimate:
     """Fill a blank estimate from the evidence."""
     fitted = evidence.aligned.whitened
-    systematic = math.hypot(settings.model_error, evidence.shift.gap)
+    systematic = math.hypot(settings.model_error, evidence.systematic)
     result = replace(
         blank,
         status=status,

@@ -218,7 +218,7 @@ class ContactEvidence:
         return self.rise >= BELIEVED
 
 
-# The square of the contacts' least travel over the largest accepted standard deviation is 100 too: a second contact
+# The square of the contacts' least travel over the largest accepted standard deviation is above that: a second contact
 # that is worth less could not have made an acceptable estimate.
 BELIEVED = 100.0
 _ENOUGH, _HOPELESS = 0.3, 30.0  # times that: clearly too little; so much that no start has come back from there

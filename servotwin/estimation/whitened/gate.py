@@ -1,29 +1,19 @@
 """Evidence for and against a fit, and the verdict: status of an estimate and the reasons for it.
 
 Four views of a window count: the slow motion that the fit leaves (noise is fast or small, a wrong channel is neither),
-the static lost motion at rest, the gap in the paper's observer form, and the gap with a free model. Near the fit, a
-model that is a little off adds multiples of a few known motions to the position: those of a stiffer or more damped
-structure, of another pitch or scale, of a compliant screw. Free within wide tolerances, they take what they can of the
-residual, and the gap moves with them. So does a gap that grows within the window, where it counts as constant.
+the static lost motion at rest, the gap in the paper's observer form, and the gap with a free model (`shift`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import BY_RATE, Travel
-from servotwin.estimation.core.least_squares import LeastSquares, least_squares, orthonormal, project_out, spread
-from servotwin.estimation.core.reduced import ReducedResponse
-from servotwin.estimation.core.variants import variants
+from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.core.visible import least_travel
-from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
-from servotwin.estimation.paper.observer import LagFilter, observer
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
 from servotwin.estimation.whitened.free_model import (
     COMPLIANCE,
@@ -33,9 +23,8 @@ from servotwin.estimation.whitened.free_model import (
     FreeProblem,
     contact_evidence,
 )
-from servotwin.estimation.whitened.nearby import Neighbour, motions
-from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL
 from servotwin.estimation.whitened.settings import WhitenedSettings
+from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -117,113 +106,6 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
     return float(np.ptp(lead)) if lead.size > 1 else 0.0
 
 
-_STEP = 1e-3  # relative
-_STIFF = 100.0  # screw over structure: far enough for the motion to be linear in the compliance
-_TOLERANCES = {"stiffness": 0.1, "damping": 0.5, "pitch or position scale": 0.05, "screw compliance": 0.1}
-_GROWTH = math.radians(0.15)  # rad/s: the paper's wear at its fastest
-_ALPHA = 40.0  # rad/s, the paper's observer
-
-
-class ModelShift(NamedTuple):
-    """Change of the gap (rad) with the model free, its standard deviation, its main cause in words, and the gain.
-
-    The gain is twice the logarithm of the likelihood ratio: a few for a right model.
-    """
-
-    gap: float
-    std: float
-    words: str
-    gain: float
-
-
-def model_shift(result: WhitenedFit, servo: Servo, order: int, second: float) -> ModelShift:
-    """Move of the gap when the model is free within `_TOLERANCES`, in the noise that is then left.
-
-    Whitening takes the error of a wrong model for noise; a free model takes it up itself.
-    """
-    model, reduction = result.reduction.reduced, result.reduction
-    screw = reduction.traced(result.point)
-    table, weights = result.table, result.shares[1 : len(reduction.fixed())]
-    answer = reduction.position - table[RESIDUAL]
-    moved = motions(model, _neighbours(servo, model), screw[:1], answer, weights)
-    free = np.insert(moved, 2, answer, axis=0)
-    sizes = list(_TOLERANCES.values())
-    if reduction.growth is None:
-        free = np.vstack([free, model.respond(screw[BY_RATE:])])
-        sizes.append(_GROWTH / second * model.response.interval)
-    free *= np.array(sizes)[:, None]
-    table, size = np.vstack([table, free]), len(free)
-    shares = _within_tolerance(reduction.prepared(result.noise, table, CONSTANT), size).coefficients
-    noise = burg((table[RESIDUAL] - shares @ table[GAP:])[None], order).at_least(reduction.rounding)
-    rows = reduction.prepared(noise, table, CONSTANT)
-    solved = _within_tolerance(rows, size)
-    own = spread(rows[GAP], rows[PLACE:-size])
-    std = math.sqrt(max(0.0, float(solved.deviations[0]) ** 2 - own**2)) if math.isfinite(own) else math.inf
-    words = _words(solved.coefficients[-size:], solved.deviations[-size:], second)
-    gain = (
-        2.0 * table.shape[1] * math.log(result.noise.spread[-1] / noise.spread[-1]) if noise.spread[-1] > 0.0 else 0.0
-    )
-    return ModelShift(float(solved.coefficients[0]), std, words, gain)
-
-
-def _within_tolerance(rows: Array, free: int) -> LeastSquares:
-    """Solve for all coefficients; the last `free` ones are expected to be 0 with standard deviation 1."""
-    known = np.zeros((len(rows), free))
-    known[-free:] = np.eye(free)
-    columns = np.hstack([rows, known])
-    return least_squares(columns[GAP:], columns[RESIDUAL])
-
-
-def _words(shares: Array, deviations: Array, second: float) -> str:
-    """Describe the direction that is needed most, and its size."""
-    index = int(np.argmax(np.abs(shares) / np.maximum(deviations, 1e-9)))
-    if index == len(_TOLERANCES):
-        return (
-            f"a gap that grows by {math.degrees(_GROWTH / second) * shares[index]:+.2g} deg/s would explain most of it"
-        )
-    name = list(_TOLERANCES)[index]
-    return f"a {name} off by {100.0 * _TOLERANCES[name] * shares[index]:+.2g} % would explain most of it"
-
-
-@lru_cache(maxsize=32)
-def _neighbours(servo: Servo, model: ReducedResponse) -> tuple[Neighbour, ...]:
-    """Neighbours of a servo's response in stiffness, damping and the screw's compliance (of the structure's)."""
-    rate, stiffness = 1.0 / model.response.interval, float(servo.stiffnesses.max())
-    own = 0.0 if servo.rigid else stiffness / servo.k_d
-    soft = 1.0 / _STIFF if servo.rigid else own * (1.0 + _STEP)
-    stiffer, damped = variants(servo, list(math.log1p(_STEP) * np.eye(4)[:2]), rate)
-    (softer,) = variants(servo, [np.zeros(4)], rate, [stiffness / soft])
-    steps = ((stiffer, _STEP), (damped, _STEP), (softer, soft - own))
-    return tuple(Neighbour.of(model, other, step, row) for row, (other, step) in enumerate(steps))
-
-
-def observer_shift(result: WhitenedFit, servo: Servo, second: float) -> tuple[float, float]:
-    """Return the change of the gap (rad) in the paper's observer form, and its standard deviation.
-
-    The observer weights the residual by denominator / (s + alpha)^N; one step of Gauss and Newton in that weight.
-    """
-    reduction = result.reduction
-    interval, alpha = reduction.response.interval * reduction.decimation.factor, _ALPHA / second
-    model = observer(servo, alpha)
-    weight = LagFilter.sampled(model.denominator, model.order, alpha, interval)
-    rows = np.array([weight.respond(row) for row in result.table])
-    basis = orthonormal(np.vstack([rows[PLACE:], _transients(model.order, alpha * interval, rows.shape[1])]))
-    left = project_out(basis, rows[[RESIDUAL, GAP]])
-    information = float(left[1] @ left[1])
-    if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
-        return 0.0, math.inf
-    direction = np.array([weight.respond(left[1][::-1])])[0][::-1] / information
-    noise = result.noise.colour_back(direction)
-    own = result.std
-    return float(left[0] @ left[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
-
-
-def _transients(order: int, step: float, samples: int) -> Array:
-    """(order, m) what the observer has not yet forgotten: t^i exp(-t), in steps of alpha times the interval."""
-    time = step * np.arange(samples)
-    return np.array([time**i * np.exp(-time) for i in range(order)])
-
-
 _SIGMAS = 3.0  # standard deviations by which another view may disagree
 _LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
 _UNEXPLAINED = 0.05  # of the position's own slow variation
@@ -257,6 +139,8 @@ class FitEvidence:
         rad: a lower bound below this says nothing.
     count : float
         rad, of the encoder, as stated or as it shows in the angle; 0: none.
+    doubt : float
+        rad, what a soft screw or a ramp of the gap may do to it besides a machine that is being learnt.
     """
 
     aligned: AlignedFit
@@ -270,6 +154,12 @@ class FitEvidence:
     needed: float
     smallest: float
     count: float = 0.0
+    doubt: float = 0.0
+
+    @property
+    def systematic(self) -> float:
+        """What other models than the fitted one may do to the gap, rad."""
+        return max(abs(self.shift.gap), self.doubt)
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
@@ -375,7 +265,7 @@ def _disagreements(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[s
     """List the disagreements of other views of the same window with the fit."""
     sentences = []
     shift, limit = evidence.shift, settings.largest_shift
-    if abs(shift.gap) > max(limit, _SIGMAS * shift.std):
+    if abs(shift.gap) > max(limit, _SIGMAS * shift.std) and shift.gain > _LIKELIER:
         sentences.append(f"with the model free the gap would move by {_deg(shift.gap)}: {shift.words}")
     if shift.gain > _LIKELIER and _spread(evidence, settings):
         sentences.append(f"freeing the model makes the window far likelier: {shift.words}")

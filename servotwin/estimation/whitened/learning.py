@@ -8,14 +8,24 @@ known well, one turn is enough.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
-from servotwin.estimation.whitened.free_model import FACTORS, LARGEST, FactorPrior, FreeFit, FreeProblem, adapted
+from servotwin.estimation.whitened.free_model import (
+    COMPLIANCE,
+    FACTORS,
+    LARGEST,
+    FactorPrior,
+    FreeFit,
+    FreeProblem,
+    adapted,
+)
+from servotwin.estimation.whitened.reduction import NuisancePrior
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -39,13 +49,19 @@ class LearntFit:
         With this servo's response.
     free : FreeFit
         In the same noise, with the factors' prior.
-    prior : FactorPrior
+    problem : FreeProblem
+        That `free` solves.
     """
 
     servo: Servo
     aligned: AlignedFit
     free: FreeFit
-    prior: FactorPrior
+    problem: FreeProblem
+
+    @property
+    def prior(self) -> FactorPrior:
+        """What was known of the factors."""
+        return self.problem.prior
 
     @property
     def beyond(self) -> str:
@@ -62,7 +78,25 @@ class LearntFit:
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
-        return calibration * math.sqrt(self.free.covariance[0, 0] * max(1.0, self.aligned.whitened.variance))
+        return self.deviation(math.sqrt(self.free.covariance[0, 0]), calibration)
+
+    def doubt(self, ramp: float, calibration: float) -> float:
+        """Root mean square (rad) of what a soft screw and a ramp of the gap can do to it, besides the free factors.
+
+        Both are free within wide limits here (`ramp`: rad/s), and cost only where the window does not tell them from
+        the factors.
+        """
+        reduction = self.problem.reduction
+        growth = NuisancePrior(0.0, ramp * reduction.response.interval)
+        wide = replace(self.problem, reduction=replace(reduction, growth=growth), compliance=COMPLIANCE)
+        residual, rows = wide.rows(np.array([*self.free.point, *self.free.factors]))
+        solved = least_squares(rows, residual)
+        more = self.deviation(float(solved.deviations[0]), calibration) ** 2 - self.gap_std(calibration) ** 2
+        return math.hypot(float(solved.coefficients[0]), math.sqrt(max(0.0, more)))
+
+    def deviation(self, white: float, calibration: float) -> float:
+        """Standard deviation of a number from that for a residual of variance 1."""
+        return calibration * white * math.sqrt(max(1.0, self.aligned.whitened.variance))
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
@@ -104,4 +138,4 @@ def learn_and_fit(
         if np.all(still):
             break
         factors, points = free.factors, [free.point]
-    return LearntFit(here, aligned, free, machine)
+    return LearntFit(here, aligned, free, problem)

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.estimation.core.decimation import Decimation
 from servotwin.estimation.core.reduced import ReducedResponse, free_motions, reduced_response
-from servotwin.estimation.core.response import Complex, Response
+from servotwin.estimation.core.response import Complex, Readout, Response
 from servotwin.estimation.core.variants import variants
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
+
+Indices: TypeAlias = NDArray[np.intp]
 
 PITCH, RATIO = 2, 3  # of the factors
 STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
@@ -50,8 +54,25 @@ class Neighbour:
         """Join another response to that of a machine."""
         mine, theirs = model.response.poles, other.poles
         if theirs.size != mine.size:
-            theirs = theirs[np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1)]
-        return cls(ReducedResponse.of(other, model.decimation), theirs, step, row)
+            other = settled(other, np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1))
+        return cls(ReducedResponse.of(other, model.decimation), other.poles, step, row)
+
+
+def settled(model: Response, kept: Indices) -> Response:
+    """Return a response with some of its modes only; the others have always come to rest.
+
+    A soft screw lets the first mass ring. How fast, depends on how soft it is: a difference quotient with this ringing
+    is no derivative, and a window seems to contradict any compliance that rings at another pitch.
+    """
+    decay, gain = model.decay[kept], model.position.gain[kept]
+    still = np.sum((gain[:, 0] + 1j * gain[:, 1]) / (1.0 - decay[:, 0] - 1j * decay[:, 1])).real
+    return replace(
+        model,
+        poles=model.poles[kept],
+        decay=decay,
+        position=Readout(gain, model.static_gain - float(still)),
+        velocity=Readout(model.velocity.gain[kept], model.velocity.direct),
+    )
 
 
 def motions(model: ReducedResponse, others: Sequence[Neighbour], screw: Array, answer: Array, weights: Array) -> Array:

@@ -83,7 +83,7 @@ class WhitenedSettings:
         key(
             "largest_std_deg", above=0.0, help="Largest statistical standard deviation of an estimate that is accepted."
         ),
-    ] = math.radians(0.05)
+    ] = math.radians(0.03)
     largest_shift: Annotated[
         float,
         key(

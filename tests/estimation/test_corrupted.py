@@ -1,0 +1,82 @@
+"""Estimates from windows of machines and sensors that are not as assumed; the whole sweep is `bench windows`."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks import windows as bench
+from benchmarks.corrupted import KINDS, corrupted_windows
+from servotwin.estimation.core.decimation import decimation
+from servotwin.estimation.core.reduced import reduced_response
+from servotwin.estimation.core.response import response
+from servotwin.estimation.core.variants import variants
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.whitened.channels import faults
+from servotwin.estimation.whitened.nearby import Neighbour, motions
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+
+RATE = 5000.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [bench.EXACT, bench.UNKNOWN])
+def test_no_corrupted_window_gives_a_confident_wrong_gap(view):
+    """Five windows of every kind; also that the clean ones are not refused for it."""
+    tallies = {kind: bench.counted((view, kind, 5, 7)) for kind in KINDS}
+    assert [example for tally in tallies.values() for example in tally.examples] == []
+    clean = tallies["clean"]
+    assert clean.accepted == clean.two_contacts if view == bench.EXACT else clean.accepted > 0
+
+
+def softened(servo, compliance, angles):
+    """Changes of the position per compliance of the screw."""
+    rate, model = RATE, reduced_response(response(servo, RATE), decimation(9))
+    stiffness = float(servo.stiffnesses.max())
+    (other,) = variants(servo, [np.zeros(4)], rate, [stiffness / compliance])
+    shares = np.zeros(2 * (servo.n - 1))
+    return motions(model, [Neighbour.of(model, other, compliance, 0)], angles, model.respond(angles)[0], shares)[0]
+
+
+@pytest.mark.parametrize("masses", [2, 3])
+def test_a_soft_screw_changes_the_position_in_proportion_to_its_compliance(masses):
+    """Its ringing does not: it would have another pitch for every compliance."""
+    servo = Servo.preset("paper").replace(n=masses)
+    angles = np.cumsum(np.where(np.arange(5000) < 1500, 2e-3, 0.0))[None]  # an abrupt start and end, as in contacts
+    little, more = softened(servo, 0.005, angles), softened(servo, 0.02, angles)
+    assert np.linalg.norm(more - little) < 0.06 * np.linalg.norm(little)
+
+
+def moving_angle():
+    return 2.0 * np.sin(np.linspace(0.0, 7.0, 5000))
+
+
+def faults_of(angle):
+    position = 1e-3 * np.sin(np.linspace(0.5, 7.5, angle.size))
+    return faults(Window(position, angle, sample_rate=RATE))
+
+
+def test_samples_that_were_held_in_full_motion_are_told():
+    for first in (100, 1122, 1150, 3000):  # the second and the third lie around a crest
+        held = moving_angle()
+        held[first : first + 40] = held[first]
+        (sentence,) = faults_of(held)
+        assert "theta_m repeats one value in full motion" in sentence
+
+
+def test_a_smooth_stop_and_the_counts_of_an_encoder_are_not_taken_for_held_samples():
+    crest = int(np.argmax(moving_angle()[:2000]))  # where the motor has no speed
+    start = moving_angle()[: 5000 - crest - 400] * np.linspace(0.0, 1.0, 5000 - crest - 400)
+    smooth = np.concatenate([moving_angle()[:crest], np.full(400, 2.0), 2.0 + start])
+    for angle in (smooth, *(count * np.round(moving_angle() / count) for count in (1e-4, 1e-2))):
+        assert faults_of(angle) == ()
+
+
+def test_a_ramp_of_the_gap_is_refused_or_lies_within_the_interval():
+    for case in corrupted_windows("ramp of 2 deg/s", 6, 11):
+        estimate = estimate_gap(case.window, case.servo)
+        assert not estimate.ok or estimate.interval[0] <= case.gap <= estimate.interval[1]
+        if estimate.status is GapStatus.LOWER_BOUND:
+            assert estimate.gap < case.gap + math.radians(0.1)
