@@ -198,7 +198,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     state = replace(state, versions=versions, tuned_for=float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
-    unverified = VerificationRequest.of(versions.pending, redesign)
+    unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + requests, all_records)
 
