@@ -62,10 +62,13 @@ def test_one_contact_with_a_model_a_little_off_is_not_taken_for_two():
         theta_d0=math.radians(22.563),
         tolerance=0.0,
     )
-    estimate = estimate_gap(Window.from_run(run, 14.7, 2.0), MODEL)
+    window = Window.from_run(run, 14.7, 2.0)
+    refused = estimate_gap(window, MODEL)
+    assert refused.status is GapStatus.MODEL_MISMATCH
+    assert "a damping off by +6" in refused.reasons[0]
+    estimate = estimate_carrying(window, MODEL, None, whitened.WhitenedSettings(), None, ROUGH)
     assert estimate.status is GapStatus.LOWER_BOUND
     assert estimate.gap <= math.radians(54.31)
-    assert "one contact" in estimate.reasons[0]
 
 
 def test_two_contacts_are_believed_where_they_are():
@@ -195,9 +198,8 @@ def test_a_machine_survives_its_encoding():
 @pytest.mark.slow
 @pytest.mark.parametrize(("loop", "machines", "seed"), [("calm", 4, 5), ("dead zone", 3, 17)])
 def test_a_twin_learns_its_machine(loop, machines, seed):
-    """Stiffness within 5 %, damping within 30 %, pitch within 1 % of the model, the gap growing: none wrong."""
-    tally = learning_twin(ModelError(0.05, 0.3, 0.01), loop, machines, seed, steps=12)
+    """Stiffness within 5 %, damping 50 %, pitch 1 %, the motor's gains 10 % of the model, the gap growing: none wrong."""
+    tally = learning_twin(ModelError(0.05, 0.5, 0.01, 0.1), loop, machines, seed, steps=14)
     assert tally.false == 0, tally.examples
     assert tally.two_contacts_late > 5
-    # One window in five may be too noisy: its gap is then not known to the accuracy that is demanded.
-    assert tally.accepted_late >= 0.8 * tally.two_contacts_late
+    assert tally.accepted_late >= 0.9 * tally.two_contacts_late

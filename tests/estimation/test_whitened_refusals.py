@@ -248,11 +248,26 @@ def test_another_view_counts_from_three_standard_deviations_on(view: str, deviat
     std = math.radians(0.1)
     most = 1.05 * seen.aligned.whitened.point.gap + seen.needed
     seen = {
-        "free model": replace(seen, shift=ModelShift(deviations * std, std, "a stiffness off", 0.0)),
+        "free model": replace(seen, shift=ModelShift(0.8 * deviations * std, std, "a stiffness off", 100.0)),
         "observer form": replace(seen, observer=(-deviations * std, std)),
-        "lost motion": replace(seen, std=0.4 * std, lost_motion=most + 0.4 * deviations * std),
+        "lost motion": replace(seen, std=0.2 * std, lost_motion=most + 0.2 * deviations * std),
     }[view]
     assert judge(seen, given)[0] is status
+
+
+def test_a_free_model_that_is_no_likelier_widens_the_estimate_and_does_not_refuse_it():
+    """Free in directions that the window hardly shows, a model moves the gap by chance."""
+    seen, std = evidence(clean()[1]), math.radians(0.02)
+    moved = replace(seen, shift=ModelShift(5.0 * std, std, "a stiffness off", 10.0))
+    assert judge(moved, WhitenedSettings())[0] is GapStatus.OK
+    assert moved.systematic == 5.0 * std
+    assert judge(replace(moved, shift=moved.shift._replace(gain=100.0)), WhitenedSettings())[0] is not GapStatus.OK
+
+
+def test_coloured_noise_allows_a_smaller_spread_than_white_noise():
+    seen, std = evidence(clean()[1]), math.radians(0.04)
+    assert judge(replace(seen, std=std, colour=0.0), WhitenedSettings())[0] is GapStatus.OK
+    assert judge(replace(seen, std=std, colour=1.0), WhitenedSettings())[0] is GapStatus.UNIDENTIFIABLE
 
 
 def test_a_slow_motion_beyond_what_noise_leaves_is_a_wrong_model():

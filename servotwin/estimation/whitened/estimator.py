@@ -209,6 +209,7 @@ def _evidence(
         needed=travel_needed(gap, servo, settings),
         smallest=least_bound(servo.encoder_resolution),
         count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
+        colour=result.noise.colour,
     )
 
 

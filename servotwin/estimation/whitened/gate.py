@@ -107,8 +107,11 @@ def static_lost_motion(theta_m: Array, position: Array, rate: float, static_gain
 
 
 _SIGMAS = 3.0  # standard deviations by which another view may disagree
-_LIKELIER = 45.0  # gain in likelihood above which what spreads the estimate is the model, not noise
+_LIKELIER = 45.0  # gain in likelihood above which the model is wrong: of 197 clean windows none had more than 33
 _UNEXPLAINED = 0.05  # of the position's own slow variation
+# The level of coloured noise rests on a few periods. What is exceeded once in 1000 windows lies at 5.4 instead of 3.3
+# standard deviations when seven independent values show it (Student).
+_COLOURED = 5.4 / 3.3 - 1.0
 _ROUNDED = 0.4  # of a count: sqrt(2/12), as the encoder's error is not random at the two reversals that show a gap
 
 
@@ -141,6 +144,8 @@ class FitEvidence:
         rad, of the encoder, as stated or as it shows in the angle; 0: none.
     doubt : float
         rad, what a soft screw or a ramp of the gap may do to it besides a machine that is being learnt.
+    colour : float
+        Share of the noise's variance that could be predicted; 0: white.
     """
 
     aligned: AlignedFit
@@ -155,6 +160,7 @@ class FitEvidence:
     smallest: float
     count: float = 0.0
     doubt: float = 0.0
+    colour: float = 0.0
 
     @property
     def systematic(self) -> float:
@@ -223,6 +229,7 @@ def _spread(evidence: FitEvidence, settings: WhitenedSettings) -> str:
         return "the window contradicts no large gap"
     gap = evidence.aligned.whitened.point.gap
     widest = max(evidence.std, (evidence.interval[1] - gap) / NORMAL_95, (gap - evidence.interval[0]) / NORMAL_95)
+    widest *= 1.0 + _COLOURED * evidence.colour
     if widest > settings.largest_std:
         return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     rounded = math.hypot(widest, _ROUNDED * evidence.count)
@@ -265,7 +272,7 @@ def _disagreements(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[s
     """List the disagreements of other views of the same window with the fit."""
     sentences = []
     shift, limit = evidence.shift, settings.largest_shift
-    if abs(shift.gap) > max(limit, _SIGMAS * shift.std) and shift.gain > _LIKELIER:
+    if abs(shift.gap) > max(limit, NORMAL_95 * shift.std) and shift.gain > _LIKELIER:
         sentences.append(f"with the model free the gap would move by {_deg(shift.gap)}: {shift.words}")
     if shift.gain > _LIKELIER and _spread(evidence, settings):
         sentences.append(f"freeing the model makes the window far likelier: {shift.words}")

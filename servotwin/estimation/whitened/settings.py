@@ -81,9 +81,12 @@ class WhitenedSettings:
     largest_std: Annotated[
         float,
         key(
-            "largest_std_deg", above=0.0, help="Largest statistical standard deviation of an estimate that is accepted."
+            "largest_std_deg",
+            above=0.0,
+            help="Largest statistical standard deviation of an estimate that is accepted; in noise whose spectrum the "
+            "window itself must show down to three fifths of that.",
         ),
-    ] = math.radians(0.03)
+    ] = math.radians(0.05)
     largest_shift: Annotated[
         float,
         key(
