@@ -61,10 +61,10 @@ def _held(name: str, steps: Array) -> str:
     still = np.concatenate([[False], steps == 0.0, [False]])
     begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
     long = ends - begins >= _HELD - 1
-    count = float(np.min(steps[steps > 0.0]))
+    least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
     for begin, end in zip(begins[long], ends[long], strict=True):
         for side in (steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]):
-            if side.size == _RUN and side[0] > _ABRUPT * max(count, float(np.max(np.abs(np.diff(side[1:]))))):
+            if side.size == _RUN and side[0] > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))):
                 held = f"{name} repeats one value in full motion, in samples {begin} to {end}"
                 return f"{held}: it was held while samples were missing"
     return ""
