@@ -30,9 +30,8 @@ from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
-# Relative: a smaller change of a gain is not worth an update; cost of the running setting over that of the cheapest
-# one, up to which the running one stays.
-_SAME, _WORTH = 1e-3, 1.1
+# Relative: a smaller change of a gain is not worth an update.
+_SAME = 1e-3
 # Voltages, relative to the answer of the servo's own Kp to the smallest step: a smaller change of the feedforward is
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
@@ -138,7 +137,8 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         feedforward, input_bias = self._input_bias(evidence)
-        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence))
+        friction, noise, usual = self._friction(evidence), _noise(evidence), self._usual_step(evidence)
+        region = Region(gap, feedforward, input_bias, friction, noise, usual)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
@@ -156,15 +156,10 @@ class CertifiedPolicy:
     ) -> Certificate | NotVerified:
         """Verify as `verify` does, on a servo with an uncertainty of its own."""
         demands, trial = self.demands_within_band(), self.simulations
-        found = certify(servo, known, demands, trial, region.feedforward, region.noise, self.clock)
-        if isinstance(found, NotVerified) or running is None or running.gains is None or alike(found.setting, running):
-            return found
-        law = with_gains(servo.controller, running.gains).replace(feedforward=region.feedforward)
-        other = confirm(servo, known, Design(law, running.tolerance), demands, trial, region.noise, self.clock)
-        # Two settings that are as good would otherwise take turns, whenever the evidence moves a little.
-        if isinstance(other, NotVerified) or other.cost > _WORTH * found.cost:
-            return found
-        return replace(other, looked_at=found.looked_at + 1, seconds=found.seconds + other.seconds)
+        fed, in_force = region.feedforward, None
+        if running is not None and running.gains is not None:
+            in_force = Design(with_gains(servo.controller, running.gains), running.tolerance)
+        return certify(servo, known, demands, trial, fed, region.noise, self.clock, in_force)
 
     def confirm(self, region: Region, setting: Design) -> Certificate | NotVerified:
         """Verify one setting for a region, by simulation."""
@@ -216,6 +211,14 @@ class CertifiedPolicy:
         if abs(bias + fed) > spread:
             fed = min(max(-bias, -limit), limit)
         return fed, (bias - spread, bias + spread)
+
+    def _usual_step(self, evidence: Evidence) -> Range | None:
+        """Range of the steps in the last windows (m), as far as it lies within the stated one; None: none was seen."""
+        if not evidence.steps:
+            return None
+        least, most = self.uncertainty.step
+        low, high = (min(max(size, least), most) for size in (min(evidence.steps), max(evidence.steps)))
+        return low, high
 
     def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
         """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
