@@ -33,7 +33,7 @@ _FAST = 10.0
 # Candidates that are compared on a machine that was observed.
 _MOVED = 8
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
-_WORTH = 1.1
+_WORTH = 1.03
 
 
 class _Ranked(NamedTuple):

@@ -126,7 +126,7 @@ class CertifiedPolicy:
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None and not self._shows_disturbance(evidence):
+        if estimate is None and not self._tells_more(evidence):
             return Redesign(None, math.nan, evidence.unusable)
         gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
         best = math.nan if estimate is None else estimate.gap
@@ -238,11 +238,13 @@ class CertifiedPolicy:
             return bias, std, 0.0
         return 0.5 * (max(rests) + min(rests)), std, half
 
-    def _shows_disturbance(self, evidence: Evidence) -> bool:
-        """True where a window tells more of bias and friction than the setting in force answers to."""
+    def _tells_more(self, evidence: Evidence) -> bool:
+        """True where a window tells more of machine, bias or friction than the setting in force answers to."""
         gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
         if gains is None or not rested or evidence.estimate.ok:
             return False
+        if evidence.estimate.machine is not None:
+            return True
         fed, _ = self._input_bias(evidence)
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True
