@@ -20,13 +20,16 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
-from servotwin.simulation.ensemble import Cases, errors_back, summarise_members
+from servotwin.simulation.ensemble import Cases, errors_to_and_fro, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 
 NEAR = 0.02
 """Share of the step within which the loop has arrived."""
 COUNTS = 2.0
 """Counts of the position sensor within which the loop may hunt: a quantised loop without friction has no rest."""
+
+# Moves after the first one: an integral needs some until each is like the one before.
+_MOVES = 3
 
 # Half peak-to-peak of the error of a loop that has settled: shares of the step and of the lost motion. A limit cycle in
 # a gap is several times as large as the lost motion; where there is hardly a gap, only the step counts.
@@ -121,38 +124,31 @@ def assess(
     ]
 
 
-def costs_back(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:
-    """(P, C) s for every setting: integral of abs(error) per step of machines that move there and back again.
+def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:
+    """(P, C) s for every setting: integral of abs(error) per step of machines that move to and fro.
 
-    The way back begins where the way there ended, on the flank of the gap where the law leaves the motor. Of a sampled
-    loop it is the mean of both ways.
+    A move begins where the one before ended, on the flank of the gap where the law leaves the motor. The first one
+    counts in sampled loops only.
 
     Parameters
     ----------
     settings, members
         As for `assess`; the machines begin in the middle of their gaps.
     trial : Trial
-        Its duration is that of each way.
+        Its duration is that of each move.
     """
     laws, plants = _columns(settings, members)
     tolerance = np.array([setting.tolerance for setting in settings])[:, None, None]
     cases = Cases(members.step, members.gap, tolerance, 0.0, members.input_bias, members.friction)
     if laws[0, 0, 0].sample_rate is None:
-        sizes = errors_back(plants, laws, trial.duration, cases, trial.rate, trial.threads)
+        sizes = errors_to_and_fro(plants, laws, trial.duration, cases, _MOVES, trial.rate, trial.threads)
         return list(sizes * trial.duration / members.step)
     sampled = SampledCases(*cases, delay=members.delay, resolution=members.model.position_resolution)
-    there_and_back = PiecewiseCubic.held([0.0, trial.duration], [1.0, 0.0])
+    times = trial.duration * np.arange(_MOVES + 1)
+    reference = PiecewiseCubic.held(times, 1.0 - np.arange(_MOVES + 1) % 2)
+    length = trial.duration * (_MOVES + 1)
     figures = summarise_sampled(
-        plants,
-        laws,
-        2.0 * trial.duration,
-        sampled,
-        trial.last,
-        None,
-        ("error",),
-        trial.rate,
-        trial.threads,
-        there_and_back,
+        plants, laws, length, sampled, trial.last, None, ("error",), trial.rate, trial.threads, reference
     )
     return list(figures["error"].mean_size * trial.duration / members.step)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, costs_back
+from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, costs_to_and_fro
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
@@ -205,6 +205,7 @@ def _ranked_in_stages(question: Question, candidates: list[Design], running: Des
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
         gains = {_gains(each.setting.controller) for each in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
+        gains.add(_gains(question.servo.controller))
         candidates = plain + [c for c in candidates if c.controller.Ki and _gains(c.controller) in gains]
     if running is not None:
         candidates = list(dict.fromkeys([running, *candidates]))
@@ -222,13 +223,14 @@ def _compared(question: Question, ranked: list[_Ranked], running: Design | None)
     in the gap decides the cost of the next move.
     """
     demands, known = question.demands, question.uncertainty
-    shown = [k for k, each in enumerate(ranked) if not each.fails and (k < _MOVED or each.setting == running)]
+    own = _gains(question.servo.controller)
+    always = [each.setting == running or _gains(each.setting.controller) == own for each in ranked]
+    shown = [k for k, each in enumerate(ranked) if not each.fails and (k < _MOVED or always[k])]
     if not shown:
         return ranked
-    members = draw(
-        question.servo, known.replace(step=known.usual_step), demands.screened, demands.conditions, demands.seed
-    )
-    moves = costs_back([_quick(question, ranked[k].setting) for k in shown], members, question.trial.half.half)
+    known = known.replace(step=known.usual_step)
+    members = draw(question.servo, known, demands.screened, demands.conditions // 2, demands.seed)
+    moves = costs_to_and_fro([_quick(question, ranked[k].setting) for k in shown], members, question.trial.half.half)
     costs = [float(cost.mean()) + question.price(ranked[k].setting) for k, cost in zip(shown, moves, strict=True)]
     first = [ranked[k]._replace(cost=cost) for k, cost in zip(shown, costs, strict=True)]
     return sorted(first, key=lambda each: each.cost) + [each for k, each in enumerate(ranked) if k not in shown]

@@ -36,6 +36,8 @@ _SAME = 1e-3
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
+# Earlier rests without which a voltage at rest may be friction: the last window's may be the same rest.
+_RESTS_AGREE = 2
 # Friction holds the motor at up to so much more than half the difference of two rests.
 _HOLDS = 1.25
 
@@ -207,6 +209,8 @@ class CertifiedPolicy:
         if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
+        if self._may_be_friction(evidence):
+            return fed, (min(bias, 0.0) - spread, max(bias, 0.0) + spread)
         # Only a significant change: every new feedforward is an update at the edge.
         if abs(bias + fed) > spread:
             fed = min(max(-bias, -limit), limit)
@@ -238,6 +242,18 @@ class CertifiedPolicy:
             return bias, std, 0.0
         return 0.5 * (max(rests) + min(rests)), std, half
 
+    def _may_be_friction(self, evidence: Evidence) -> bool:
+        """True at the first rests, unless the motor's motion told friction: a voltage there is that of bias or friction.
+
+        Fed forward, a friction would push the wrong way after the next reversal.
+        """
+        alone = len(evidence.rests) < _RESTS_AGREE and self._motor(evidence) is None
+        return alone and self.uncertainty.friction[1] == 0.0 and self._moved(evidence.disturbance.bias)
+
+    def _moved(self, voltage: float) -> bool:
+        """True where a voltage at rest is no small change."""
+        return abs(voltage) > _BIAS_MOVED * self.smallest_answer
+
     def _tells_more(self, evidence: Evidence) -> bool:
         """True where a window tells more of machine, bias or friction than the setting in force answers to."""
         gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
@@ -267,6 +283,8 @@ class CertifiedPolicy:
             # Friction that is not significant counts at most as stated.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
+        if self._may_be_friction(evidence):
+            return low, max(high, abs(disturbance.bias) * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)
