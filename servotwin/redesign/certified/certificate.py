@@ -125,7 +125,7 @@ class Demands:
     tail: float = math.inf
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
-    shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.2, 0.85), (1.5, 0.85), (1.5, 0.7), (2.0, 0.7))
+    shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     known: float = 0.0726

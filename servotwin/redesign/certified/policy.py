@@ -218,7 +218,7 @@ class CertifiedPolicy:
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
         if self._may_be_friction(evidence):
-            return fed, (min(bias, 0.0) - spread, max(bias, 0.0) + spread)
+            return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
         # Only a significant change: every new feedforward is an update at the edge.
         if abs(bias + fed) > spread:
             fed = min(max(-bias, -limit), limit)
@@ -291,8 +291,6 @@ class CertifiedPolicy:
             # Friction that is not significant counts at most as stated.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
-        if self._may_be_friction(evidence):
-            return low, max(high, abs(disturbance.bias) * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         left = abs(disturbance.bias + now.feedforward)

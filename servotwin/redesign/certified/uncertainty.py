@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -131,7 +131,8 @@ class Uncertainty:
         ),
     ] = 0
     learnt: LearntFactors | None = None
-    usual_step: Range | None = None
+    # Not in the representation, which seeds the verification: its machines do not depend on this.
+    usual_step: Range | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
