@@ -251,7 +251,7 @@ class CertifiedPolicy:
         return 0.5 * (max(rests) + min(rests)), std, half
 
     def _may_be_friction(self, evidence: Evidence) -> bool:
-        """True at the first rests, unless the motor's motion told friction: a voltage there is that of bias or friction.
+        """True at the first rests, unless the motor's motion told friction: the voltage there is of bias or friction.
 
         Fed forward, a friction would push the wrong way after the next reversal.
         """
