@@ -17,6 +17,7 @@ from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
 from servotwin.estimation.whitened.free_model import (
+    BELIEVED,
     COMPLIANCE,
     FACTORS,
     LARGEST,
@@ -25,7 +26,7 @@ from servotwin.estimation.whitened.free_model import (
     FreeProblem,
     adapted,
 )
-from servotwin.estimation.whitened.reduction import NuisancePrior
+from servotwin.estimation.whitened.reduction import NuisancePrior, Point
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -50,7 +51,7 @@ class LearntFit:
     free : FreeFit
         In the same noise, with the factors' prior.
     problem : FreeProblem
-        That `free` solves.
+        Of which `free` is the minimum.
     """
 
     servo: Servo
@@ -59,14 +60,9 @@ class LearntFit:
     problem: FreeProblem
 
     @property
-    def prior(self) -> FactorPrior:
-        """What was known of the factors."""
-        return self.problem.prior
-
-    @property
     def beyond(self) -> str:
         """Sentence on a factor that lies at the end of what is allowed; empty where none does."""
-        low, high = self.prior.limits()
+        low, high = self.problem.prior.limits()
         ends = _AT_END * (high - low)
         for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
             if not least < factor < most:
@@ -78,7 +74,7 @@ class LearntFit:
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
-        return self.deviation(math.sqrt(self.free.covariance[0, 0]), calibration)
+        return math.sqrt(self._scale(calibration) * self.free.covariance[0, 0])
 
     def doubt(self, ramp: float, calibration: float) -> float:
         """Root mean square (rad) of what a soft screw and a ramp of the gap can do to it, besides the free factors.
@@ -91,18 +87,36 @@ class LearntFit:
         wide = replace(self.problem, reduction=replace(reduction, growth=growth), compliance=COMPLIANCE)
         residual, rows = wide.rows(np.array([*self.free.point, *self.free.factors]))
         solved = least_squares(rows, residual)
-        more = self.deviation(float(solved.deviations[0]), calibration) ** 2 - self.gap_std(calibration) ** 2
+        more = self._scale(calibration) * (float(solved.deviations[0]) ** 2 - self.free.covariance[0, 0])
         return math.hypot(float(solved.coefficients[0]), math.sqrt(max(0.0, more)))
-
-    def deviation(self, white: float, calibration: float) -> float:
-        """Standard deviation of a number from that for a residual of variance 1."""
-        return calibration * white * math.sqrt(max(1.0, self.aligned.whitened.variance))
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
-        scale = calibration**2 * max(1.0, self.aligned.whitened.variance)
-        covariance = scale * self.free.covariance[2:, 2:]
-        return MachineReading(tuple(self.free.factors.tolist()), tuple(covariance.ravel().tolist()))
+        return _reading(self.free.factors, self._scale(calibration) * self.free.covariance[2:, 2:])
+
+    def reading_of_either(self, single: Point, calibration: float) -> MachineReading | None:
+        """Factors after a window that a `single` contact explains as well as two.
+
+        Both fits count alike, and what they differ by is part of the spread. None: the factors are known well already,
+        or with what is known of them one contact does not explain the window.
+        """
+        low, high = self.problem.prior.limits()
+        if not np.any(high - low > 2.0 * LARGEST * np.array(_WIDE)) or self.beyond:
+            return None
+        one = self.problem.descend(np.array([self.problem.largest, single.place, *self.free.factors]), (False, True))
+        if one.cost > self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance):
+            return None
+        away = one.factors - self.free.factors
+        spread = 0.5 * self._scale(calibration) * (self.free.factor_covariance + one.factor_covariance)
+        return _reading(self.free.factors + 0.5 * away, spread + 0.25 * np.outer(away, away))
+
+    def _scale(self, calibration: float) -> float:
+        """Factor on covariances for a residual of variance 1."""
+        return calibration**2 * max(1.0, self.aligned.whitened.variance)
+
+
+def _reading(factors: Array, covariance: Array) -> MachineReading:
+    return MachineReading(tuple(factors.tolist()), tuple(covariance.ravel().tolist()))
 
 
 def learn_and_fit(
