@@ -97,7 +97,17 @@ def total(tallies: Sequence[Tally]) -> Tally:
     return whole
 
 
-HEADS = ("two contacts", "accepted", "after ten", "false", "worst, deg", "inside, %", "half-width, deg", "bounds above")
+HEADS = (
+    "two contacts",
+    "accepted",
+    "after ten",
+    "false",
+    "worst, deg",
+    "inside, %",
+    "by std, %",
+    "half-width, deg",
+    "bounds above",
+)
 
 
 def shown(view: str, tallies: dict[str, Tally]) -> Table:
@@ -114,6 +124,7 @@ def shown(view: str, tallies: dict[str, Tally]) -> Table:
 def _row(tally: Tally) -> tuple[str, ...]:
     late = f"{tally.accepted_late} of {tally.two_contacts_late}" if tally.two_contacts_late else "-"
     inside = f"{100.0 * tally.coverage:.1f}" if tally.accepted else "-"
+    by_std = f"{100.0 * tally.statistical:.1f}" if tally.accepted else "-"
     width = f"{math.degrees(tally.half_width):.3f}" if tally.accepted else "-"
     numbers = (tally.windows, tally.two_contacts, tally.accepted)
     return (
@@ -122,6 +133,7 @@ def _row(tally: Tally) -> tuple[str, ...]:
         str(tally.false),
         f"{math.degrees(tally.worst):.3f}",
         inside,
+        by_std,
         width,
         str(tally.above),
     )

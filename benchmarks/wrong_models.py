@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.estimator_windows import WindowCase, cut, random_servo
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, simulate
@@ -85,6 +85,8 @@ class Tally:
         Accepted, off by more than 0.1 deg and outside of their 95 % interval.
     inside : int
         Accepted with the gap inside the interval.
+    within : int
+        Accepted and off by at most 1.96 `std`, the statistical part of the spread.
     worst : float
         rad, the largest error of the false ones.
     above : int
@@ -102,6 +104,7 @@ class Tally:
     two_contacts_late: int = 0
     false: int = 0
     inside: int = 0
+    within: int = 0
     worst: float = 0.0
     above: int = 0
     half_widths: list[float] = field(default_factory=list)
@@ -119,6 +122,7 @@ class Tally:
         self.accepted += 1
         self.accepted_late += late and case.two_contacts
         self.inside += inside
+        self.within += error <= NORMAL_95 * estimate.std
         self.half_widths.append(0.5 * (estimate.interval[1] - estimate.interval[0]))
         if error > FALSE and not inside:
             self.false += 1
@@ -129,10 +133,16 @@ class Tally:
         """Add another tally's counts."""
         for name in ("windows", "two_contacts", "accepted", "accepted_late", "two_contacts_late", "false", "inside"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.within += other.within
         self.above += other.above
         self.worst = max(self.worst, other.worst)
         self.half_widths += other.half_widths
         self.examples += other.examples
+
+    @property
+    def statistical(self) -> float:
+        """Share of the accepted estimates within 1.96 of their own `std`."""
+        return self.within / self.accepted if self.accepted else math.nan
 
     @property
     def half_width(self) -> float:

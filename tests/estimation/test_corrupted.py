@@ -11,6 +11,7 @@ from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.reduced import reduced_response
 from servotwin.estimation.core.response import response
 from servotwin.estimation.core.variants import variants
+from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.channels import faults
@@ -47,6 +48,14 @@ def test_a_soft_screw_changes_the_position_in_proportion_to_its_compliance(masse
     angles = np.cumsum(np.where(np.arange(5000) < 1500, 2e-3, 0.0))[None]  # an abrupt start and end, as in contacts
     little, more = softened(servo, 0.005, angles), softened(servo, 0.02, angles)
     assert np.linalg.norm(more - little) < 0.06 * np.linalg.norm(little)
+
+
+def test_decimated_white_noise_is_told_from_coloured_noise():
+    rng, reduce = np.random.default_rng(1), decimation(9)
+    white = rng.standard_normal(400_000)
+    found = burg(reduce.rows(white[None]), 20)
+    assert found.unpredicted == pytest.approx(reduce.whiteness, rel=0.02)
+    assert decimation(1).whiteness == 1.0
 
 
 def moving_angle():

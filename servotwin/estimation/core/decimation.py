@@ -7,7 +7,7 @@ carry noise to low frequencies: within 6 % of the new rate it is down by more th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
 AVERAGES = 4
+_FREQUENCIES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,17 @@ class Decimation:
         out = np.empty((len(columns), columns.shape[1] // self.factor - AVERAGES + 1))
         decimate(columns, self.taps, self.factor, out)
         return out
+
+    @cached_property
+    def whiteness(self) -> float:
+        """Share of decimated white noise's variance that no earlier sample predicts: 1 without decimation.
+
+        Innovations have the geometric mean of the spectrum (Kolmogorov, Szego), a sample its arithmetic mean.
+        """
+        lags = [float(self.taps[lag * self.factor :] @ self.taps[: -lag * self.factor or None]) for lag in range(4)]
+        angles = np.pi * (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
+        spectrum = lags[0] + 2.0 * sum(value * np.cos(lag * angles) for lag, value in enumerate(lags) if lag > 0)
+        return float(np.exp(np.mean(np.log(spectrum)))) / lags[0] if self.factor > 1 else 1.0
 
 
 @lru_cache(maxsize=32)

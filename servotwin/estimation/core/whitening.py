@@ -45,9 +45,9 @@ class Autoregression:
         return self.spread.size - 1
 
     @property
-    def colour(self) -> float:
-        """Share of the variance that can be predicted; 0: white."""
-        return 1.0 - float(self.spread[-1] / self.spread[0]) ** 2 if self.spread[0] > 0.0 else 0.0
+    def unpredicted(self) -> float:
+        """Share of the variance that no earlier sample predicts; 1: white."""
+        return float(self.spread[-1] / self.spread[0]) ** 2 if self.spread[0] > 0.0 else 1.0
 
     def whiten(self, columns: Array) -> Array:
         """(k, n) rows as errors of prediction over their standard deviation, from the first sample on.

@@ -214,7 +214,7 @@ def _evidence(
         needed=travel_needed(gap, servo, settings),
         smallest=least_bound(servo.encoder_resolution),
         count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
-        colour=result.noise.colour,
+        colour=max(0.0, 1.0 - result.noise.unpredicted / result.reduction.decimation.whiteness),
     )
 
 

@@ -145,7 +145,7 @@ class FitEvidence:
     doubt : float
         rad, what a soft screw or a ramp of the gap may do to it besides a machine that is being learnt.
     colour : float
-        Share of the noise's variance that could be predicted; 0: white.
+        Share of the noise's variance that is predicted beyond that of decimated white noise; 0: white.
     """
 
     aligned: AlignedFit
