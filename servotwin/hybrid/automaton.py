@@ -119,8 +119,8 @@ class AutomatonStack:
     flows : (A, M, n, n) array
     rows : (A, M, G, n) array
         Guards; 0 where a mode has fewer.
-    resets : (A, M, G, n, n) array
-        0 where there is none.
+    resets : (A, M, G, n, n) or (1, M, G, n, n) array
+        0 where there is none; one where all automata have the same.
 
     Raises
     ------
@@ -184,8 +184,11 @@ def speeds(flows: Array) -> tuple[Array, Array]:
 def shared_flows(flows: Array) -> NDArray[np.int64]:
     """(M,) index of each mode's flow among the different ones of (..., M, n, n), in the order of appearance."""
     result: list[int] = []
+    first = flows.reshape(-1, *flows.shape[-3:])[0]
     for m in range(flows.shape[-3]):
-        same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))
+        # The flows of the first automaton tell most of them apart.
+        one, here = first[m], flows[..., m, :, :]
+        same = (k for k in range(m) if np.array_equal(first[k], one) and np.array_equal(flows[..., k, :, :], here))
         result.append(next((result[k] for k in same), max(result, default=-1) + 1))
     return np.array(result)
 
