@@ -158,8 +158,12 @@ class Wear(Struct, frozen=True):
         For a window older than the trend it is the present trend, not predicted.
         """
         trend = self._on_clock(settings, boot, time, now)
-        known = self.machine.prior(learning, now) if learning.learn and self.machine is not None else None
+        known = self.known_machine(learning, now)
         return Expectation(self.previous, trend and trend.predict(max(time, trend.time)), known)
+
+    def known_machine(self, learning: LearningSettings, now: float) -> FactorPrior | None:
+        """The machine's numbers as learnt, at a time (s, on the twin's clock); None: nothing, or learning is off."""
+        return self.machine.prior(learning, now) if learning.learn and self.machine is not None else None
 
     def update(
         self,

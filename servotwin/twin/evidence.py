@@ -210,19 +210,14 @@ class StoredExpectation(Struct, frozen=True):
     def of(cls, expected: Expectation) -> StoredExpectation:
         """The numbers of an expectation."""
         trend = None if expected.trend is None else TrendState.of(expected.trend)
-        known = expected.machine
-        if known is None:
-            return cls(float(expected.previous), trend)
-        numbers = MachineReading(tuple(known.mean.tolist()), tuple(known.covariance.ravel().tolist()))
-        return cls(float(expected.previous), trend, numbers)
+        machine = None if expected.machine is None else expected.machine.reading
+        return cls(float(expected.previous), trend, machine)
 
     def expectation(self, settings: TrendSettings) -> Expectation:
         """Make the expectation again, bit for bit."""
-        trend, numbers = None if self.trend is None else self.trend.trend(settings), self.machine
-        if numbers is None:
-            return Expectation(self.previous, trend)
-        known = FactorPrior(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
-        return Expectation(self.previous, trend, known)
+        trend = None if self.trend is None else self.trend.trend(settings)
+        machine = None if self.machine is None else FactorPrior.of_reading(self.machine)
+        return Expectation(self.previous, trend, machine)
 
 
 class StoredEstimate(Struct, frozen=True):

@@ -149,8 +149,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     decoded, records = DecodedWindow.of(message), list[Record]()
     if model.triage is not None and state.triage is not None and decoded.window is not None:
         requested = state.requests is not None and state.requests.pending is not None
-        trend = state.wear.trend(trends)
-        triage, glance = model.triage.glance(state.triage, message, decoded.window, trend, requested)
+        trend, known = state.wear.trend(trends), state.wear.known_machine(learning, arrived)
+        triage, glance = model.triage.glance(state.triage, message, decoded.window, trend, requested, known)
         state = replace(state, triage=triage)
         if glance is not None:
             records.append(GlanceRecord(message, glance, decoded.tail))
@@ -172,7 +172,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     if model.triage is not None and state.triage is not None and not stale:
-        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
+        known = state.wear.known_machine(learning, arrived)
+        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
         state = replace(state, triage=triage)
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
@@ -197,7 +198,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     state = replace(state, versions=versions, tuned_for=float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
-    unverified = VerificationRequest.of(versions.pending, redesign)
+    unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + requests, all_records)
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-from twin_messages import eq_21
+from twin_messages import eq_21, message_of
 
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from benchmarks.glances import triage as bench
@@ -24,7 +24,6 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance, quick_bias
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
-from servotwin.messages import pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
@@ -60,28 +59,6 @@ def calm_windows() -> tuple[messages.WindowMessage, ...]:
     scenario = Scenario.preset("certified")
     scenario = scenario.replace(gap=25.0 * DEG, duration=125.0, twin=scenario.twin.replace(demands=demands))
     return cosimulate(scenario).windows
-
-
-def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
-    channels = []
-    for name, samples in window.channels.items():
-        unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
-        packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
-        channels += packed
-    told = {"version": 0, "reason": "reference", "boot": "b", **changes}
-    return messages.WindowMessage(
-        "axis",
-        told["boot"],
-        sequence,
-        told.get("start", window.start),
-        window.sample_rate,
-        tuple(channels),
-        (),
-        told["version"],
-        "m",
-        told["reason"],
-        messages.checksum(channels),
-    )
 
 
 def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
@@ -359,9 +336,13 @@ def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
 def test_the_bench_says_how_often_a_glance_errs(tmp_path) -> None:
     output = tmp_path / "triage.json"
     rows = bench(output=output, gaps=2, console=Console(file=io.StringIO()))
-    for row in rows:
+    *exact, off, once, thrice = rows
+    for row in (*exact, thrice):
         assert row.seen[0] < 0.1
-        assert row.seen[-1] == 1.0
+        assert row.seen[-1] >= (1.0 if row in exact else 0.9)
+    assert off.seen[0] > 0.9
+    assert once.seen[0] < 0.2
+    for row in rows:
         assert list(row.seen) == sorted(row.seen)
         assert 0.0 < row.least <= row.median
-    assert len(json.loads(output.read_text())["rows"]) == len(rows) == 3
+    assert len(json.loads(output.read_text())["rows"]) == len(rows) == 6

@@ -20,6 +20,7 @@ import numpy as np
 from servotwin.estimation.core.contacts import travel
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
@@ -54,6 +55,16 @@ class FactorPrior:
     def of_spreads(cls, k: float, c: float, pitch: float, ratio: float = 0.03) -> FactorPrior:
         """Make a prior of independent factors about 1, with relative standard deviations."""
         return cls(np.zeros(4), np.diag(np.square([k, c, pitch, ratio])))
+
+    @classmethod
+    def of_reading(cls, numbers: MachineReading) -> FactorPrior:
+        """Make a prior of plain numbers, bit for bit."""
+        return cls(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
+
+    @property
+    def reading(self) -> MachineReading:
+        """The same as plain numbers."""
+        return MachineReading(tuple(self.mean.tolist()), tuple(self.covariance.ravel().tolist()))
 
     @cached_property
     def root(self) -> Array:

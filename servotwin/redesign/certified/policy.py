@@ -17,7 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LAG, LearntMotor
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.free_model import adapted
+from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -121,7 +121,7 @@ class CertifiedPolicy:
         the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
-        learnt = _learnt(self.servo, self.uncertainty, evidence)
+        learnt = learnt_servo(self.servo, self.uncertainty, evidence.machine, evidence.motor)
         return self.decide(evidence, self if learnt is None else _LearntVerifier(self, *learnt))
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
@@ -166,12 +166,20 @@ class CertifiedPolicy:
             return found
         return replace(other, looked_at=found.looked_at + 1, seconds=found.seconds + other.seconds)
 
-    def confirm(self, region: Region, setting: Design) -> Certificate | NotVerified:
-        """Verify one setting for a region, by simulation."""
-        known = region.within(self.uncertainty)
-        return confirm(
-            self.servo, known, setting, self.demands_within_band(), self.simulations, region.noise, self.clock
-        )
+    def confirm(
+        self,
+        region: Region,
+        setting: Design,
+        machine: FactorPrior | None = None,
+        motor: LearntMotor | None = None,
+    ) -> Certificate | NotVerified:
+        """Verify one setting for a region, by simulation, on machine and motor as learnt where they were."""
+        servo, known = self.servo, region.within(self.uncertainty)
+        learnt = learnt_servo(servo, self.uncertainty, machine, motor)
+        if learnt is not None:
+            servo, known = learnt[0], _narrowed(known, learnt[1])
+        demands = self.demands_within_band()
+        return confirm(servo, known, setting, demands, self.simulations, region.noise, self.clock)
 
     def demands_within_band(self) -> Demands:
         """Demands with the fallback set's band as a bound; a dead zone must open the loop inside of that band."""
@@ -288,26 +296,31 @@ class _LearntVerifier:
     provisional: ClassVar[bool] = False
 
     def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
-        known = region.within(self.policy.uncertainty)
-        # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
-        known = known.replace(learnt=self.learnt, m=0.0 if "k" in self.learnt.names else known.m)
+        known = _narrowed(region.within(self.policy.uncertainty), self.learnt)
         return self.policy.verify_on(self.servo, known, region, running)
 
     def fallback(self) -> Certificate:
         return self.policy.fallback()
 
 
-def _learnt(servo: Servo, known: Uncertainty, evidence: Evidence) -> tuple[Servo, LearntFactors] | None:
+def _narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
+    """Prior knowledge with what was learnt in place of the stated half-widths."""
+    # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
+    return known.replace(learnt=learnt, m=0.0 if "k" in learnt.names else known.m)
+
+
+def learnt_servo(
+    servo: Servo, known: Uncertainty, machine: FactorPrior | None, motor: LearntMotor | None
+) -> tuple[Servo, LearntFactors] | None:
     """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
 
     The motor's numbers count where the windows told more of them than was stated.
     """
     names, variances = list[str](), list[Array]()
-    machine, motor = evidence.machine, evidence.motor
     if machine is not None:
         servo = adapted(servo, machine.mean)
-        names += ["k", "c"]
-        variances.append(machine.covariance[:2, :2] + np.diag([_LEAST_K**2, _LEAST_C**2]))
+        names += ["k", "c", "p"]
+        variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
     if motor is not None:
         for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
             relative = motor.std(index) / (1.0 + motor.mean[index])
