@@ -9,26 +9,24 @@ point value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import islice
 from time import perf_counter
-
-import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import COUNTS, assess
-from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
+from servotwin.redesign.certified.assess import COUNTS
+from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
+from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
-# Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
-_FAST = 10.0
 
 
 def certify(
@@ -111,10 +109,16 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
+def _shortlist(ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
     """The first candidates, then as many without integral action and dead zone, which settle most surely."""
-    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
-    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
+    plain = 0
+    for place, setting in enumerate(ranked):
+        is_plain = not setting.controller.Ki and not setting.tolerance
+        if place < attempts or (is_plain and plain < attempts):
+            yield setting
+        plain += is_plain
+        if place + 1 >= attempts and plain >= attempts:
+            return
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
@@ -177,37 +181,13 @@ def _gains(law: Controller) -> tuple[float, float, float]:
     return law.Kp, law.Kd, law.Tf
 
 
-def _ranked_in_stages(question: Question, candidates: list[Design]) -> list[Design]:
-    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only."""
+def _ranked_in_stages(question: Question, candidates: list[Design]) -> Iterator[Design]:
+    """Candidates in the order of their screening: integral action is tried with the best gains without it only."""
     plain = [setting for setting in candidates if not setting.controller.Ki]
+    screening = Screening(question)
     if not plain or len(plain) == len(candidates):
-        return _ranked(question, candidates)
-    gains = {_gains(setting.controller) for setting in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
+        return screening.ranked(candidates)
+    best = islice(screening.ranked(plain), _GAINS_WITH_INTEGRAL)
+    gains = {_gains(setting.controller) for setting in best}
     with_integral = [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
-    return _ranked(question, plain + with_integral)
-
-
-def _ranked(question: Question, candidates: list[Design]) -> list[Design]:
-    """Candidates that meet the demands on a few machines first, then by cost."""
-    demands = question.demands
-    members = draw(question.servo, question.uncertainty, demands.screened, demands.conditions, demands.seed)
-    measures = assess([_quick(question, setting) for setting in candidates], members, question.trial.half)
-
-    def rank(k: int) -> tuple[bool, float]:
-        few = measures[k]
-        fails = float(np.mean(few.settled)) < demands.settled or few.overshoot.max() > demands.overshoot
-        fails = fails or bool(few.tail.max() > ROUNDED * question.largest_error(candidates[k]))
-        return fails, question.cost(candidates[k], few)
-
-    return [candidates[k] for k in sorted(range(len(candidates)), key=rank)]
-
-
-def _quick(question: Question, setting: Design) -> Design:
-    """The setting as it is ranked: in continuous time where the rate is so high that the order is the same there.
-
-    The verification is at the rate in any case.
-    """
-    rate = setting.controller.sample_rate
-    if rate is None or rate < _FAST * question.trial.rate:
-        return setting
-    return Design(setting.controller.replace(sample_rate=None), setting.tolerance)
+    return screening.ranked(plain + with_integral)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servotwin.redesign.certified.assess import MachineMeasures, assess, joined
 from servotwin.redesign.certified.attempt import ROUNDED, Question
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, draw
+from servotwin.redesign.certified.uncertainty import draw
 from servotwin.redesign.design import Design
 
 # Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
@@ -86,7 +86,7 @@ class Screening:
     def _simulated(self, settings: list[Design], first: int, last: int) -> list[MachineMeasures]:
         """Measures on the machines at places first .. last - 1 of the order."""
         assert self._order is not None
-        machines = _each(self._members, self._order[first:last])
+        machines = self._members.each(self._order[first:last])
         return assess([self._quick(each) for each in settings], machines, self.question.trial.half, self._largest)
 
     def _quick(self, setting: Design) -> Design:
@@ -104,15 +104,9 @@ class Screening:
 
     def _rank(self, setting: Design, place: int) -> _Rank:
         demands, few = self.question.demands, self._known[setting]
-        most = 1.0 - np.sum(~few.settled) / self._members.count
-        fails = bool(most < demands.settled) or bool(few.overshoot.max() > demands.overshoot)
+        most = self._members.count - int(np.sum(~few.settled))
+        fails = most / self._members.count < demands.settled or bool(few.overshoot.max() > demands.overshoot)
         fails = fails or bool(few.tail.max() > ROUNDED * self.question.largest_error(setting))
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
         return _Rank(fails, self.question.cost(setting, costs), place)
-
-
-def _each(members: SimulatedMachines, places: NDArray[np.int64]) -> SimulatedMachines:
-    """Machines at flat places, each with its plant in one condition."""
-    plant = places // members.gap.shape[1]
-    return members.chosen(plant, places % members.gap.shape[1])
