@@ -172,10 +172,11 @@ def speeds(flows: Array) -> tuple[Array, Array]:
     ratio below 1 / sqrt(2)."""
     # Constant states only add eigenvalues of zero, and equal flows have equal eigenvalues.
     moving = np.flatnonzero(flows.any(axis=(*range(flows.ndim - 2), flows.ndim - 1)))
-    different = np.unique(shared_flows(flows), return_index=True)[1]
     if moving.size == 0:
         return np.zeros(flows.shape[:-3]), np.zeros(flows.shape[:-3])
-    values = np.linalg.eigvals(flows[..., different, :, :][..., moving[:, None], moving])
+    among = np.ascontiguousarray(flows[..., moving[:, None], moving])
+    different = np.unique(shared_flows(among), return_index=True)[1]
+    values = np.linalg.eigvals(among[..., different, :, :])
     sizes = np.abs(values)
     lasting = np.where(values.real > -sizes / np.sqrt(2.0), sizes, 0.0)
     return sizes.max(axis=(-2, -1)), lasting.max(axis=(-2, -1))

@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -304,15 +304,7 @@ def _machines(plants: tuple[Servo, ...], uncertainty: Uncertainty, places: Array
 
 
 def _scaled_plants(servo: Servo, factors: Array) -> tuple[Servo, ...]:
-    return tuple(_scaled(servo, dict(zip(PARAMETERS, row.tolist(), strict=True))) for row in factors)
-
-
-def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
-    changes: dict[str, Any] = {}
-    for name, factor in factors.items():
-        value = getattr(servo, name)
-        changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-    return servo.replace(**changes)
+    return tuple(servo.scaled(dict(zip(PARAMETERS, row, strict=True))) for row in factors.tolist())
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
