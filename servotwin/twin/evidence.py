@@ -5,6 +5,7 @@ Bodies are MessagePack, every double with all its bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from servotwin.messages import (
     Answer,
     Fallback,
     Hello,
+    LearntResponse,
     ParameterMessage,
     Receipt,
     Request,
@@ -119,7 +121,7 @@ class WithdrawalRecord(NamedTuple):
 Record = (
     GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | RedesignRecord
     | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
-    | Update | Request | Receipt | Fallback | Answer | Hello
+    | Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
 """Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
 
@@ -142,6 +144,7 @@ class EvidenceLog:
     excitations: dict[WindowId, Decision] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
     requests: list[Request] = field(default_factory=list)
+    responses: list[LearntResponse] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
     fallbacks: list[Fallback] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
@@ -189,6 +192,8 @@ class EvidenceLog:
                 self.updates.append(record)
             case Request():
                 self.requests.append(record)
+            case LearntResponse():
+                self.responses.append(record)
             case Receipt():
                 self.receipts.append(record)
             case Fallback():
@@ -291,6 +296,9 @@ def _row(record: Record) -> EvidenceRecord | None:
             return row._replace(gap=record.gap, std=record.std, window=window_key)
         case Request():
             return _sent("request", record, record.reason)
+        case LearntResponse():
+            spread = math.degrees(record.gap_std)
+            return _sent("response", record, f"version {record.version} of the structure, gap to {spread:.2g} deg")
         case Receipt():
             return _sent("receipt", record, record.reason.value, record.version)
         case Fallback():

@@ -81,9 +81,9 @@ class Question:
 
     def cost(self, setting: Design, costs: Array) -> float:
         """s: 95th percentile of the error's integral per step (s, of each machine), plus the price of the noise."""
-        return float(np.percentile(costs, 95.0)) + self._price(setting)
+        return float(np.percentile(costs, 95.0)) + self.price(setting)
 
-    def _price(self, setting: Design) -> float:
+    def price(self, setting: Design) -> float:
         """s, price of the noise in the voltage."""
         law = setting.controller
         if not self.noise:
