@@ -78,19 +78,24 @@ class SampledEngine:
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
-        chain = [i for i, name in enumerate(names) if name.startswith("chain")]
-        recorded = [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
         return Port(
             names.index("voltage"),
             int(np.argmax(self.plant.rows["position"][0])),
             self.servo.position_resolution,
-            np.array(recorded),
+            1 if self.servo.position_resolution > 0.0 else 0,
+            np.array(self._recorded()),
             self.tick_every,
             self.record_every,
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
             np.zeros(self.delay),
         )
+
+    def _recorded(self) -> list[int]:
+        """States that are written at every sample."""
+        names = self.plant.automaton.names
+        chain = [i for i, name in enumerate(names) if name.startswith("chain")]
+        return [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
 
     @property
     def index(self) -> int:
@@ -116,10 +121,7 @@ class SampledEngine:
             self._run_through(base, jumps)
         self._run(end)
         if index == self.samples - 1:
-            tick_inputs = self.tick_inputs(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
-            self.law_state = tick_and_record(
-                self.base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
-            )
+            self._tick_and_record(self.base)
             self.finished = True
 
     def make_room(self, index: int) -> None:
@@ -195,10 +197,7 @@ class SampledEngine:
 
     def _run_through(self, base: int, jumps: list[Jump]) -> None:
         """One base step in which the gap's cubic changes."""
-        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
-        self.law_state = tick_and_record(
-            base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
-        )
+        self._tick_and_record(base)
         at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
         end = (base + 1) * self.port.searches
         steps, fractions, values, modes = schedule_of(jumps, self.step, self.plant.automaton, end)
@@ -212,6 +211,13 @@ class SampledEngine:
             self.record.size[0] = 0
             self._check(status)
         self.mode, self.base = int(at[1]), base + 1
+
+    def _tick_and_record(self, base: int) -> None:
+        """What is due at a base step, without the flow after it."""
+        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
+        self.law_state = tick_and_record(
+            base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
+        )
 
     def _check(self, status: int) -> None:
         if status == ZENO:

@@ -24,6 +24,7 @@ class Port(NamedTuple):
     voltage: int
     position: int
     resolution: float
+    counted: int  # 1: the sensor counts, 0: it is ideal
     recorded: NDArray[np.int64]  # states written at every recorded step
     tick_every: int
     record_every: int
@@ -54,12 +55,19 @@ class Output(NamedTuple):
 
 @inlined
 def take_tick(
-    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, tick_inputs: TickInputs, output: Output
+    i: int,
+    position: float,
+    parameters: LawParameters,
+    state: LawState,
+    port: Port,
+    tick_inputs: TickInputs,
+    output: Output,
 ) -> LawState:
-    """Measure, tick, hold the voltage (that of `delayed.size` ticks ago)."""
-    k = i - tick_inputs.first
-    y = x[port.position] + tick_inputs.noise[k]
-    if port.resolution > 0.0:
+    """Measure, tick."""
+    k = np.uint64(i - tick_inputs.first)
+    y = position + tick_inputs.noise[k]
+    # A loop, for a branch would be compiled as a choice, and the tick would wait for a division without need.
+    for _ in range(port.counted):
         y = np.round(y / port.resolution) * port.resolution
     now = LawParameters(
         parameters.Kp,
@@ -77,15 +85,21 @@ def take_tick(
         parameters.acting_inside,
     )
     state = tick(now, state, tick_inputs.reference[k], y)
-    if port.delayed.size == 0:
-        x[port.voltage] = state.voltage
-    else:
-        place = i % port.delayed.size
-        x[port.voltage] = port.delayed[place]
-        port.delayed[place] = state.voltage
-    output.measured[i - output.first_tick] = y
-    output.active[i - output.first_tick] = 1 if state.active > 0.5 else 0
+    at = np.uint64(i - output.first_tick)
+    output.measured[at] = y
+    output.active[at] = 1 if state.active > 0.5 else 0
     return state
+
+
+@inlined
+def to_hold(i: int, voltage: float, port: Port) -> float:
+    """The voltage to hold from tick i on: that of `delayed.size` ticks ago."""
+    if port.delayed.size == 0:
+        return voltage
+    place = i % port.delayed.size
+    held = port.delayed[place]
+    port.delayed[place] = voltage
+    return held
 
 
 @inlined
@@ -101,7 +115,9 @@ def tick_and_record(
 ) -> LawState:
     """Tick and record where they are due at a base step, before the plant flows on."""
     if base % port.tick_every == 0:
-        state = take_tick(base // port.tick_every, x, parameters, state, port, tick_inputs, output)
+        i, position = base // port.tick_every, x[port.position]
+        state = take_tick(i, position, parameters, state, port, tick_inputs, output)
+        x[port.voltage] = to_hold(i, state.voltage, port)
     if base % port.record_every == 0:
         write_sample(base // port.record_every, x, port, output)
     return state
@@ -131,7 +147,8 @@ def run_ticks(
         if record.size[1] > port.room:
             return FULL, base, mode, state
         if to_tick == 0:
-            state = take_tick(i, x, parameters, state, port, tick_inputs, output)
+            state = take_tick(i, x[port.position], parameters, state, port, tick_inputs, output)
+            x[port.voltage] = to_hold(i, state.voltage, port)
             to_tick = port.tick_every
             i += 1
         if to_record == 0:
