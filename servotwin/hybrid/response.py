@@ -231,10 +231,10 @@ def begin_block(r: Responses, mode: int, held: int, fresh: bool, x: Array, memor
 @inlined
 def hold_input(r: Responses, mode: int, j: int, u: float, memory: ResponseMemory) -> None:
     """Add the response to the input of tick j, but for the position one tick later."""
-    at = np.uint64(mode * 4 * TICKS + 2 * TICKS - j)
+    at = np.uint64(mode * 4 * TICKS + 2 * TICKS) - np.uint64(j)
     for k in range(np.uint64(memory.position.size)):
         memory.position[k] += r.pulse[at + k] * u
-    memory.start[memory.start.size - TICKS + j] = u
+    memory.start[np.uint64(memory.start.size - TICKS) + np.uint64(j)] = u
 
 
 @inlined

@@ -23,7 +23,7 @@ from servotwin.hybrid.response import (
     hold_input,
 )
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.ticks import Output, Port, TickInputs, take_tick, to_hold
+from servotwin.simulation.ticks import Output, Port, TickInputs, measured, tick_between, to_hold
 
 LAW_STATES = 6 * TICKS
 """Numbers of the law's states after the ticks of a block."""
@@ -71,7 +71,7 @@ def note_block(blocks: PlantBlocks, tick: int, mode: int, x: Array) -> None:
 @inlined
 def store(state: LawState, law_states: Array, j: int) -> None:
     """Keep the law's state after a tick of the block."""
-    at = np.uint64(j * 6)
+    at = np.uint64(j) * np.uint64(6)
     law_states[at], law_states[at + np.uint64(1)] = state.integral, state.derivative
     law_states[at + np.uint64(2)], law_states[at + np.uint64(3)] = state.filtered, state.voltage
     law_states[at + np.uint64(4)], law_states[at + np.uint64(5)] = state.active, state.offset
@@ -101,17 +101,24 @@ def take_ticks(
 ) -> LawState:
     """The ticks of a block, one after the other, as if no guard fired."""
     delay, soon, voltage, coming = port.delayed.size, r.next[mode], recent, memory.position[0]
-    for j in range(count):
+    begin, row = tick - tick_inputs.first, tick - output.first_tick
+    references, noises = tick_inputs.reference[begin : begin + count], tick_inputs.noise[begin : begin + count]
+    enters, leaves = tick_inputs.enter[begin : begin + count], tick_inputs.leave[begin : begin + count]
+    voltages, positions = output.states[0, row : row + count], output.states[1, row : row + count]
+    measurements, actives = output.measured[row : row + count], output.active[row : row + count]
+    for j in range(np.uint64(count)):
         # The newest voltage is added here, and the next position read before it is added there: through memory the
         # next tick would wait for it.
-        position, coming = coming + soon * voltage, memory.position[np.uint64(j + 1)]
-        state = take_tick(tick + j, position, parameters, state, port, tick_inputs, output)
+        position, coming = coming + soon * voltage, memory.position[j + np.uint64(1)]
+        y = measured(position, noises[j], port)
+        state = tick_between(parameters, enters[j], leaves[j], state, references[j], y)
         store(state, law_states, j)
         voltage = state.voltage
         if delay > 0:
-            voltage = port.delayed[(tick + j) % delay] if j < delay else law_states[(j - delay) * 6 + 3]
-        sample = np.uint64(tick + j - output.first_sample)
-        output.states[0, sample], output.states[1, sample] = voltage, position
+            early = int(j) < delay
+            voltage = port.delayed[(tick + int(j)) % delay] if early else law_states[(int(j) - delay) * 6 + 3]
+        voltages[j], positions[j], measurements[j] = voltage, position, y
+        actives[j] = 1 if state.active > 0.5 else 0
         hold_input(r, mode, j, voltage, memory)
     return state
 

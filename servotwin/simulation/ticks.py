@@ -54,6 +54,39 @@ class Output(NamedTuple):
 
 
 @inlined
+def measured(position: float, noise: float, port: Port) -> float:
+    """The measurement: noise, then whole counts."""
+    y = position + noise
+    # A loop, for a branch would be compiled as a choice, and the tick would wait for a division without need.
+    for _ in range(port.counted):
+        y = np.round(y / port.resolution) * port.resolution
+    return y
+
+
+@inlined
+def tick_between(
+    parameters: LawParameters, enter: float, leave: float, state: LawState, reference: float, y: float
+) -> LawState:
+    """The edge's tick with its thresholds of the instant."""
+    now = LawParameters(
+        parameters.Kp,
+        parameters.integral_step,
+        parameters.derivative_gain,
+        parameters.filter_step,
+        enter,
+        leave,
+        parameters.voltage_limit,
+        parameters.rate_step,
+        parameters.loop_step,
+        parameters.tracking_step,
+        parameters.feedforward,
+        parameters.release_step,
+        parameters.acting_inside,
+    )
+    return tick(now, state, reference, y)
+
+
+@inlined
 def take_tick(
     i: int,
     position: float,
@@ -63,29 +96,10 @@ def take_tick(
     tick_inputs: TickInputs,
     output: Output,
 ) -> LawState:
-    """Measure, tick."""
-    k = np.uint64(i - tick_inputs.first)
-    y = position + tick_inputs.noise[k]
-    # A loop, for a branch would be compiled as a choice, and the tick would wait for a division without need.
-    for _ in range(port.counted):
-        y = np.round(y / port.resolution) * port.resolution
-    now = LawParameters(
-        parameters.Kp,
-        parameters.integral_step,
-        parameters.derivative_gain,
-        parameters.filter_step,
-        tick_inputs.enter[k],
-        tick_inputs.leave[k],
-        parameters.voltage_limit,
-        parameters.rate_step,
-        parameters.loop_step,
-        parameters.tracking_step,
-        parameters.feedforward,
-        parameters.release_step,
-        parameters.acting_inside,
-    )
-    state = tick(now, state, tick_inputs.reference[k], y)
-    at = np.uint64(i - output.first_tick)
+    """Measure, tick, record both."""
+    k, at = np.uint64(i - tick_inputs.first), np.uint64(i - output.first_tick)
+    y = measured(position, tick_inputs.noise[k], port)
+    state = tick_between(parameters, tick_inputs.enter[k], tick_inputs.leave[k], state, tick_inputs.reference[k], y)
     output.measured[at] = y
     output.active[at] = 1 if state.active > 0.5 else 0
     return state
