@@ -34,7 +34,7 @@ from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
-_CHUNK = 1 << 15
+_CHUNK, _FIRST_CHUNK = 1 << 15, 1 << 12
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -145,16 +145,27 @@ class SampledEngine:
     def tick_inputs(self, first: int, last: int) -> TickInputs:
         """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
-        times = np.arange(first, first + count) / self.tick_rate
+        enter, leave = self._thresholds(first, count)
+        reference = self._on_ticks(self.inputs.reference, first, count)
+        return TickInputs(first, reference, self.draws.take(count), enter, leave)
+
+    def _on_ticks(self, signal: PiecewiseCubic, first: int, count: int) -> Array:
+        held = signal.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
+        return np.full(count, held) if held is not None else signal.on(np.arange(first, first + count) / self.tick_rate)
+
+    def _thresholds(self, first: int, count: int) -> tuple[Array, Array]:
+        """Thresholds of the dead zone at ticks."""
         if self.inputs.tolerance is None:
-            enter = leave = np.full(count, -1.0)
-        else:
-            tolerance = self.inputs.tolerance.on(times)
-            # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
-            zero = tolerance == 0.0
-            enter = np.where(zero, -1.0, self.controller.enter * tolerance)
-            leave = np.where(zero, -1.0, self.controller.leave * tolerance)
-        return TickInputs(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
+            return np.full(count, -1.0), np.full(count, -1.0)
+        held = self.inputs.tolerance.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
+        if held is not None:
+            enter, leave = self.controller.thresholds(held)
+            return np.full(count, enter), np.full(count, leave)
+        tolerance = self._on_ticks(self.inputs.tolerance, first, count)
+        # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
+        zero = tolerance == 0.0
+        enter = np.where(zero, -1.0, self.controller.enter * tolerance)
+        return enter, np.where(zero, -1.0, self.controller.leave * tolerance)
 
     def _run(self, end: int) -> None:
         if self.noise is None or end - self.base <= _CHUNK:
@@ -162,15 +173,16 @@ class SampledEngine:
                 stop = min(end, self.base + _CHUNK)
                 self.flow(stop, self._inputs_until(self.base, stop))
             return
-        # The noise of the next chunk is drawn while this one runs.
+        # The noise of the next chunk is drawn while this one runs; the first one, which is waited for, is short.
         with ThreadPoolExecutor(1) as pool:
-            coming = pool.submit(self._inputs_until, self.base, self.base + _CHUNK)
+            stop = min(end, self.base + _FIRST_CHUNK)
+            coming = pool.submit(self._inputs_until, self.base, stop)
             while self.base < end:
-                stop = min(end, self.base + _CHUNK)
-                tick_inputs = coming.result()
+                tick_inputs, following = coming.result(), min(end, stop + _CHUNK)
                 if stop < end:
-                    coming = pool.submit(self._inputs_until, stop, min(end, stop + _CHUNK))
+                    coming = pool.submit(self._inputs_until, stop, following)
                 self.flow(stop, tick_inputs)
+                stop = following
 
     def _inputs_until(self, base: int, end: int) -> TickInputs:
         """Inputs of the ticks from one base step up to another."""
