@@ -206,7 +206,8 @@ _WITH = {"sampled": ("sampled", "counts", "calm", "quiet")}
 
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of workloads in their usual order, whatever their case; none means all, and sampled brings counts, calm and quiet along.
+    """Names of workloads in their usual order, whatever their case; none means all, and sampled brings counts,
+    calm and quiet along.
 
     Raises
     ------

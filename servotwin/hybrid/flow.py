@@ -99,7 +99,7 @@ def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out:
 @inlined
 def wide_product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
     """The same for sixteen columns and a multiple of eight rows, in one go."""
-    at, step, one = np.uint64(base), np.uint64(stride), np.uint64(1)
+    at, step = np.uint64(base), np.uint64(stride)
     x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
     x8, x9, xa, xb, xc, xd, xe, xf = x[8], x[9], x[10], x[11], x[12], x[13], x[14], x[15]
     for r in range(np.uint64(rows)):

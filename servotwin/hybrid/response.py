@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.hybrid.automaton import Array, Automaton, Guard
+from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import inlined
 from servotwin.hybrid.flow import LINGERING, dot, dot_sizes, rounding, tall_product, wide_product
 from servotwin.hybrid.tables import NODES_FINE, Tables, aligned, zeros
@@ -24,19 +24,19 @@ TICKS = 8
 
 
 class Responses(NamedTuple):
-    """Flat tables of `M` modes, `n` states and at most `L` lanes a tick; inputs follow the states in every table."""
+    """Flat tables of `M` modes, `n` states, `G` guards and at most `L` lanes a tick; inputs follow the states."""
 
     lanes: int
     lane_count: NDArray[np.int64]  # (M,) lanes of each mode
-    position: Array  # M * n * 8: at this block's ticks, of the state with the input left out
-    ahead: Array  # M * n * (n + 8): the same at the next block's ticks, and the change of the state in this one
+    position: Array  # M * n * 8: the position at this block's ticks, of the state with the input left out
+    ahead: Array  # M * n * (8 + n): the same at the next block's ticks, and the change of the state in this one
     pulse: Array  # M * 32: the position -16 .. 15 ticks after an input's tick, zero up to one tick after it
     next: Array  # M: the position one tick after it
     watch: Array  # M * (n + 8) * (L * 8): lanes, tick after tick, as many as the mode has, of its columns
     held: Array  # M * 8 * n: change of the state in a block, of the inputs
     step: Array  # M * 8 * (n + 8) * n: change of the state after 1 .. 8 ticks
-    columns: NDArray[np.int64]  # M * n: states on which lanes depend
-    column_count: NDArray[np.int64]  # (M,) of them and the inputs, a multiple of eight
+    columns: NDArray[np.int64]  # M * n: states on which lanes depend, then the others
+    column_count: NDArray[np.int64]  # (M,) of the former and the inputs, a multiple of eight
     slow: NDArray[np.bool_]  # (M,) where guards hardly change in a block: a bound of their change is tried first
     reach: Array  # M * G * (n + 8): largest change of a guard in a block, of the sizes of state and inputs
     guard: NDArray[np.int64]  # (M, L): the guard of each lane, -1: none
@@ -53,6 +53,29 @@ class ResponseMemory(NamedTuple):
     change: Array  # n
 
 
+class _Mode(NamedTuple):
+    """One mode over the ticks of this block and the next one."""
+
+    rows: tuple[Array, ...]  # of its guards, (n,) each
+    powers: list[Array]  # 1 .. 15 of a tick's map without its input, less one
+    pulses: list[Array]  # states that a pulse leaves after 1 .. 15 ticks
+    lanes: Array  # rows (lanes, n) of the state after the tick
+    owners: list[int]  # the guard of every lane
+    held: int  # index of the input
+
+    def seen(self, rows: Array, ticks: int = TICKS) -> Array:
+        """(ticks, R, n + 8): rows of the state after the tick, of the state at the start and the block's inputs."""
+        n = rows.shape[1]
+        out = np.zeros((ticks, len(rows), n + TICKS))
+        delayed = [rows[:, self.held], *(rows @ pulse for pulse in self.pulses)]
+        for j in range(ticks):
+            out[j, :, :n] = rows + (rows @ self.powers[j - 1] if j else 0.0)
+            out[j, :, self.held] = 0.0
+            for i in range(min(j + 1, TICKS)):
+                out[j, :, n + i] = delayed[j - i]
+        return out
+
+
 def new_response_memory(r: Responses, states: int) -> ResponseMemory:
     """Working memory for one run."""
     return ResponseMemory(
@@ -65,49 +88,36 @@ def new_response_memory(r: Responses, states: int) -> ResponseMemory:
     )
 
 
-def build_responses(
-    automaton: Automaton, t: Tables, step: float, searches: int, held: int, position: int
-) -> Responses:
+def build_responses(automaton: Automaton, t: Tables, step: float, searches: int, held: int, position: int) -> Responses:
     """All responses to the input that is the state `held`, with so many search steps (s) a tick."""
-    n, modes, row = t.states, len(automaton.modes), np.eye(t.states)[[position]]
-    owners = [_owners(automaton, m, searches, held) for m in range(modes)]
-    lanes = max(1, *(len(owner) for owner in owners))
-    guard = np.array([owner + [-1] * (lanes - len(owner)) for owner in owners])
-    free, ahead, pulse, inputs, watch, steps, columns, column_count = [], [], [], [], [], [], [], []
-    slow, reach = [], []
-    for m in range(modes):
-        at = t.flow_of[m] * NODES_FINE * n * n
-        search = t.jump_fine[at : at + n * n].reshape(n, n).T
-        powers, pulses = _powers(search, searches, held)
-        seen = _responses(row, powers, pulses, held, 2 * TICKS)[:, 0, :n].T
-        free.append(seen[:, :TICKS])
-        ahead.append(np.hstack([seen[:, TICKS:], powers[TICKS - 1].T]))
-        inputs.append(np.array(pulses[TICKS - 1 :: -1]))
-        pulse.append(np.concatenate([np.zeros(2 * TICKS + 1), [row[0] @ each for each in pulses]]))
-        lanes_of = _responses(_lane_rows(automaton, m, search, step, searches, held), powers, pulses, held, TICKS)
-        lane_columns = _columns(lanes_of.reshape(-1, n + TICKS), lanes * TICKS)
-        order = np.argsort(~lane_columns[:n].any(axis=1), kind="stable")
-        needed = np.count_nonzero(lane_columns[:n].any(axis=1))
-        column_count.append(min(-(-needed // 8) * 8, n) + TICKS)
-        columns.append(order)
-        seen_states = order[: column_count[-1] - TICKS]
-        watch.append(np.zeros_like(lane_columns))
-        watch[-1][: column_count[-1]] = np.vstack([lane_columns[seen_states], lane_columns[n:]])
-        changes, is_slow = _changes(automaton.modes[m].guards, lanes_of, guard[m], t.guards)
-        reach.append(changes)
-        slow.append(is_slow)
-        for j in range(TICKS):
-            late = np.zeros((TICKS, n))
-            late[: j + 1] = pulses[j::-1]
-            steps.append(np.vstack([powers[j].T, late]))
-    following = np.array([each[2 * TICKS + 1] for each in pulse])
-    for each in pulse:
-        each[2 * TICKS + 1] = 0.0
+    n, row = t.states, np.eye(t.states)[[position]]
+    modes = [_mode(automaton, t, m, step, searches, held) for m in range(len(automaton.modes))]
+    lanes = max([1] + [len(mode.owners) for mode in modes])
+    positions = [mode.seen(row, 2 * TICKS)[:, 0, :n].T for mode in modes]
+    pulses = [np.array([row[0] @ pulse for pulse in mode.pulses]) for mode in modes]
+    watched = [_watched(mode, lanes) for mode in modes]
+    changes = [_changes(mode, t.guards) for mode in modes]
     return Responses(
-        lanes, np.array([len(owner) for owner in owners]), _flat(free), _flat(ahead), _flat(pulse), following,
-        _flat(watch), _flat(inputs), _flat(steps), np.concatenate(columns), np.array(column_count),
-        np.array(slow), _flat(reach), guard,
-    )  # fmt: skip
+        lanes=lanes,
+        lane_count=np.array([len(mode.owners) for mode in modes]),
+        position=_flat([each[:, :TICKS] for each in positions]),
+        ahead=_flat(
+            [
+                np.hstack([each[:, TICKS:], mode.powers[TICKS - 1].T])
+                for each, mode in zip(positions, modes, strict=True)
+            ]
+        ),
+        pulse=_flat([np.concatenate([np.zeros(2 * TICKS + 2), each[1:]]) for each in pulses]),
+        next=np.array([each[0] for each in pulses]),
+        watch=_flat([each[0] for each in watched]),
+        held=_flat([np.array(mode.pulses[TICKS - 1 :: -1]) for mode in modes]),
+        step=_flat([_step(mode, ticks) for mode in modes for ticks in range(1, TICKS + 1)]),
+        columns=np.concatenate([each[1] for each in watched]),
+        column_count=np.array([each[2] for each in watched]),
+        slow=np.array([each[1] for each in changes]),
+        reach=_flat([each[0] for each in changes]),
+        guard=np.array([mode.owners + [-1] * (lanes - len(mode.owners)) for mode in modes]),
+    )
 
 
 def output_responses(r: Responses, row: Array, held: int) -> tuple[Array, Array]:
@@ -125,68 +135,29 @@ def _flat(parts: list[Array]) -> Array:
     return aligned(np.concatenate([np.ravel(part) for part in parts]))
 
 
-def _columns(rows: Array, room: int) -> Array:
-    """Rows side by side, with room for so many."""
-    columns = np.zeros((rows.shape[1], room))
-    columns[:, : len(rows)] = rows.T
-    return columns
-
-
-def _changes(guards: tuple[Guard, ...], lanes: Array, owners: Array, room: int) -> tuple[Array, bool]:
-    """(G, n + 8): the largest change of each guard in a block, of the sizes of state and inputs; True where none loses
-    half of its own terms."""
-    changes, slow = np.zeros((room, lanes.shape[2])), True
-    for g, guard in enumerate(guards):
-        row = np.append(guard.row, np.zeros(TICKS))
-        own = lanes[:, owners[: lanes.shape[1]] == g] - row
-        changes[g] = np.abs(own).max(axis=(0, 1))
-        slow = slow and bool(np.all(changes[g][row != 0.0] <= 0.5 * np.abs(row[row != 0.0])))
-    return changes, slow
-
-
-def _responses(rows: Array, powers: list[Array], pulses: list[Array], held: int, ticks: int) -> Array:
-    """(ticks, R, n + 8): rows of the state after the tick, at every tick, of the state at the start and the inputs."""
-    n = rows.shape[1]
-    out = np.zeros((ticks, len(rows), n + TICKS))
-    delayed = [rows[:, held], *(rows @ pulse for pulse in pulses)]
-    for j in range(ticks):
-        out[j, :, :n] = rows + (rows @ powers[j - 1] if j else 0.0)
-        out[j, :, held] = 0.0
-        for i in range(min(j + 1, TICKS)):
-            out[j, :, n + i] = delayed[j - i]
-    return out
-
-
-def _owners(automaton: Automaton, m: int, searches: int, held: int) -> list[int]:
-    """The guard of every lane."""
-    guards = automaton.modes[m].guards
-    return [g for g, guard in enumerate(guards) for _ in range(3 * searches + _begins(guard.row, held))]
-
-
-def _begins(row: Array, held: int) -> int:
-    """An input that enters a guard moves it at the tick; any other guard begins where it ended."""
-    return 1 if row[held] != 0.0 else 0
-
-
-def _lane_rows(
-    automaton: Automaton, m: int, search: Array, step: float, searches: int, held: int
-) -> Array:
-    """Rows of the lanes, of the state after the tick."""
-    rows = [np.zeros((0, len(search)))]
-    for guard in automaton.modes[m].guards:
-        value, third = np.asarray(guard.row), guard.row @ automaton.modes[m].flow * (step / 3.0)
-        if _begins(value, held):
-            rows.append(value)
+def _mode(automaton: Automaton, t: Tables, m: int, step: float, searches: int, held: int) -> _Mode:
+    """A mode with its lanes; the flow of a search step is that of the tables."""
+    n = t.states
+    at = t.flow_of[m] * NODES_FINE * n * n
+    search, flow = t.jump_fine[at : at + n * n].reshape(n, n).T, automaton.flows[m]
+    rows, lanes, owners = [], [np.zeros((0, n))], []
+    for g, guard in enumerate(automaton.modes[m].guards):
+        value = np.asarray(guard.row, dtype=float)
+        third = value @ flow * (step / 3.0)
+        rows.append(value)
+        # An input that enters a guard moves it at the tick; any other guard begins where it ended.
+        own = [value] if value[held] != 0.0 else []
         for _ in range(searches):
             second = value + third
             value, third = value + value @ search, third + third @ search
-            rows += [second, value - third, value]
-    return np.vstack(rows)
+            own += [second, value - third, value]
+        lanes.append(np.array(own))
+        owners += [g] * len(own)
+    return _Mode(tuple(rows), *_powers(search, searches, held), np.vstack(lanes), owners, held)
 
 
 def _powers(search: Array, searches: int, held: int) -> tuple[list[Array], list[Array]]:
-    """Deviations from one of the powers 1 .. 15 of a tick's map without its input, and the states that a pulse leaves
-    after 1 .. 15 ticks."""
+    """Powers of a tick's map without its input, less one, and the states that a pulse of the input leaves."""
     tick = np.zeros_like(search)
     for _ in range(searches):
         tick = tick + search + search @ tick
@@ -198,6 +169,39 @@ def _powers(search: Array, searches: int, held: int) -> tuple[list[Array], list[
         powers.append(powers[-1] + tick + tick @ powers[-1])
         pulses.append(pulses[-1] + tick @ pulses[-1])
     return powers, pulses
+
+
+def _step(mode: _Mode, ticks: int) -> Array:
+    """(n + 8, n): change of the state after so many ticks, transposed."""
+    power = mode.powers[ticks - 1]
+    late = np.zeros((TICKS, len(power)))
+    late[:ticks] = mode.pulses[ticks - 1 :: -1]
+    return np.vstack([power.T, late])
+
+
+def _watched(mode: _Mode, room: int) -> tuple[Array, NDArray[np.int64], int]:
+    """Lanes as columns, of those states on which they depend and the inputs; an order of the states that begins with
+    those, and the number of both."""
+    seen = mode.seen(mode.lanes).reshape(len(mode.owners) * TICKS, -1).T
+    n = len(seen) - TICKS
+    needed = seen[:n].any(axis=1)
+    order, eights = np.argsort(~needed, kind="stable"), -(-int(np.count_nonzero(needed)) // 8)
+    count = min(8 * eights, n)
+    columns = np.zeros((n + TICKS, room * TICKS))
+    columns[: count + TICKS, : seen.shape[1]] = np.vstack([seen[order[:count]], seen[n:]])
+    return columns, order.astype(np.int64), count + TICKS
+
+
+def _changes(mode: _Mode, room: int) -> tuple[Array, bool]:
+    """(G, n + 8): the largest change of each guard in a block, of the sizes of state and inputs; True where none loses
+    half of its own terms."""
+    seen, slow = mode.seen(mode.lanes), True
+    changes = np.zeros((room, seen.shape[2]))
+    for g, guard in enumerate(mode.rows):
+        row = np.append(guard, np.zeros(TICKS))
+        changes[g] = np.abs(seen[:, np.array(mode.owners) == g] - row).max(axis=(0, 1))
+        slow = slow and bool(np.all(changes[g][row != 0.0] <= 0.5 * np.abs(row[row != 0.0])))
+    return changes, slow
 
 
 @inlined

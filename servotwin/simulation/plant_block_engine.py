@@ -8,15 +8,23 @@ from functools import lru_cache
 import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.kernel import EVENTS_PER_STEP, FULL
-from servotwin.hybrid.response import TICKS, Responses, build_responses, new_response_memory, output_responses
-from servotwin.hybrid.trajectory import ON_GRID, Jump, tables_for
-from servotwin.simulation.inputs import RunInputs
-from servotwin.simulation.plant_blocks import LAW_STATES, more_blocks, new_blocks, note_block, run_plant_blocks, sample_blocks
+from servotwin.hybrid.kernel import FULL
+from servotwin.hybrid.response import Responses, build_responses, new_response_memory, output_responses
+from servotwin.hybrid.trajectory import tables_for
+from servotwin.simulation.plant_blocks import (
+    LAW_STATES,
+    more_blocks,
+    new_blocks,
+    note_block,
+    run_plant_blocks,
+    sample_blocks,
+)
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.ticks import TickInputs
 
 _ROOM = 4096
+_PAGE = 512
+"""Numbers in a page of memory, or fewer."""
 # Ticks below which compilation and tables do not pay, and search steps per tick above which a block has too many lanes.
 _LEAST_TICKS, _MOST_SEARCHES = 20_000, 8
 
@@ -62,8 +70,8 @@ class PlantBlockEngine(SampledEngine):
 
     def _inputs_until(self, base: int, end: int) -> TickInputs:
         # The system provides the memory of what is recorded here, beside the run, not where the run waits for it.
-        self.output.states[:, base:end] = 0.0
-        self.output.measured[base:end] = 0.0
+        self.output.states[:, base:end:_PAGE] = 0.0
+        self.output.measured[base:end:_PAGE] = 0.0
         return super()._inputs_until(base, end)
 
     def flow(self, end: int, tick_inputs: TickInputs) -> None:

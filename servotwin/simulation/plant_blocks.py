@@ -102,16 +102,17 @@ def take_ticks(
     """The ticks of a block, one after the other, as if no guard fired."""
     delay, soon, voltage, coming = port.delayed.size, r.next[mode], recent, memory.position[0]
     begin, row = tick - tick_inputs.first, tick - output.first_tick
-    references, noises = tick_inputs.reference[begin : begin + count], tick_inputs.noise[begin : begin + count]
-    enters, leaves = tick_inputs.enter[begin : begin + count], tick_inputs.leave[begin : begin + count]
     voltages, positions = output.states[0, row : row + count], output.states[1, row : row + count]
     measurements, actives = output.measured[row : row + count], output.active[row : row + count]
     for j in range(np.uint64(count)):
         # The newest voltage is added here, and the next position read before it is added there: through memory the
         # next tick would wait for it.
         position, coming = coming + soon * voltage, memory.position[j + np.uint64(1)]
-        y = measured(position, noises[j], port)
-        state = tick_between(parameters, enters[j], leaves[j], state, references[j], y)
+        k = begin + int(j)
+        zone = np.uint64(k & tick_inputs.zone_mask)
+        y = measured(position, tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)], port)
+        reference = tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)]
+        state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
         store(state, law_states, j)
         voltage = state.voltage
         if delay > 0:
@@ -156,7 +157,9 @@ def run_plant_blocks(
         count = min(TICKS, end - tick)
         for j in range(count, TICKS):
             memory.start[t.states + j] = 0.0
-        state = take_ticks(r, tick, count, mode, parameters, state, port, tick_inputs, output, memory, law_states, recent)
+        state = take_ticks(
+            r, tick, count, mode, parameters, state, port, tick_inputs, output, memory, law_states, recent
+        )
         calm = calm_ticks(t, r, mode, count, x, memory)
         end_block(r, mode, calm, x, memory)
         last = min(calm, count - 1)

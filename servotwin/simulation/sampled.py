@@ -34,7 +34,7 @@ from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
-_CHUNK, _FIRST_CHUNK = 1 << 15, 1 << 12
+_CHUNK, _LARGEST_CHUNK = 1 << 15, 1 << 16
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -146,21 +146,20 @@ class SampledEngine:
         """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
         enter, leave = self._thresholds(first, count)
-        reference = self._on_ticks(self.inputs.reference, first, count)
-        return TickInputs(first, reference, self.draws.take(count), enter, leave)
+        reference, noise = self._on_ticks(self.inputs.reference, first, count), self.draws.take(count)
+        return TickInputs(
+            first, reference, noise, enter, leave, *(0 if each.size == 1 else -1 for each in (reference, noise, enter))
+        )
 
     def _on_ticks(self, signal: PiecewiseCubic, first: int, count: int) -> Array:
+        """Values at ticks; one value where it is constant."""
         held = signal.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
-        return np.full(count, held) if held is not None else signal.on(np.arange(first, first + count) / self.tick_rate)
+        return np.array([held]) if held is not None else signal.on(np.arange(first, first + count) / self.tick_rate)
 
     def _thresholds(self, first: int, count: int) -> tuple[Array, Array]:
-        """Thresholds of the dead zone at ticks."""
+        """Thresholds of the dead zone at ticks; one pair where they are constant."""
         if self.inputs.tolerance is None:
-            return np.full(count, -1.0), np.full(count, -1.0)
-        held = self.inputs.tolerance.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
-        if held is not None:
-            enter, leave = self.controller.thresholds(held)
-            return np.full(count, enter), np.full(count, leave)
+            return np.array([-1.0]), np.array([-1.0])
         tolerance = self._on_ticks(self.inputs.tolerance, first, count)
         # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
         zero = tolerance == 0.0
@@ -173,12 +172,15 @@ class SampledEngine:
                 stop = min(end, self.base + _CHUNK)
                 self.flow(stop, self._inputs_until(self.base, stop))
             return
-        # The noise of the next chunk is drawn while this one runs; the first one, which is waited for, is short.
+        # The noise of the next chunk is drawn while this one runs. The first one, which is waited for, is short, and
+        # they grow slowly, so that no later one is waited for.
         with ThreadPoolExecutor(1) as pool:
-            stop = min(end, self.base + _FIRST_CHUNK)
+            chunk = _CHUNK // 2
+            stop = min(end, self.base + chunk)
             coming = pool.submit(self._inputs_until, self.base, stop)
             while self.base < end:
-                tick_inputs, following = coming.result(), min(end, stop + _CHUNK)
+                tick_inputs, chunk = coming.result(), min(chunk + chunk // 4, _LARGEST_CHUNK)
+                following = min(end, stop + chunk)
                 if stop < end:
                     coming = pool.submit(self._inputs_until, stop, following)
                 self.flow(stop, tick_inputs)
@@ -359,9 +361,9 @@ class NoiseBuffer:
     drawn: Array = field(default_factory=lambda: np.zeros(0))
 
     def take(self, count: int) -> Array:
-        """Noise (m) of the next ticks."""
+        """Noise (m) of the next ticks; one zero without noise."""
         if self.source is None:
-            return np.zeros(count)
+            return np.zeros(1)
         if (missing := count - self.drawn.size) > 0:
             self.drawn = np.concatenate([self.drawn, self.source.block(max(missing, self.ahead))])
         values, self.drawn = self.drawn[:count], self.drawn[count:]

@@ -34,13 +34,16 @@ class Port(NamedTuple):
 
 
 class TickInputs(NamedTuple):
-    """Inputs of the ticks from tick `first` on."""
+    """Inputs of the ticks from tick `first` on; one value stands for all of them where a mask is 0 and not -1."""
 
     first: int
     reference: Array
     noise: Array
     enter: Array
     leave: Array
+    reference_mask: int
+    noise_mask: int
+    zone_mask: int
 
 
 class Output(NamedTuple):
@@ -97,9 +100,11 @@ def take_tick(
     output: Output,
 ) -> LawState:
     """Measure, tick, record both."""
-    k, at = np.uint64(i - tick_inputs.first), np.uint64(i - output.first_tick)
-    y = measured(position, tick_inputs.noise[k], port)
-    state = tick_between(parameters, tick_inputs.enter[k], tick_inputs.leave[k], state, tick_inputs.reference[k], y)
+    k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
+    zone = np.uint64(k & tick_inputs.zone_mask)
+    y = measured(position, tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)], port)
+    reference = tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)]
+    state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
     output.measured[at] = y
     output.active[at] = 1 if state.active > 0.5 else 0
     return state
