@@ -14,10 +14,14 @@ from rich.table import Table
 
 from benchmarks import report
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
-from servotwin.estimation.whitened.quick import quick_fit
+from benchmarks.wrong_models import ModelError
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.messages import Channel, WindowMessage, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.plant.noise import Noise
-from servotwin.twin.estimating import decode_window
+from servotwin.plant.servo import Servo
+from servotwin.twin.estimating import Wear, decode_window, estimator_of
+from servotwin.twin.settings import TwinSettings
 from servotwin.twin.triage import TriageState, glance
 
 NAME, SCHEMA = "triage", "servotwin-bench-triage/1"
@@ -28,7 +32,18 @@ KNOWN_DEG = 0.005
 """Spread of the gap before the glance."""
 CONDITIONS = {"clean": None, "noise, floor 1 um": 1e-6, "noise, floor 10 um": 1e-5}
 """The paper's noise, on a white floor of so many m."""
+ERROR, FLOOR = ModelError(0.05, 0.3, 0.01), 1e-6
+LEARNT = {"1 um, machine off": 0, "..., 1 window learnt": 1, "..., 3 windows learnt": 3}
+"""Machines off by up to 5 % (k), 30 % (c) and 1 % (pitch): windows of the same gap from which the twin has learnt."""
 _UNITS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
+
+
+class Looked(NamedTuple):
+    """A window with the model to glance at it with, and what was learnt of the machine."""
+
+    case: WindowCase
+    model: Servo
+    machine: FactorPrior | None
 
 
 class GlanceRow(NamedTuple):
@@ -77,23 +92,48 @@ def triage(
     """
     console = console or Console()
     report.check(output)
-    rows = tuple(_row(name, floor, gaps) for name, floor in CONDITIONS.items())
+    rows = [
+        _row(name, [Looked(case, case.servo, None) for case in _cases(floor, gaps)])
+        for name, floor in CONDITIONS.items()
+    ]
+    rows += [_row(name, list(_off_model(gaps, learnt))) for name, learnt in LEARNT.items()]
     console.print(_table(rows), highlight=False)
     report.write(output, report.text(SCHEMA, date, rows=[row._asdict() for row in rows]), console)
-    return rows
+    return tuple(rows)
 
 
-def _row(name: str, floor: float | None, gaps: int) -> GlanceRow:
-    cases = list(_cases(floor, gaps))
-    fits = [quick_fit(case.window, case.servo, case.gap) for case in cases]
-    errors = np.degrees([fit.gap - case.gap for fit, case in zip(fits, cases, strict=True)])
+def _row(name: str, looked: Sequence[Looked]) -> GlanceRow:
+    fits = [quick_fit(each.case.window, each.model, each.case.gap, None, each.machine) for each in looked]
+    errors = np.degrees([fit.gap - each.case.gap for fit, each in zip(fits, looked, strict=True)])
     usual = 1.5 * float(np.median([fit.misfit for fit in fits]))
     rng = np.random.default_rng(1)
-    messages = [_message(case) for case in cases]
-    shares = tuple(_estimated_share(cases, messages, moved, usual, rng) for moved in MOVED_DEG)
-    times = [_glance_time(case, message, usual) for case, message in zip(cases, messages, strict=True)]
-    error, std = float(np.sqrt(np.mean(errors**2))), math.degrees(float(np.median([fit.std for fit in fits])))
-    return GlanceRow(name, len(cases), error, std, shares, min(times), float(np.median(times)))
+    messages = [_message(each.case) for each in looked]
+    shares = tuple(_estimated_share(looked, messages, moved, usual, rng) for moved in MOVED_DEG)
+    times = [_glance_time(each, message, usual) for each, message in zip(looked, messages, strict=True)]
+    error, std = float(np.sqrt(np.mean(errors**2))), math.degrees(float(np.median([_spread(fit) for fit in fits])))
+    return GlanceRow(name, len(looked), error, std, shares, min(times), float(np.median(times)))
+
+
+def _spread(fit: QuickFit) -> float:
+    """rad, what is open of the machine included."""
+    return math.hypot(fit.std, fit.machine_spread().gap)
+
+
+def _off_model(gaps: int, learnt: int) -> Iterator[Looked]:
+    """Windows of machines that differ from the model, after a twin has learnt from so many of the same gap."""
+    rng, model, settings = np.random.default_rng(2), Servo.preset("paper"), TwinSettings()
+    estimator = estimator_of(model, settings)
+    for number, gap in enumerate(np.radians(rng.uniform(1.0, 40.0, gaps))):
+        machine, wear, seen = ERROR.machine(rng, model), Wear(0.0), 0
+        for case in paper_loop_cases(np.array([gap]), PER_GAP, 2026 + number, None, machine):
+            noisy, now = case.noisy(FLOOR * rng.standard_normal(case.window.position.size)), case.window.mid_time
+            if seen < learnt:
+                expected = wear.expect(settings.trend, "b", now, now, settings.learning)
+                estimate = estimator(noisy.window, expected)
+                wear, rejection = wear.update(settings.trend, "b", estimate, now, settings.learning)
+                seen += estimate.machine is not None and not rejection
+            elif case.two_contacts:
+                yield Looked(noisy, model, wear.known_machine(settings.learning, now))
 
 
 def _cases(floor: float | None, gaps: int) -> Iterator[WindowCase]:
@@ -106,25 +146,26 @@ def _cases(floor: float | None, gaps: int) -> Iterator[WindowCase]:
 
 
 def _estimated_share(
-    cases: Sequence[WindowCase], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
+    looked: Sequence[Looked], messages: Sequence[WindowMessage], moved: float, usual: float, rng: np.random.Generator
 ) -> float:
     """Share of windows that would be estimated, the gap having moved by so much (deg) to either side."""
     decisions = []
-    for case, message in zip(cases, messages, strict=True):
+    for (case, model, machine), message in zip(looked, messages, strict=True):
         for side in (1.0, -1.0):
             before = case.gap + math.radians(side * moved + KNOWN_DEG * float(rng.standard_normal()))
             if before > 0.0:
-                decisions.append(glance(message, case.window, case.servo, _watch(before, usual)).moved)
+                watch = _watch(before, usual)
+                decisions.append(glance(message, case.window, model, watch, machine=machine).moved)
     return float(np.mean(decisions))
 
 
-def _glance_time(case: WindowCase, message: WindowMessage, usual: float) -> float:
+def _glance_time(looked: Looked, message: WindowMessage, usual: float) -> float:
     """ms from bytes to verdict."""
-    body, watch = encode(message), _watch(case.gap, usual)
+    body, watch = encode(message), _watch(looked.case.gap, usual)
     begin = time.perf_counter()
     decoded = decode(body)
     assert isinstance(decoded, WindowMessage)
-    glance(decoded, decode_window(decoded), case.servo, watch)
+    glance(decoded, decode_window(decoded), looked.model, watch, machine=looked.machine)
     return 1e3 * (time.perf_counter() - begin)
 
 

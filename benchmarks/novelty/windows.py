@@ -6,18 +6,24 @@ import math
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks.estimator_figures import FLOOR
 from servotwin.analysis.maps.pool import shared
+from servotwin.estimation.whitened.free_model import adapted
+from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
 from servotwin.novelty.score import model_of, score
+from servotwin.novelty.settings import NoveltyModel
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SquareWave
 from servotwin.simulation import simulate
+from servotwin.twin.estimating import Wear, estimator_of
+from servotwin.twin.settings import TwinSettings
 
 RATE, SECONDS = 5000.0, 1.0
 STEP, AMPLITUDE = 5.0, 1e-3  # s from one change of the reference to the next, m
@@ -34,14 +40,18 @@ class NoveltyCondition:
     name : str
     noise : Noise or None
         On the measured position, in the loop; a white floor of 1 um comes on top.
-    k, c : float
-        Stiffness and damping of the machine over those of the edge's model.
+    k, c, pitch : float
+        Stiffness, damping and pitch of the machine over those of the model in the edge's file.
+    learnt : int
+        Windows from which the twin has learnt the machine before it sent its response to the edge; 0: none.
     """
 
     name: str
     noise: Noise | None
     k: float = 1.0
     c: float = 1.0
+    pitch: float = 1.0
+    learnt: int = 0
 
 
 PAPER_NOISE = Noise(0.22e-3)
@@ -50,6 +60,10 @@ CONDITIONS = (
     NoveltyCondition("paper's noise, k + 1 %, c + 20 %", PAPER_NOISE, 1.01, 1.2),
     NoveltyCondition("1 um", None),
     NoveltyCondition("1 um, k + 1 %, c + 20 %", None, 1.01, 1.2),
+    NoveltyCondition("paper's noise, k + 1 %, c + 20 %, learnt", PAPER_NOISE, 1.01, 1.2, learnt=3),
+    NoveltyCondition("1 um, k + 1 %, c + 20 %, learnt", None, 1.01, 1.2, learnt=3),
+    NoveltyCondition("paper's noise, k + 5 %, c + 30 %, pitch + 1 %, learnt", PAPER_NOISE, 1.05, 1.3, 1.01, 3),
+    NoveltyCondition("1 um, k + 5 %, c + 30 %, pitch + 1 %, learnt", None, 1.05, 1.3, 1.01, 3),
 )
 
 
@@ -103,20 +117,46 @@ def pools(condition: NoveltyCondition, gaps: Sequence[float], counts: Sequence[i
 def scored(task: PoolTask) -> list[tuple[int, float, float]]:
     """Score each window: direction of the step before it, estimate, standard deviation; NaN where it shows no gap."""
     known = Servo.preset("paper")
-    model, rng = model_of(known, RATE), np.random.default_rng(task.seed)
+    (model, gap_std), rng = edge_model(task.condition), np.random.default_rng(task.seed)
     rows = []
-    for number, window in enumerate(recorded(task, known)):
+    for number, window in enumerate(_with_floor(recorded(task, known), rng)):
         assert window.theta_m is not None
-        position = window.position + FLOOR * rng.standard_normal(window.position.size)
-        estimate = score(array("d", window.theta_m), array("d", position), model, KNOWN_GAP)
-        rows.append((number % 2, math.nan, math.nan) if estimate is None else (number % 2, estimate.gap, estimate.std))
+        estimate = score(array("d", window.theta_m), array("d", window.position), model, KNOWN_GAP)
+        found = (math.nan, math.nan) if estimate is None else (estimate.gap, math.hypot(estimate.std, gap_std))
+        rows.append((number % 2, *found))
     return rows
+
+
+def _with_floor(windows: Iterator[Window], rng: np.random.Generator) -> Iterator[Window]:
+    for window in windows:
+        yield window.replace(position=window.position + FLOOR * rng.standard_normal(window.position.size))
+
+
+@lru_cache
+def edge_model(condition: NoveltyCondition) -> tuple[NoveltyModel, float]:
+    """The edge's model, with the spread (rad) of a gap that is open in it: as configured, or as the twin has learnt."""
+    known, settings = Servo.preset("paper"), TwinSettings()
+    model, wear, left, gap_std = model_of(known, RATE), Wear(0.0), condition.learnt, 0.0
+    estimator, task = estimator_of(known, settings), PoolTask(condition, KNOWN_GAP, 1)
+    for window in _with_floor(recorded(task, known), np.random.default_rng(1)):
+        if left == 0:
+            break
+        now = window.mid_time
+        expected = wear.expect(settings.trend, "b", now, now, settings.learning)
+        estimate = estimator(window, expected)
+        wear, rejection = wear.update(settings.trend, "b", estimate, now, settings.learning)
+        machine = wear.known_machine(settings.learning, now)
+        if machine is not None and not rejection and estimate.machine is not None:
+            left -= 1
+            gap_std = quick_fit(window, known, estimate.gap, None, machine).machine_spread().gap
+            model = model_of(adapted(known, machine.mean), RATE)
+    return model, gap_std
 
 
 def recorded(task: PoolTask, known: Servo) -> Iterator[Window]:
     """Yield the windows after the steps of one run, with the dead zone for the gap that the twin knows."""
     condition = task.condition
-    plant = known.replace(k=_times(known.k, condition.k), c=_times(known.c, condition.c))
+    plant = known.replace(k=_times(known.k, condition.k), c=_times(known.c, condition.c), p=condition.pitch * known.p)
     law = known.controller
     run = simulate(
         plant,

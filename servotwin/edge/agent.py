@@ -27,7 +27,7 @@ from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import Acknowledge, Fallback, Hello, Message, Request, Setting, Update
+from servotwin.messages import Acknowledge, Fallback, Hello, LearntResponse, Message, Request, Setting, Update
 
 
 class ScheduledMessage(NamedTuple):
@@ -164,6 +164,8 @@ class Agent:
             return [ScheduledMessage(self.samples, each) for each in replies]
         if isinstance(message, Request):
             return self._handle_request(message)
+        if isinstance(message, LearntResponse) and message.servo == self.settings.servo:
+            self.outlet.adopt(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self.outlet.acknowledge(message)
             self._twin_answered(message.servo)

@@ -16,7 +16,16 @@ from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.link.session import Session
-from servotwin.messages import Acknowledge, Channel, InvalidMessage, WindowMessage, checksum, pack_channel, pack_finely
+from servotwin.messages import (
+    Acknowledge,
+    Channel,
+    InvalidMessage,
+    LearntResponse,
+    WindowMessage,
+    checksum,
+    pack_channel,
+    pack_finely,
+)
 from servotwin.messages.checks import all_finite
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
@@ -26,8 +35,8 @@ MAX_CHANGES = 256
 """Reference changes listed per window; the reference channel has them all."""
 
 
-def pack(cut: Cut, settings: AgentSettings) -> WindowMessage:
-    """Pack a cut into the window message.
+def pack(cut: Cut, settings: AgentSettings, response_version: int | None = None) -> WindowMessage:
+    """Pack a cut into the window message, with the version of the response that its filter used, if it has one.
 
     Raises
     ------
@@ -48,6 +57,7 @@ def pack(cut: Cut, settings: AgentSettings) -> WindowMessage:
         model_version=settings.model_version,
         reason=cut.reason,
         crc=checksum(channels),
+        response_version=response_version,
     )
 
 
@@ -73,8 +83,8 @@ NOT_FINITE = "sample not finite"
 FILTERED = "nothing new"
 """Reasons of windows that are not sent."""
 
-UNFILTERED = "window not judged"
-"""Fault of a window whose filter failed."""
+UNFILTERED, NOT_ADOPTED = "window not judged", "learnt response not used"
+"""Faults of a window, and of a response from the twin, at which the filter failed."""
 
 _FILTER_STATE = "novelty"  # its name in outboxes on disk since the first filter
 
@@ -102,6 +112,9 @@ class Outlet(Protocol):
 
     def acknowledge(self, message: Acknowledge) -> bool:
         """Take the twin's acknowledgement of a window; False when the window was not stored any more."""
+
+    def adopt(self, response: LearntResponse) -> None:
+        """Take a learnt response, for the windows that are cut from now on."""
 
 
 class WindowWriter:
@@ -132,11 +145,25 @@ class WindowWriter:
             self._outbox.count_dropped(FILTERED)
             return
         try:
-            window = pack(chosen, self._settings)
+            version = None if self._filter is None else self._filter.response_version
+            window = pack(chosen, self._settings, version)
         except InvalidMessage:
             self._outbox.count_dropped(NOT_FINITE)
         else:
             self._outbox.put(window)
+
+    def adopt(self, response: LearntResponse) -> None:
+        """Have the filter use a learnt response; without a filter nothing changes."""
+        if self._filter is None:
+            return
+        try:
+            self._filter.adopt(response)
+        except Exception:
+            if self._faults is None:
+                raise
+            self._faults[NOT_ADOPTED] += 1
+            return
+        self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
 
     def _filtered(self, cut: Cut) -> Cut | None:
         if self._filter is None:
@@ -196,3 +223,7 @@ class LocalOutlet:
     def acknowledge(self, message: Acknowledge) -> bool:
         """Remove a window that the twin has acknowledged; False when it was not stored any more."""
         return self._session.acknowledge((message.boot, message.sequence))
+
+    def adopt(self, response: LearntResponse) -> None:
+        """Have the window filter use a learnt response from the next window on."""
+        self._writer.adopt(response)

@@ -6,10 +6,18 @@ The agent's settings carry a `WindowFilterSettings`. The edge's core names no im
 from typing import Protocol
 
 from servotwin.edge.recorder import Cut
+from servotwin.messages import LearntResponse
 
 
 class WindowFilter(Protocol):
     """A filter at work on the windows of one boot."""
+
+    @property
+    def response_version(self) -> int:
+        """Version of the learnt response in use; 0: the configured one."""
+
+    def adopt(self, response: LearntResponse) -> None:
+        """Use a learnt response from the next window on; one that is not newer, or for another rate, is ignored."""
 
     def __call__(self, cut: Cut) -> Cut | None:
         """Return the window to send, perhaps with another reason; None: do not send it."""

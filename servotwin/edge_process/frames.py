@@ -55,6 +55,14 @@ class LetterFrame(Struct, frozen=True, array_like=True, tag="letter"):
     body: bytes
 
 
+class ResponseFrame(Struct, frozen=True, array_like=True, tag="response"):
+    """An encoded learnt response for the window filter, from the windows after it on."""
+
+    serial: int
+    boot: str
+    body: bytes
+
+
 class SaveFrame(Struct, frozen=True, array_like=True, tag="save"):
     """Parameters under which the loop kept its band, to be stored on disk."""
 
@@ -102,7 +110,7 @@ class ReconnectedFrame(Struct, frozen=True, array_like=True, tag="reconnected"):
     """The twin is reached again."""
 
 
-ToLink = WindowFrame | LetterFrame | SaveFrame | ProcessedFrame | StatusFrame
+ToLink = WindowFrame | LetterFrame | ResponseFrame | SaveFrame | ProcessedFrame | StatusFrame
 ToControl = AckFrame | MessageFrame | PendingFrame | ReconnectedFrame
 
 encode = msgspec.msgpack.Encoder().encode

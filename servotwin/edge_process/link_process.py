@@ -35,7 +35,7 @@ from servotwin.link.outbox import Key
 from servotwin.link.session import Session
 from servotwin.link.sqlite_outbox import MOST_UNWRITTEN, SqliteOutbox
 from servotwin.link.transport import Transport
-from servotwin.messages import Acknowledge, InvalidMessage, encode
+from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, decode, encode
 from servotwin.runtime.frames import FrameSocket
 
 CURSOR = "cursor"
@@ -81,6 +81,11 @@ class FrameHandler:
             self._outbox.put_letter(frame.body)
             self._unconfirmed[frame.serial] = _Unconfirmed(None, len(frame.body))
             return self._confirmed()
+        if isinstance(frame, frames.ResponseFrame):
+            with self._outbox.transaction():
+                self._adopt(frame)
+            self._unconfirmed[frame.serial] = _Unconfirmed(None, len(frame.body))
+            return self._confirmed()
         if isinstance(frame, SaveFrame):
             # Newer parameters replace unwritten ones, whose frame is confirmed because nobody needs it any more.
             before, self._unsaved = self._unsaved, frame
@@ -116,10 +121,19 @@ class FrameHandler:
             return
         # In the transaction of the window itself: after a crash both are on the disk, or neither.
         self._outbox.set_value(_LAST_CUT, msgspec.msgpack.encode((frame.boot, frame.sequence)))
-        if self._writer is None or frame.boot != self._boot:
-            self._boot = frame.boot
-            self._writer = WindowWriter(self._config.settings(frame.boot), self._outbox, self.faults)
-        self._writer.write(frame.cut)
+        self._writer_of(frame.boot).write(frame.cut)
+
+    def _adopt(self, frame: frames.ResponseFrame) -> None:
+        """Have the window filter use a response; a repeated one is not newer, and changes nothing."""
+        response = decode(frame.body)
+        assert isinstance(response, LearntResponse)
+        self._writer_of(frame.boot).adopt(response)
+
+    def _writer_of(self, boot: str) -> WindowWriter:
+        if self._writer is None or boot != self._boot:
+            self._boot = boot
+            self._writer = WindowWriter(self._config.settings(boot), self._outbox, self.faults)
+        return self._writer
 
     def _save(self) -> list[int]:
         if self._unsaved is None:

@@ -13,7 +13,7 @@ from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame
-from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage, decode, encode
+from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, Message, WindowMessage, decode, encode
 from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
@@ -128,6 +128,10 @@ class PipeOutlet:
         """Do nothing: the link process knows first, and sends how many windows are pending."""
         return True
 
+    def adopt(self, response: LearntResponse) -> None:
+        """Send a learnt response to the window filter, which is in the link process."""
+        self._send(frames.ResponseFrame(self._next_serial(), self.boot, encode(response)))
+
     def send_letter(self, message: Message) -> None:
         """Send a letter to the twin."""
         self._send(frames.LetterFrame(self._next_serial(), encode(message)))
@@ -186,7 +190,7 @@ class PipeOutlet:
         self._serial += 1
         return self._serial
 
-    def _send(self, frame: frames.WindowFrame | frames.LetterFrame | frames.SaveFrame) -> int:
+    def _send(self, frame: frames.WindowFrame | frames.LetterFrame | frames.ResponseFrame | frames.SaveFrame) -> int:
         data = frames.encode(frame)
         self._unacknowledged[frame.serial] = data
         self._size += len(data)

@@ -1,4 +1,5 @@
-"""Messages between edge and twin: windows, receipts, answers and hellos up; updates, requests, acknowledgements down.
+"""Messages between edge and twin: windows, receipts, answers and hellos up; updates, requests, responses and
+acknowledgements down.
 
 MessagePack with a tag that carries the schema's version ("window/1"); an unknown tag is refused, unknown fields of a
 known tag are ignored. A window's channels are planar int16 with a scale and an offset each. Parameter messages may be
@@ -8,6 +9,7 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome
+from servotwin.messages.responses import LearntResponse
 from servotwin.messages.setting import Band, Gains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
 from servotwin.messages.windows import (
@@ -36,6 +38,7 @@ __all__ = [
     "Gains",
     "Hello",
     "InvalidMessage",
+    "LearntResponse",
     "LongerWindow",
     "Message",
     "ParameterMessage",

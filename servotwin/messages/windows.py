@@ -110,7 +110,7 @@ def _little_endian(codes: "array[int]") -> "array[int]":
     return codes
 
 
-class WindowMessage(Struct, frozen=True, tag="window/1"):
+class WindowMessage(Struct, frozen=True, omit_defaults=True, tag="window/1"):
     """Recorded samples, identified by (servo, boot, sequence).
 
     Attributes
@@ -129,6 +129,8 @@ class WindowMessage(Struct, frozen=True, tag="window/1"):
         Version of the servo's model on the edge; reason for sending the window.
     crc : int
         `checksum(channels)`.
+    response_version : int or None
+        Version of the learnt response that the edge's window filter used, 0: the configured one; None: it takes none.
     """
 
     servo: Name
@@ -142,6 +144,7 @@ class WindowMessage(Struct, frozen=True, tag="window/1"):
     model_version: Text
     reason: Text
     crc: Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+    response_version: Count | None = None
 
     def __post_init__(self) -> None:
         require(isfinite(self.start), f"window start {self.start} s is not finite")

@@ -3,8 +3,11 @@
 It measures the change of the gap since the last window that was sent as news; that window begins a new baseline. After
 an accepted update the baseline counts as a few windows only, and where the update stands on a window that did not show
 the gap here, the baseline moves with the update's gap. A window that does not show the gap changes no baseline.
+A response that the twin has learnt takes the place of the configured one, and begins another baseline.
 """
 
+from dataclasses import replace
+from functools import lru_cache
 from math import hypot, inf, sqrt
 from typing import NamedTuple
 
@@ -14,9 +17,10 @@ from msgspec import Struct, structs
 from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.visible import least_travel
+from servotwin.messages import LearntResponse
 from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, score
-from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.novelty.settings import NoveltyModel, NoveltyRules, NoveltySettings, ResponseMode
 
 PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
 LOST_MOTION, SCORE, CUSUM = "novelty: lost motion", "novelty: score", "novelty: cusum"
@@ -35,7 +39,7 @@ _WIDEST = 1.0  # rad: a gap with a larger spread does not count as an estimate
 _STILL = 0.2  # of the margin: a signal that moves less is at rest
 
 
-class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
+class NoveltyState(Struct, frozen=True, omit_defaults=True, tag="novelty/1", rename=_STORED):
     """State of the detector, which the link process stores.
 
     Attributes
@@ -63,6 +67,8 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
         rad, the encoder's, and its standard deviation; None: no window of this boot has shown it.
     noise : float
         m, residual (rms) of the last fit; 0: not known.
+    response : LearntResponse or None
+        Learnt by the twin; None: the configured one is used.
     """
 
     gap: float
@@ -78,6 +84,12 @@ class NoveltyState(Struct, frozen=True, tag="novelty/1", rename=_STORED):
     reported_lost_motion: float = 0.0
     offset: tuple[float, float] | None = None
     noise: float = 0.0
+    response: LearntResponse | None = None
+
+    @property
+    def response_version(self) -> int:
+        """Version of the response in use; 0: the configured one."""
+        return 0 if self.response is None else self.response.version
 
 
 class NoveltyVerdict(NamedTuple):
@@ -108,7 +120,33 @@ def start(settings: NoveltySettings) -> NoveltyState:
 
 def booted(state: NoveltyState, rules: NoveltyRules) -> NoveltyState:
     """Return the state after a restart: the baseline stays; sample times and the encoder's offset begin anew."""
-    return NoveltyState(state.gap, rules.learn, state.chart, state.version, state.update_gap)
+    begun = NoveltyState(state.gap, rules.learn, state.chart, state.version, state.update_gap)
+    return structs.replace(begun, response=state.response)
+
+
+def adopted(state: NoveltyState, response: LearntResponse, settings: NoveltySettings) -> NoveltyState:
+    """Return the state with a learnt response; one that is not newer, or for another rate, changes nothing.
+
+    Baseline and scatter were those of the response before, and a wrong one may have led the search astray. Unless an
+    update comes first, the next window that shows the gap is sent: no baseline tells what has changed meanwhile.
+    """
+    if response.version <= state.response_version or response.rate != settings.model.rate:
+        return state
+    unconditional = max(state.unconditional, min(1, settings.rules.learn))
+    return structs.replace(
+        state, response=response, gap=response.gap, chart=Chart(), unconditional=unconditional, noise=0.0
+    )
+
+
+@lru_cache(maxsize=8)
+def _model(configured: NoveltyModel, response: LearntResponse | None) -> NoveltyModel:
+    """The model in use."""
+    if response is None:
+        return configured
+    modes = tuple(ResponseMode(complex(*mode[:2]), complex(*mode[2:])) for mode in response.modes)
+    return replace(
+        configured, modes=modes, direct=response.direct, static_gain=response.static_gain, unseen=response.unseen
+    )
 
 
 def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[NoveltyState, NoveltyVerdict]:
@@ -121,6 +159,8 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
         Its `reason` is the reason for the cut.
     settings : NoveltySettings
     """
+    if state.response is not None:
+        settings = replace(settings, model=_model(settings.model, state.response))
     rules, model = settings.rules, settings.model
     theta_m, position, rate = cut.signals["theta_m"], cut.signals["position"], model.rate * model.second
     leads = leads_at_rest(theta_m, position, rate, model.static_gain, _still(rules))
@@ -128,7 +168,9 @@ def judge(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> tuple[Nov
     estimate = _read(state, cut, settings)
     if estimate is None:
         return _without_score(state, cut, settings)
-    charted = add_window(state.chart, estimate.gap, estimate.std, rules)
+    # What is open of a learnt response differs from window to window, as noise does.
+    std = estimate.std if state.response is None else hypot(estimate.std, state.response.gap_std)
+    charted = add_window(state.chart, estimate.gap, std, rules)
     far = abs(estimate.gap - state.chart.anchor) > rules.outlier
     news = SCORE if charted.sudden else CUSUM if charted.slow else LOST_MOTION if _lost(state, rules) else ""
     state = structs.replace(_after_score(state, cut, estimate, rules), chart=charted.chart)
@@ -274,6 +316,15 @@ class NoveltyDetector:
         self.settings = settings
         self.state = start(settings) if state is None else booted(state, settings.rules)
         self.verdict: NoveltyVerdict | None = None
+
+    @property
+    def response_version(self) -> int:
+        """Version of the learnt response in use; 0: the configured one."""
+        return self.state.response_version
+
+    def adopt(self, response: LearntResponse) -> None:
+        """Use a learnt response from the next window on; one that is not newer, or for another rate, is ignored."""
+        self.state = adopted(self.state, response, self.settings)
 
     def dumps(self) -> bytes:
         """Encode the state."""

@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.control.controller import Controller
-from servotwin.plant.linear import Complex, LinearSystem, zero_order_holds
+from servotwin.hybrid.exponential import expm1
+from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.loop import StateMatrices, continuous_law, sampled_law
 from servotwin.plant.signals import Array
 
@@ -28,6 +29,10 @@ _BEYOND = 1e2
 _ABOUT = np.array([-8.0, -4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0, 8.0])
 _NARROWEST = 1e-6
 _DISTINCT = 1e-9
+# Poles below this part of the fastest one's size are integrators.
+_ZERO = 1e-9
+# Steps of 1 + L from one frequency to the next, relative to its size, up to which the curve between them is known.
+_RESOLVED = 0.8
 _AT_ONCE = 700.0
 # The least value between two frequencies is searched for by zooming in.
 _ZOOMS, _INSIDE = 2, np.linspace(0.0, 1.0, 17)
@@ -83,28 +88,39 @@ class PlantSet:
         """Discretise plants, by zero-order hold where there is a rate."""
         A, B, C = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C"))
         if rate is not None:
-            A, B = zero_order_holds(A, B, 1.0 / rate)
-            A, B = rate * (A - np.eye(B.shape[1])), rate * B
+            flows = np.zeros((len(A), B.shape[1] + 1, B.shape[1] + 1))
+            flows[:, :-1, :-1], flows[:, :-1, -1] = A, B
+            held = rate * np.array([expm1(flow, 1.0 / rate) for flow in flows])
+            A, B = held[:, :-1, :-1], held[:, :-1, -1]
         return PlantSet(A, B, C, rate)
 
-    @cached_property
+    @property
     def omega(self) -> Array:
         """(P, F) rad/s, ascending: frequencies that resolve the poles of each plant."""
+        return self._grid.omega
+
+    @cached_property
+    def _grid(self) -> Grid:
         poles = self._frequencies(_eigenvalues(self.A))
         sizes = np.abs(poles)
         # The integrator's pole is zero only to within rounding.
-        real = sizes > 1e-9 * sizes.max(axis=1, keepdims=True)
+        real = sizes > _ZERO * sizes.max(axis=1, keepdims=True)
         low, high = float(sizes[real].min()) / _BEYOND, float(sizes[real].max()) * _BEYOND
         high = high if self.rate is None else math.pi * self.rate
         low = min(low, 1e-3 * high)
         common = np.geomspace(low, high, int(_PER_DECADE * math.log10(high / low)) + 2)
         about = np.clip(_about(poles), low, high)
-        return np.sort(np.concatenate([np.broadcast_to(common, (len(poles), common.size)), about], axis=1), axis=1)
+        both = np.concatenate([np.broadcast_to(common, (len(poles), common.size)), about], axis=1)
+        order = np.argsort(both, axis=1, kind="stable")
+        omega = np.take_along_axis(both, order, axis=1)
+        return Grid(omega, order, self.points(common), self.points(about), np.sum(~real, axis=1))
 
     @cached_property
     def response(self) -> Complex:
         """(P, F) response at `omega`."""
-        return self.at(self.omega)
+        grid = self._grid
+        common = np.broadcast_to(grid.common, (len(self.A), grid.common.size))
+        return _response(self._schur, 0.0, grid.sorted(common, grid.about))
 
     def at(self, omega: Array) -> Complex:
         """(P, K) response at (P, K) frequencies, rad/s."""
@@ -122,23 +138,75 @@ class PlantSet:
 
     def loop(self, law: Controller, delay: int, omega: Array) -> Complex:
         """(P, K) response of the open loop at (P, K) frequencies, rad/s."""
-        return self._loop(self._matrices(law), delay, omega)
-
-    def _loop(self, law: StateMatrices, delay: int, omega: Array) -> Complex:
         return np.asarray(self.at(omega) * self._law_response(law, delay, omega))
 
-    def _matrices(self, law: Controller) -> StateMatrices:
-        return continuous_law(law) if self.rate is None else sampled_law(law)
+    @cached_property
+    def _law(self) -> Callable[[Controller], LawForms]:
+        return lru_cache(maxsize=8)(self._forms_of)
+
+    def _forms_of(self, law: Controller) -> LawForms:
+        A, B, C, D = continuous_law(law) if self.rate is None else sampled_law(law)
+        if self.rate is not None:
+            A, B = self.rate * (A - np.eye(len(A))), self.rate * B
+        forms = SchurForms(*(each[None].astype(np.complex128) for each in (A, B, C)))
+        if not np.array_equal(A, np.triu(A)):
+            forms = _schur_forms(A[None], B[None], C[None])
+        return LawForms(StateMatrices(A, B, C, D), forms)
+
+    @cached_property
+    def _stored(self) -> dict[tuple[str, Controller | None, int], NDArray[Any]]:
+        """Results that are asked for more than once."""
+        return {}
+
+    def _once(self, name: str, law: Controller | None, delay: int, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        key = name, law, delay
+        if key not in self._stored:
+            self._stored[key] = make()
+        return self._stored[key]
+
+    def _returned(self, law: Controller, delay: int) -> Complex:
+        """(P, F) return difference 1 + L at `omega`."""
+        loop = self.response * self._law_on_grid(law)
+        if delay:
+            loop *= self._once("late", None, delay, lambda: self._late(delay, self.omega))
+        loop += 1.0
+        return np.asarray(loop)
+
+    @cached_property
+    def _law_on_grid(self) -> Callable[[Controller], Complex]:
+        # One law is asked for with several delays, and never again.
+        return lru_cache(maxsize=1)(self._at_grid)
+
+    def _at_grid(self, law: Controller) -> Complex:
+        grid, (matrices, forms) = self._grid, self._law(law)
+        # The frequencies that all plants share are most of them.
+        common = _response(forms, matrices.D, grid.common[None])
+        about = _response(forms, matrices.D, grid.about.reshape(1, -1)).reshape(grid.about.shape)
+        return grid.sorted(np.broadcast_to(common, (len(self.A), common.shape[1])), about)
 
     def peaks(self, law: Controller, delay: int = 0) -> Array:
         """(P,) sensitivity peaks on the stored frequencies: at most what `margins` finds, and much cheaper."""
-        loop = self.response * self._law_response(self._matrices(law), delay, self.omega)
-        return np.asarray(np.max(1.0 / np.abs(1.0 + loop), axis=1))
+        return self._once("peak", law, delay, lambda: 1.0 / np.sqrt(_squares(self._returned(law, delay)).min(axis=1)))
+
+    def stable(self, law: Controller, delay: int = 0) -> NDArray[np.bool_]:
+        """(P,) stability of the closed loop, from the turns of 1 + L about zero (Nyquist); by its poles where a plant's
+        frequencies do not resolve them."""
+        if ("decay", law, delay) in self._stored:
+            return np.asarray(self.decays(law, delay) > 0.0)
+        integrators = self._grid.integrators + (law.Ki != 0.0)
+        circled, resolved = _encirclements(self._returned(law, delay), integrators)
+        stable = circled == 0
+        if not resolved.all():
+            few = PlantSet(self.A[~resolved], self.B[~resolved], self.C[~resolved], self.rate)
+            stable[~resolved] = few.decays(law, delay) > 0.0
+        return np.asarray(stable)
 
     def decays(self, law: Controller, delay: int = 0) -> Array:
         """(P,) 1/s, rate at which the slowest closed-loop mode decays; negative: it grows."""
-        poles = _eigenvalues(self._closed(self._matrices(law), delay))
-        return np.asarray(-self._frequencies(poles).real.max(axis=1))
+        return self._once("decay", law, delay, lambda: self._decays(law, delay))
+
+    def _decays(self, law: Controller, delay: int) -> Array:
+        return np.asarray(-self._frequencies(_eigenvalues(self._closed(law, delay))).real.max(axis=1))
 
     def margins(self, law: Controller, delay: int = 0) -> SetMargins:
         """Margins of the loop with a law.
@@ -150,8 +218,7 @@ class PlantSet:
         delay : int
             Whole samples between a measurement and its voltage; 0 for a continuous law.
         """
-        matrices = self._matrices(law)
-        poles = _eigenvalues(self._closed(matrices, delay))
+        poles = _eigenvalues(self._closed(law, delay))
         growth = self._frequencies(poles).real.max(axis=1)
         # Closed-loop resonances are not those of the plant alone.
         extra = _about(self._frequencies(poles))
@@ -160,11 +227,11 @@ class PlantSet:
         order = np.argsort(omega, axis=1, kind="stable")
         omega = np.take_along_axis(omega, order, axis=1)
         plant = np.take_along_axis(np.concatenate([self.response, self.at(extra)], axis=1), order, axis=1)
-        loop = plant * self._law_response(matrices, delay, omega)
+        loop = plant * self._law_response(law, delay, omega)
         stable = growth < 0.0
 
         def value(omega: Array) -> Complex:
-            return self._loop(matrices, delay, omega)
+            return self.loop(law, delay, omega)
 
         gain, phase, late = _distances(omega, loop, value)
         closest = _least(omega, np.abs(1.0 + loop), lambda w: np.abs(1.0 + value(w)))
@@ -181,20 +248,20 @@ class PlantSet:
         # A pole z = 0 decays at once; the clip keeps its infinity out of the arithmetic.
         return np.asarray(self.rate * (np.maximum(logarithm.real, -_AT_ONCE) + 1j * logarithm.imag))
 
-    def _law_response(self, law: StateMatrices, delay: int, omega: Array) -> Complex:
+    def _law_response(self, law: Controller, delay: int, omega: Array) -> Complex:
         """Response of law and delay from measurement to minus the voltage."""
-        A, B, C, D = law
-        if self.rate is not None:
-            A, B = self.rate * (A - np.eye(len(A))), self.rate * B
-        points = self.points(omega)
-        value = _response(_schur_forms(A[None], B[None], C[None]), D, points.reshape(1, -1)).reshape(omega.shape)
-        return value if self.rate is None else np.asarray(value * np.exp(-1j * delay * omega / self.rate))
+        matrices, forms = self._law(law)
+        value = _response(forms, matrices.D, self.points(omega).reshape(1, -1)).reshape(omega.shape)
+        return value if delay == 0 else np.asarray(value * self._late(delay, omega))
 
-    def _closed(self, law: StateMatrices, delay: int) -> Array:
+    def _late(self, delay: int, omega: Array) -> Complex:
+        """Response of a delay of so many samples."""
+        assert self.rate is not None
+        return np.asarray(np.exp(-1j * delay * omega / self.rate))
+
+    def _closed(self, law: Controller, delay: int) -> Array:
         """(P, N, N) closed loop of plant, law and delayed voltages; the delta operator's where there is a rate."""
-        A, B, C, D = law
-        if self.rate is not None:
-            A, B = self.rate * (A - np.eye(len(A))), self.rate * B
+        A, B, C, D = self._law(law).matrices
         n, k = self.B.shape[1], len(A)
         closed = np.zeros((len(self.A), n + k + delay, n + k + delay))
         closed[:, :n, :n] = self.A
@@ -215,12 +282,45 @@ class PlantSet:
         return closed
 
 
+class Grid(NamedTuple):
+    """Frequencies at which the plants of a set are stored.
+
+    Attributes
+    ----------
+    omega : (P, F) array
+        rad/s, ascending.
+    order : (P, F) array of int
+        Places of them among those that all plants share, followed by those about the poles of each.
+    common, about : (F - K,), (P, K) arrays
+        Points of the stability boundary at these.
+    integrators : (P,) array of int
+        Number of poles of each plant at zero.
+    """
+
+    omega: Array
+    order: NDArray[np.int64]
+    common: Complex
+    about: Complex
+    integrators: NDArray[np.int64]
+
+    def sorted(self, common: Complex, about: Complex) -> Complex:
+        """(P, F) values in the order of `omega`, from those at the shared (P, F - K) and the other (P, K) points."""
+        return np.take_along_axis(np.concatenate([common, about], axis=1), self.order, axis=1)
+
+
 class SchurForms(NamedTuple):
     """Triangular A (P, n, n) of balanced systems, with B and C (P, n) in its states."""
 
     A: Complex
     B: Complex
     C: Complex
+
+
+class LawForms(NamedTuple):
+    """A law in continuous time, or the delta operator's, and its triangular form."""
+
+    matrices: StateMatrices
+    forms: SchurForms
 
 
 def _schur_forms(A: Array, B: Array, C: Array) -> SchurForms:
@@ -251,6 +351,27 @@ def _response(forms: SchurForms, direct: float, points: Complex) -> Complex:
 
 def _eigenvalues(matrices: Array) -> Complex:
     return np.asarray(np.linalg.eigvals(matrices), dtype=np.complex128)
+
+
+def _squares(values: Complex) -> Array:
+    return np.asarray(values.real**2 + values.imag**2)
+
+
+def _encirclements(returned: Complex, integrators: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(P,) numbers of pairs of closed-loop poles beyond the boundary, and True where the frequencies resolve the curve.
+
+    `returned` is 1 + L along the boundary, (P, F) at ascending frequencies; of a stable loop it turns by a quarter for
+    each of the integrators.
+    """
+    steps = _squares(np.diff(returned, axis=1))
+    sizes = _squares(returned)
+    resolved = np.all(steps < _RESOLVED**2 * np.minimum(sizes[:, 1:], sizes[:, :-1]), axis=1)
+    upper, left = returned.imag >= 0.0, returned.real < 0.0
+    # Steps are short beside the distance from zero: a crossing of the negative real axis has an end left of zero.
+    across = (upper[:, 1:] != upper[:, :-1]) & (left[:, 1:] | left[:, :-1])
+    turns = np.sum(np.where(across, np.where(upper[:, :-1], 1, -1), 0), axis=1)
+    turned = np.angle(returned[:, -1]) - np.angle(returned[:, 0]) + 2.0 * np.pi * turns
+    return np.rint(0.25 * integrators - turned / (2.0 * np.pi)).astype(np.int64), resolved
 
 
 def _about(poles: Complex) -> Array:

@@ -158,8 +158,12 @@ class Wear(Struct, frozen=True):
         For a window older than the trend it is the present trend, not predicted.
         """
         trend = self._on_clock(settings, boot, time, now)
-        known = self.machine.prior(learning, now) if learning.learn and self.machine is not None else None
+        known = self.known_machine(learning, now)
         return Expectation(self.previous, trend and trend.predict(max(time, trend.time)), known)
+
+    def known_machine(self, learning: LearningSettings, now: float) -> FactorPrior | None:
+        """The machine's numbers as learnt, at a time (s, on the twin's clock); None: nothing, or learning is off."""
+        return self.machine.prior(learning, now) if learning.learn and self.machine is not None else None
 
     def update(
         self,
@@ -329,6 +333,14 @@ class DecodedWindow(NamedTuple):
         last = -(-self.message.samples // _TAIL)
         error = np.abs(self.window.position[-last:] - self.window.reference[-last:])
         return messages.finite(float(np.max(error)))
+
+    @property
+    def step(self) -> float:
+        """Range of the reference within the window, m; 0 where the channel is missing or the reference rests."""
+        if self.window is None or self.window.reference is None:
+            return 0.0
+        size = float(np.ptp(self.window.reference))
+        return size if math.isfinite(size) else 0.0
 
 
 def decode_window(message: messages.WindowMessage) -> Window:

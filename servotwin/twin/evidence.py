@@ -5,6 +5,7 @@ Bodies are MessagePack, every double with all its bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from servotwin.messages import (
     Answer,
     Fallback,
     Hello,
+    LearntResponse,
     ParameterMessage,
     Receipt,
     Request,
@@ -119,7 +121,7 @@ class WithdrawalRecord(NamedTuple):
 Record = (
     GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | RedesignRecord
     | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
-    | Update | Request | Receipt | Fallback | Answer | Hello
+    | Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
 """Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
 
@@ -142,6 +144,7 @@ class EvidenceLog:
     excitations: dict[WindowId, Decision] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
     requests: list[Request] = field(default_factory=list)
+    responses: list[LearntResponse] = field(default_factory=list)
     receipts: list[Receipt] = field(default_factory=list)
     fallbacks: list[Fallback] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
@@ -189,6 +192,8 @@ class EvidenceLog:
                 self.updates.append(record)
             case Request():
                 self.requests.append(record)
+            case LearntResponse():
+                self.responses.append(record)
             case Receipt():
                 self.receipts.append(record)
             case Fallback():
@@ -210,19 +215,14 @@ class StoredExpectation(Struct, frozen=True):
     def of(cls, expected: Expectation) -> StoredExpectation:
         """The numbers of an expectation."""
         trend = None if expected.trend is None else TrendState.of(expected.trend)
-        known = expected.machine
-        if known is None:
-            return cls(float(expected.previous), trend)
-        numbers = MachineReading(tuple(known.mean.tolist()), tuple(known.covariance.ravel().tolist()))
-        return cls(float(expected.previous), trend, numbers)
+        machine = None if expected.machine is None else expected.machine.reading
+        return cls(float(expected.previous), trend, machine)
 
     def expectation(self, settings: TrendSettings) -> Expectation:
         """Make the expectation again, bit for bit."""
-        trend, numbers = None if self.trend is None else self.trend.trend(settings), self.machine
-        if numbers is None:
-            return Expectation(self.previous, trend)
-        known = FactorPrior(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
-        return Expectation(self.previous, trend, known)
+        trend = None if self.trend is None else self.trend.trend(settings)
+        machine = None if self.machine is None else FactorPrior.of_reading(self.machine)
+        return Expectation(self.previous, trend, machine)
 
 
 class StoredEstimate(Struct, frozen=True):
@@ -296,6 +296,9 @@ def _row(record: Record) -> EvidenceRecord | None:
             return row._replace(gap=record.gap, std=record.std, window=window_key)
         case Request():
             return _sent("request", record, record.reason)
+        case LearntResponse():
+            spread = math.degrees(record.gap_std)
+            return _sent("response", record, f"version {record.version} of the structure, gap to {spread:.2g} deg")
         case Receipt():
             return _sent("receipt", record, record.reason.value, record.version)
         case Fallback():

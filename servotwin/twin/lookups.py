@@ -12,6 +12,9 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import MachineReading
+from servotwin.estimation.motor import LearntMotor
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting, Update
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
@@ -20,7 +23,7 @@ from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
 
-class VerificationRequest(Struct, frozen=True, tag="proof/1"):
+class VerificationRequest(Struct, frozen=True, omit_defaults=True, tag="proof/1"):
     """A verification that a twin schedules for itself through the service's queue.
 
     Attributes
@@ -34,6 +37,10 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
         Range that the setting must serve.
     setting : Design
         The controller that was looked up.
+    machine : MachineReading, optional
+        The machine's numbers as learnt by then; None: the model's, within the stated half-widths.
+    motor : LearntMotor, optional
+        The motor's.
     """
 
     servo: str
@@ -41,14 +48,24 @@ class VerificationRequest(Struct, frozen=True, tag="proof/1"):
     window: tuple[str, int]
     region: Region
     setting: Design
+    machine: MachineReading | None = None
+    motor: LearntMotor | None = None
 
     @classmethod
-    def of(cls, update: Update, redesign: Redesign) -> VerificationRequest | None:
+    def of(cls, update: Update, redesign: Redesign, evidence: Evidence) -> VerificationRequest | None:
         """Make the verification that an update still needs; None: none."""
         if redesign.to_verify is None:
             return None
         assert redesign.certificate is not None
-        return cls(update.servo, update.version, update.window, redesign.to_verify, redesign.certificate.setting)
+        return cls(
+            update.servo,
+            update.version,
+            update.window,
+            redesign.to_verify,
+            redesign.certificate.setting,
+            None if evidence.machine is None else evidence.machine.reading,
+            evidence.motor,
+        )
 
 
 class LookupState(Struct, frozen=True):
@@ -104,7 +121,8 @@ class Lookups:
         sent = request.setting.setting()
         if not any(setting is not None and sent.same_loop(setting) for setting in current):
             return state, NotVerified("not verified: another setting is in force by now"), ""
-        result = self.policy.policy.confirm(request.region, request.setting)
+        machine = None if request.machine is None else FactorPrior.of_reading(request.machine)
+        result = self.policy.policy.confirm(request.region, request.setting, machine, request.motor)
         if not isinstance(result, NotVerified):
             return state, result, ""
         why = f"the verification of version {request.version} failed: {result.reason}"

@@ -17,6 +17,7 @@ from servotwin.redesign.registry import policy_of
 from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of, motor_learning_of
 from servotwin.twin.lookups import Lookups, LookupState
 from servotwin.twin.requests import Requests, RequestState
+from servotwin.twin.responses import Responses, ResponseState
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import TwinState, decode_state
 from servotwin.twin.triage import Triage, TriageState
@@ -46,6 +47,8 @@ class TwinModel:
         Looks settings up, and verifies them after they were sent; `policy` is not used then.
     motor : MotorLearning, optional
         Learns the motor's numbers; None: the model's are taken as they are.
+    responses : Responses, optional
+        Sends the learnt structure to edges that can use it.
     """
 
     estimator: Estimator
@@ -57,6 +60,7 @@ class TwinModel:
     triage: Triage | None = None
     lookups: Lookups | None = None
     motor: MotorLearning | None = None
+    responses: Responses | None = None
 
     @classmethod
     def of(
@@ -87,6 +91,7 @@ class TwinModel:
             start=start,
             requests=Requests.of(servo, settings),
             triage=None if settings.triage is None else Triage(servo, settings.triage),
+            responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
         )
 
@@ -110,5 +115,6 @@ class TwinModel:
             state,
             requests=None if self.requests is None else state.requests or RequestState(),
             triage=None if self.triage is None else state.triage or TriageState(),
+            responses=None if self.responses is None else state.responses or ResponseState(),
             lookups=None if self.lookups is None else state.lookups or LookupState(),
         )

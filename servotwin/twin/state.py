@@ -17,6 +17,7 @@ from servotwin.messages.legacy import upgrade
 from servotwin.twin.estimating import Wear
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import RequestState
+from servotwin.twin.responses import ResponseState
 from servotwin.twin.triage import TriageState
 from servotwin.twin.versions import Attempts, Versions
 
@@ -37,7 +38,9 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         rad, gap of the last redesign.
     rests : tuple of float
         V, input biases that the last windows showed, the newest last.
-    requests, triage, lookups : RequestState, TriageState, LookupState, or None
+    steps : tuple of float
+        m, sizes of the reference's steps in the last windows, the newest last.
+    requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
 
@@ -51,6 +54,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     triage: TriageState | None = None
     lookups: LookupState | None = None
     rests: tuple[float, ...] = ()
+    steps: tuple[float, ...] = ()
+    responses: ResponseState | None = None
 
 
 _encoder = msgspec.msgpack.Encoder()

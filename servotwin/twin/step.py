@@ -15,11 +15,13 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import (
     Answer,
     Fallback,
     Hello,
     InvalidMessage,
+    LearntResponse,
     Message,
     ParameterMessage,
     Receipt,
@@ -47,6 +49,7 @@ from servotwin.twin.evidence import (
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.state import TwinState
+from servotwin.twin.triage import Glance
 from servotwin.twin.versions import Attempts, noted_setting
 
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
@@ -54,6 +57,8 @@ _STALE = "the window is not newer than what the parameters stand on, or of an ea
 
 # Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
 _RESTS = 3
+# Windows whose step is remembered.
+_STEPS = 4
 
 
 class WindowArrival(NamedTuple):
@@ -147,15 +152,12 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     learning = model.settings.learning
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records = DecodedWindow.of(message), list[Record]()
-    if model.triage is not None and state.triage is not None and decoded.window is not None:
-        requested = state.requests is not None and state.requests.pending is not None
-        trend = state.wear.trend(trends)
-        triage, glance = model.triage.glance(state.triage, message, decoded.window, trend, requested)
-        state = replace(state, triage=triage)
-        if glance is not None:
-            records.append(GlanceRecord(message, glance, decoded.tail))
-            if not glance.moved:
-                return StepResult(state, (), tuple(records))
+    state, glance = _glance(model, state, decoded, arrived)
+    if glance is not None:
+        records.append(GlanceRecord(message, glance, decoded.tail))
+        if not glance.moved:
+            state, taught = _teach(model, state, decoded, arrived)
+            return StepResult(state, taught, (*records, *taught))
     expected = state.wear.expect(trends, message.boot, message.middle, arrived, learning)
     estimate = decoded.estimate(model.estimator, expected)
     disturbed = decoded.disturbance(model.observer)
@@ -172,17 +174,25 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     if model.triage is not None and state.triage is not None and not stale:
-        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection)
+        known = state.wear.known_machine(learning, arrived)
+        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
         state = replace(state, triage=triage)
+    others: tuple[Message, ...] = ()
+    if not stale:
+        state, taught = _teach(model, state, decoded, arrived, None if rejection else estimate)
+        others, records = taught, [*records, *taught]
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
     motor = None if model.motor is None else model.motor.current(state.wear.motor, arrived)
-    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests)
+    if decoded.step > 0.0 and not stale:
+        state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
+    evidence = Evidence(
+        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests, state.steps
+    )
     state, redesign = _redesign(model, state, evidence, stale)
     if disturbed.known and not stale:
         state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
-    requests: tuple[Message, ...] = ()
     if model.requests is not None and state.requests is not None and not stale and estimate.method != UNUSABLE:
         widest = state.wear.expect(trends, message.boot, estimate.time, arrived).widest
         asking, decision = model.requests.decide(state.requests, message, estimate, widest, in_force, now)
@@ -190,16 +200,40 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         records.append(ExcitationRecord(message, decision))
         if decision.ask is not None and asking.pending is not None:
             records.append(asking.pending)
-            requests = (asking.pending,)
+            others = (*others, asking.pending)
     if redesign.setting is None:
-        return StepResult(state, requests, tuple(records))
+        return StepResult(state, others, tuple(records))
     versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))
     state = replace(state, versions=versions, tuned_for=float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
-    unverified = VerificationRequest.of(versions.pending, redesign)
+    unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
-    return StepResult(sent.state, sent.messages + requests, all_records)
+    return StepResult(sent.state, sent.messages + others, all_records)
+
+
+def _glance(
+    model: TwinModel, state: TwinState, decoded: DecodedWindow, arrived: float
+) -> tuple[TwinState, Glance | None]:
+    """Glance at a window that arrived at a time (s); None: without triage, or not possible."""
+    if model.triage is None or state.triage is None or decoded.window is None:
+        return state, None
+    requested = state.requests is not None and state.requests.pending is not None
+    trend = state.wear.trend(model.settings.trend)
+    machine = state.wear.known_machine(model.settings.learning, arrived)
+    triage, glance = model.triage.glance(state.triage, decoded.message, decoded.window, trend, requested, machine)
+    return replace(state, triage=triage), glance
+
+
+def _teach(
+    model: TwinModel, state: TwinState, decoded: DecodedWindow, arrived: float, estimate: GapEstimate | None = None
+) -> tuple[TwinState, tuple[LearntResponse, ...]]:
+    """Decide if the edge is sent the learnt structure; `estimate`: of this window, where it counts."""
+    if model.responses is None or state.responses is None:
+        return state, ()
+    machine = state.wear.known_machine(model.settings.learning, arrived)
+    responses, sent = model.responses.after(state.responses, decoded, arrived, estimate, machine)
+    return replace(state, responses=responses), () if sent is None else (sent,)
 
 
 def _learnt(message: WindowMessage, before: Wear, after: Wear) -> list[Record]:

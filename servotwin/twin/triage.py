@@ -3,6 +3,7 @@
 A glance is the plain fit that starts from the gap estimated last; the two are compared. A window is estimated, and the
 reason stored, where the gap is not identifiable from it, the fit does not converge, or anything is unusual. After every
 estimate the glance at the same window is compared with it: where glances mislead, every window is estimated.
+A glance stands on the machine as learnt, where one was; what is still open of its numbers is no news.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.quick import QuickFit, quick_fit
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.whitened.quick import NO_SPREAD, QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
@@ -79,7 +81,7 @@ class TriageState(Struct, frozen=True):
         return replace(self, misfit=usual, glances=self.glances + 1)
 
 
-class Glance(Struct, frozen=True):
+class Glance(Struct, frozen=True, omit_defaults=True):
     """Result of a glance.
 
     Attributes
@@ -94,6 +96,8 @@ class Glance(Struct, frozen=True):
         True where the window is to be estimated.
     why : str
         The reason for that decision, in words.
+    machine : MachineReading, optional
+        The machine's numbers that it stands on; None: the model's.
     """
 
     gap: float
@@ -103,6 +107,7 @@ class Glance(Struct, frozen=True):
     bias_std: float
     moved: bool
     why: str
+    machine: MachineReading | None = None
 
 
 def due(message: WindowMessage, state: TriageState, settings: TriageSettings) -> str:
@@ -138,6 +143,7 @@ def glance(
     state: TriageState,
     offset: tuple[float, float] | None = None,
     settings: TriageSettings | None = None,
+    machine: FactorPrior | None = None,
 ) -> Glance:
     """Glance at a window, and decide if it must be estimated.
 
@@ -152,6 +158,8 @@ def glance(
     offset : (float, float), optional
         The encoder's offset from earlier windows, mean and standard deviation, rad.
     settings : TriageSettings, optional
+    machine : FactorPrior, optional
+        The machine's numbers over the servo's, as learnt; None: the servo is exact.
     """
     settings, skipped = settings or TriageSettings(), in_vain(message, state)
     if skipped:
@@ -160,10 +168,11 @@ def glance(
         return _without_result("the window has no theta_m, or too few samples: what to make of it, the estimator says")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
-    fit = quick_fit(window, servo, state.gap, offset)
+    fit = quick_fit(window, servo, state.gap, offset, machine)
     bias, bias_std = quick_bias(window, servo)
-    result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "")
-    why = due(message, state, settings) or _unclear(fit, settings) or _moved(result, state, settings)
+    numbers = None if machine is None else machine.reading
+    result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "", numbers)
+    why = due(message, state, settings) or _unclear(fit, settings) or _moved(result, fit, state, settings)
     return replace(result, moved=bool(why), why=why or "nothing moved")
 
 
@@ -180,16 +189,20 @@ def _unclear(fit: QuickFit, settings: TriageSettings) -> str:
     return ""
 
 
-def _moved(result: Glance, state: TriageState, settings: TriageSettings) -> str:
+def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSettings) -> str:
     """Change since the last estimate, in words; empty: none."""
-    off = abs(result.gap - state.gap)
-    if not off <= allowed(math.hypot(result.std, state.std), settings):
+    off, std = abs(result.gap - state.gap), math.hypot(result.std, state.std)
+    usual, spread = max(state.misfit, settings.misfit_limit), NO_SPREAD
+    if not (off <= allowed(std, settings) and result.misfit <= settings.misfit * usual):
+        # Only here does it matter what is open of the machine: it may be all that differs.
+        spread = fit.machine_spread()
+    if not off <= allowed(math.hypot(std, spread.gap), settings):
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
-    if not result.misfit <= settings.misfit * max(state.misfit, settings.misfit_limit):
+    if not result.misfit <= settings.misfit * max(usual, spread.misfit):
         return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
-    spread = settings.deviations * math.hypot(result.bias_std, state.bias_std)
-    if abs(result.bias - state.bias) > max(settings.bias_limit, spread):
+    spread_of_bias = settings.deviations * math.hypot(result.bias_std, state.bias_std)
+    if abs(result.bias - state.bias) > max(settings.bias_limit, spread_of_bias):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
     return ""
 
@@ -213,7 +226,13 @@ class Triage:
     settings: TriageSettings
 
     def glance(
-        self, state: TriageState, message: WindowMessage, window: Window, trend: Trend | None, requested: bool
+        self,
+        state: TriageState,
+        message: WindowMessage,
+        window: Window,
+        trend: Trend | None,
+        requested: bool,
+        machine: FactorPrior | None = None,
     ) -> tuple[TriageState, Glance | None]:
         """Glance at a window; None where that is not possible: the estimator then reports the reason.
 
@@ -226,10 +245,12 @@ class Triage:
             Trend after the accepted windows.
         requested : bool
             True while a request for a more informative window is pending: every window is estimated then.
+        machine : FactorPrior, optional
+            The machine's numbers over the servo's, as learnt.
         """
         compared = replace(state, doubt="a request is open", vain=0) if requested else state
         try:
-            result = glance(message, window, self.servo, compared, _offset(trend), self.settings)
+            result = glance(message, window, self.servo, compared, _offset(trend), self.settings, machine)
         except InvalidInput:
             return state, None
         return (state if result.moved else state.glanced(result)), result
@@ -242,15 +263,17 @@ class Triage:
         estimate: GapEstimate,
         trend: Trend | None,
         rejection: str,
+        machine: FactorPrior | None = None,
     ) -> TriageState:
         """Return the state after an estimate; after a rejected one the next window is estimated too.
 
-        Later glances are compared with the glance at the estimated window itself.
+        Later glances are compared with the glance at the estimated window itself. Trend and `machine` are those after
+        the estimate.
         """
         if rejection or window is None:
             boot, version = message.boot, message.parameter_version
             return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
-        fit = quick_fit(window, self.servo, estimate.gap, _offset(trend))
+        fit = quick_fit(window, self.servo, estimate.gap, _offset(trend), machine)
         bias, bias_std = quick_bias(window, self.servo)
         return TriageState(
             doubt=self._misled(fit, estimate),
@@ -267,7 +290,10 @@ class Triage:
     def _misled(self, fit: QuickFit, estimate: GapEstimate) -> str:
         """Error of a glance, in words; empty where it is small enough."""
         off = abs(fit.gap - estimate.gap)
-        if off <= allowed(math.hypot(fit.std, estimate.std), self.settings):
+        std = math.hypot(fit.std, estimate.std)
+        if off <= allowed(std, self.settings) or off <= allowed(
+            math.hypot(std, fit.machine_spread().gap), self.settings
+        ):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
 

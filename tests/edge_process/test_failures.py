@@ -14,7 +14,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.edge.drive import DriveLost
 from servotwin.edge.guard import Limits
-from servotwin.edge.outlet import CHANNELS, UNFILTERED
+from servotwin.edge.outlet import CHANNELS, NOT_ADOPTED, UNFILTERED
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
@@ -26,7 +26,7 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import StopSignal, run_role
 from servotwin.edge_process.startup import permitted
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Setting
+from servotwin.messages import LearntResponse, Setting, encode
 
 LAW = Controller(200.0, 0.0, 0.0, 0.1, sample_rate=100.0)
 SETTINGS = AgentSettings("axis-1", UNBOOTED, 100.0, 0.1, limits=Limits(maximum=1e-3), controller=LAW)
@@ -34,7 +34,7 @@ CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
 
 
 class FailingFilter:
-    longest_pause_s = math.inf
+    longest_pause_s, response_version = math.inf, 0
 
     def check(self, sample_rate: float) -> None:
         """Any rate will do."""
@@ -43,6 +43,9 @@ class FailingFilter:
         return self
 
     def __call__(self, _cut: Cut) -> Cut | None:
+        raise ZeroDivisionError
+
+    def adopt(self, _response: LearntResponse) -> None:
         raise ZeroDivisionError
 
     def dumps(self) -> bytes:
@@ -95,6 +98,15 @@ def test_a_window_whose_filter_fails_is_sent(
     handler.handle(cut(0))
     assert outbox.pending() == [("b1", 0)]
     assert handler.faults == {UNFILTERED: 1}
+
+
+def test_a_response_at_which_the_filter_fails_is_counted(
+    handler: FrameHandler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
+    response = LearntResponse("axis-1", 1, 100.0, ((0.5, 0.1, 1e-4, 0.0),), 0.0, 3e-4, 0.0, 0.1, 1e-4)
+    handler.handle(frames.ResponseFrame(1, "b1", encode(response)))
+    assert handler.faults == {NOT_ADOPTED: 1}
 
 
 def test_a_window_with_a_bad_sample_is_not_filtered_and_not_sent(

@@ -21,6 +21,7 @@ from servotwin.messages import (
     Gains,
     Hello,
     InvalidMessage,
+    LearntResponse,
     Message,
     Reason,
     Receipt,
@@ -62,7 +63,8 @@ FULL_UPDATE = msgspec.structs.replace(
     UPDATE, setting=Setting(1e-4, GAINS, Band(5e-5, 2e-5, 0.1, 2.0)), verification=VERIFICATION
 )
 FALLBACK = Fallback("axis-1", "b0", 110_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 3, 4, Setting(0.0, GAINS))
-MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE]
+RESPONSE = LearntResponse("axis-1", 2, 5000.0, ((0.99, 0.02, 1e-6, -2e-6),), 0.0, 3e-4, 0.004, 0.1, 1e-4)
+MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE, RESPONSE]
 
 
 @pytest.mark.parametrize("message", MESSAGES)
@@ -75,6 +77,30 @@ def test_parameter_messages_are_json_too(message: Any) -> None:
     text = encode_json(message)
     assert decode_json(text) == message
     assert json.loads(text)["type"] == type(message).__struct_config__.tag
+
+
+def test_a_window_names_a_response_only_where_its_filter_takes_one() -> None:
+    assert b"response_version" not in encode(window())
+    named = decode(encode(window(response_version=0)))
+    assert isinstance(named, WindowMessage)
+    assert named.response_version == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rate": 0.0}, "rate 0.0 Hz is not positive"),
+        ({"modes": ((0.8, 0.6, 0.0, 0.0),)}, "must all decay"),
+        ({"modes": ((0.8, 0.1, math.inf, 0.0),)}, "must be finite"),
+        ({"static_gain": 0.0}, "static_gain 0 m/rad"),
+        ({"unseen": -1.0}, "unseen -1.0 s"),
+        ({"gap": -0.1}, "gap -0.1 rad"),
+        ({"gap_std": math.inf}, "gap_std inf rad"),
+    ],
+)
+def test_a_response_that_no_structure_has_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidMessage, match=words):
+        msgspec.structs.replace(RESPONSE, **changes)
 
 
 def test_a_window_has_an_identity() -> None:

@@ -121,3 +121,25 @@ def test_margins_do_not_depend_on_the_unit_of_time() -> None:
     assert other.Ms == pytest.approx(one.Ms, rel=1e-8)
     assert other.phase_margin == pytest.approx(one.phase_margin, rel=1e-8)
     assert 100.0 * other.delay_margin == pytest.approx(one.delay_margin, rel=1e-8)
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 1000),
+    scale=st.floats(0.05, 20.0),
+    share=st.sampled_from([0.0, 0.01, 1.0]),
+    rate=st.sampled_from([None, 50.0, 300.0, 5000.0]),
+    delay=st.integers(0, 3),
+    filtered=st.sampled_from([None, 20.0]),
+)
+def test_the_turns_of_the_return_difference_tell_stability_as_the_poles_do(
+    seed: int, scale: float, share: float, rate: float | None, delay: int, filtered: float | None
+) -> None:
+    own = OWN.replace(sample_rate=rate, loop_filter_hz=filtered)
+    law = own.replace(Kp=scale * own.Kp, Kd=scale * own.Kd, Ki=share * own.Ki)
+    late = delay if rate else 0
+    systems = [servo.plant() for servo in varied(5, seed)]
+    decays = PlantSet.of(systems, rate).decays(law, late)
+    # Poles on the boundary to within what eigenvalues resolve belong to neither side.
+    clear = np.abs(decays) > 1e-6
+    assert np.array_equal(PlantSet.of(systems, rate).stable(law, late)[clear], decays[clear] > 0.0)

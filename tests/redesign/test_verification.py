@@ -210,7 +210,7 @@ def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_fr
     rest = Disturbance(0.05, 1e-5, 0.0, 0.3, 0.0)
     torque = SERVO.k_T / SERVO.R
     stated, sticky, smooth, unsure = (
-        policy.redesign(Evidence(estimate, rest, motor=each)).certificate
+        policy.redesign(Evidence(estimate, rest, motor=each, rests=(0.05, 0.05))).certificate
         for each in (
             None,
             motor(-0.07, 0.045, 0.03, 5e-4),

@@ -10,6 +10,7 @@ from servotwin.messages import (
     Receipt,
     Setting,
     pack_channel,
+    pack_finely,
 )
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.estimating import Expectation
@@ -65,3 +66,26 @@ def twin_of(estimator, policy, settings: TwinSettings | None = None, **parts) ->
 def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):
     in_force = update.version if in_force is None else in_force
     return Receipt("axis", update.version, reason is Reason.APPLIED, 10, reason, in_force, boot)
+
+
+def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
+    """Message of a window, with theta_m packed finely; `changes`: version, reason, boot, start."""
+    channels = []
+    for name, samples in window.channels.items():
+        unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
+        packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
+        channels += packed
+    told = {"version": 0, "reason": "reference", "boot": "b", **changes}
+    return messages.WindowMessage(
+        "axis",
+        told["boot"],
+        sequence,
+        told.get("start", window.start),
+        window.sample_rate,
+        tuple(channels),
+        (),
+        told["version"],
+        "m",
+        told["reason"],
+        messages.checksum(channels),
+    )

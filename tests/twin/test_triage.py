@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -12,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-from twin_messages import eq_21
+from twin_messages import eq_21, message_of
 
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from benchmarks.glances import triage as bench
@@ -24,7 +25,6 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance, quick_bias
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
-from servotwin.messages import pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
@@ -55,33 +55,16 @@ def cases(noisy: bool) -> tuple[WindowCase, ...]:
 @cache
 def calm_windows() -> tuple[messages.WindowMessage, ...]:
     """Of a deployed loop: at rest between steps, 2 s with a bias of 50 mV; only the first few show both contacts."""
-    # Without the bound on the worst plant: a livelier loop shows both contacts for longer.
-    demands = Demands(Ms_worst=100.0, shapes=((1.0, 1.0),), **SMALL)
+    lively, calm = (windows_under(scale) for scale in (1.0, 0.7))
+    return (*lively[:3], *calm[3:])
+
+
+def windows_under(scale: float) -> tuple[messages.WindowMessage, ...]:
+    """Of a loop whose Kp and Kd are the servo's own times a scale: a livelier one shows both contacts for longer."""
+    demands = Demands(scales=(scale,), shapes=((1.0, 1.0),), Ms_worst=100.0, **SMALL)
     scenario = Scenario.preset("certified")
     scenario = scenario.replace(gap=25.0 * DEG, duration=125.0, twin=scenario.twin.replace(demands=demands))
     return cosimulate(scenario).windows
-
-
-def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
-    channels = []
-    for name, samples in window.channels.items():
-        unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
-        packed = pack_finely(name, unit, samples) if name == "theta_m" else (pack_channel(name, unit, samples),)
-        channels += packed
-    told = {"version": 0, "reason": "reference", "boot": "b", **changes}
-    return messages.WindowMessage(
-        "axis",
-        told["boot"],
-        sequence,
-        told.get("start", window.start),
-        window.sample_rate,
-        tuple(channels),
-        (),
-        told["version"],
-        "m",
-        told["reason"],
-        messages.checksum(channels),
-    )
 
 
 def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
@@ -298,7 +281,7 @@ def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
     _, store = triaged([*before, *shifted])
     first = store.glances[("servo", before[0].boot, shifted[0].sequence)]
     assert first.moved
-    assert "the gap moved: 26 deg at a glance, 25 deg estimated before" in first.why
+    assert re.match(r"the gap moved: (26|25.99) deg at a glance, 25 deg estimated before", first.why)
 
 
 @pytest.mark.slow
@@ -359,9 +342,13 @@ def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
 def test_the_bench_says_how_often_a_glance_errs(tmp_path) -> None:
     output = tmp_path / "triage.json"
     rows = bench(output=output, gaps=2, console=Console(file=io.StringIO()))
-    for row in rows:
+    *exact, off, once, thrice = rows
+    for row in (*exact, thrice):
         assert row.seen[0] < 0.1
-        assert row.seen[-1] == 1.0
+        assert row.seen[-1] >= (1.0 if row in exact else 0.9)
+    assert off.seen[0] > 0.9
+    assert once.seen[0] < 0.2
+    for row in rows:
         assert list(row.seen) == sorted(row.seen)
         assert 0.0 < row.least <= row.median
-    assert len(json.loads(output.read_text())["rows"]) == len(rows) == 3
+    assert len(json.loads(output.read_text())["rows"]) == len(rows) == 6

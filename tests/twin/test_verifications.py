@@ -95,7 +95,7 @@ def kinds(outcome: WorkResult) -> list[str]:
 
 
 def failing(monkeypatch) -> None:
-    def refuted(_policy, _region, _setting):
+    def refuted(_policy, _region, _setting, _machine, _motor):
         return NotVerified("the setting settles on 3.0 % of the members, and 99 % are asked")
 
     monkeypatch.setattr(certified_module.CertifiedPolicy, "confirm", refuted)

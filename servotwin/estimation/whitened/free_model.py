@@ -20,6 +20,7 @@ import numpy as np
 from servotwin.estimation.core.contacts import travel
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
@@ -54,6 +55,16 @@ class FactorPrior:
     def of_spreads(cls, k: float, c: float, pitch: float, ratio: float = 0.03) -> FactorPrior:
         """Make a prior of independent factors about 1, with relative standard deviations."""
         return cls(np.zeros(4), np.diag(np.square([k, c, pitch, ratio])))
+
+    @classmethod
+    def of_reading(cls, numbers: MachineReading) -> FactorPrior:
+        """Make a prior of plain numbers, bit for bit."""
+        return cls(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
+
+    @property
+    def reading(self) -> MachineReading:
+        """The same as plain numbers."""
+        return MachineReading(tuple(self.mean.tolist()), tuple(self.covariance.ravel().tolist()))
 
     @cached_property
     def root(self) -> Array:
@@ -95,6 +106,12 @@ class FreeFit:
     def covariance(self) -> Array:
         """(6, 6) of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal: not known."""
         return _covariance(self.rows, self.movable)
+
+    @property
+    def factor_covariance(self) -> Array:
+        """(4, 4) of the factors alone, whether or not gap and place are known, for a residual of variance 1."""
+        left = project_out(orthonormal(self.rows[:2]), self.rows[2:])
+        return np.asarray(np.linalg.inv(left @ left.T))
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
@@ -206,11 +223,14 @@ class ContactEvidence:
         rad, range by which the motor leads the screw in the fit of one contact: the gap is at least as wide.
     lead_std : float
         rad, its standard deviation with the model free; 0 where the screw did not move.
+    single : Point
+        The fit of one contact.
     """
 
     rise: float
     lead: float
     lead_std: float
+    single: Point
 
     @property
     def two(self) -> bool:
@@ -257,7 +277,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     # The way to the contact is what the place says: half the gap per unit.
     moved = motion.forwards + motion.backwards > 0.0
     std = 0.5 * wide * math.sqrt(variance * best.covariance[1, 1]) if moved else 0.0
-    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std)
+    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std, best.point)
 
 
 def same_way(point: Point, gap: float) -> tuple[float, float, float]:

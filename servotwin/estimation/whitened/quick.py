@@ -2,19 +2,25 @@
 
 It tells whether the gap has moved; the estimator tells where to. It needs the gap as known before, next to which it
 searches, and the encoder's offset, without which a window of one contact shows nothing of the gap. Where the offset is
-not known, several places of the screw in the gap are tried.
+not known, several places of the screw in the gap are tried. A machine that was learnt is fitted as learnt; what is
+still open of its numbers is computed on demand, because few windows need it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.estimation.core.decimation import decimation
-from servotwin.estimation.core.least_squares import remove
-from servotwin.estimation.core.response import response
+from servotwin.estimation.core.least_squares import least_squares, project_out, remove
+from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.variants import variants
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import Misfit, MisfitSlopes, NuisancePrior, Point, Reduction, factor_for
 from servotwin.estimation.whitened.search import GAP_ONLY, descend
 from servotwin.estimation.window import Window
@@ -27,6 +33,41 @@ _FREE, _PRECISION, _GAIN = 2.0, 1e-5, 1e-7  # ranges of the motor; of the motor'
 _LAST_STEP, _CLOSE = 0.3, 1e-5  # largest last step of a converged gap: standard deviations; of the motor's range
 _FLAT = 1e-9  # of the derivative's square: below it nothing shows the gap
 _ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 to 1
+
+
+class MachineSpread(NamedTuple):
+    """What the open numbers of a machine do to a fit: spread of the gap (rad), root mean square left over (m)."""
+
+    gap: float
+    misfit: float
+
+
+NO_SPREAD = MachineSpread(0.0, 0.0)
+"""Of an exact model."""
+
+
+@dataclass(frozen=True, eq=False)
+class _LearntMinimum:
+    """A minimum on a learnt machine, and by how much the gap moves there per change of each sample."""
+
+    reduction: Reduction
+    misfit: Misfit
+    servo: Servo
+    machine: FactorPrior
+    point: Point
+    weights: Array
+
+    def spread(self) -> MachineSpread:
+        """Effect of one standard deviation along each axis of the open numbers."""
+        reduction, basis = self.reduction, self.misfit.basis
+        screw = reduction.traced(self.point)[:1]
+        answer = reduction.reduced.respond(screw)[0]
+        shares = least_squares(reduction.fixed(), self.misfit.position - answer).coefficients
+        rate, factors = 1.0 / reduction.response.interval, tuple(self.machine.mean.tolist())
+        near = nearby(self.servo, factors, rate, reduction.decimation, soft=False)
+        motions = np.linalg.cholesky(self.machine.covariance).T @ near.motions(screw, answer, shares[1:])
+        left, count = project_out(basis, motions), _freedom(self.misfit)
+        return MachineSpread(float(np.linalg.norm(motions @ self.weights)), float(np.linalg.norm(left)) / count**0.5)
 
 
 @dataclass(frozen=True)
@@ -50,9 +91,20 @@ class QuickFit:
     std: float
     misfit: float
     converged: bool
+    _learnt: _LearntMinimum | None = field(default=None, repr=False, compare=False)
+
+    def machine_spread(self) -> MachineSpread:
+        """Effect of what is open of the machine; none on an exact model."""
+        return NO_SPREAD if self._learnt is None else self._learnt.spread()
 
 
-def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, float] | None = None) -> QuickFit:
+def quick_fit(
+    window: Window,
+    servo: Servo,
+    gap: float,
+    offset: tuple[float, float] | None = None,
+    machine: FactorPrior | None = None,
+) -> QuickFit:
     """Fit a window with theta_m next to a total gap (rad).
 
     Parameters
@@ -62,16 +114,17 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
     gap : float
     offset : (float, float), optional
         Mean and standard deviation (rad) of the encoder's offset as earlier windows showed it; None: not known.
+    machine : FactorPrior, optional
+        The machine's numbers over the servo's, as learnt; None: the servo is exact.
     """
-    reduction = _slow(window, servo, offset)
+    reduction = _slow(window, servo, offset, machine)
     misfit, span = reduction.coarse(), float(np.ptp(reduction.theta_m))
     costs = misfit.costs([Point(gap, place) for place in PLACES])
     start = Point(gap, PLACES[int(np.argmin(costs))])
     both = descend(misfit, start, _FREE * span, _PRECISION * span, STEPS, gain=_GAIN)
     # Where noise hides the place, its steps are wild and keep the gap from its minimum.
     fit = descend(misfit, both.point, _FREE * span, _PRECISION * span, STEPS, GAP_ONLY, gain=_GAIN)
-    count = max(1, misfit.position.size - len(misfit.basis) - 2)
-    rms, residual = math.sqrt(fit.slopes.cost / count), fit.slopes.residual
+    rms, residual = math.sqrt(fit.slopes.cost / _freedom(misfit)), fit.slopes.residual
     weights = _weights(fit.slopes, rms)
     if weights is None:
         return QuickFit(float(fit.point.gap), math.inf, rms, fit.converged)
@@ -81,22 +134,35 @@ def quick_fit(window: Window, servo: Servo, gap: float, offset: tuple[float, flo
         variance += (offset[1] * _by_offset(reduction, misfit, weights)) ** 2
     std = math.sqrt(variance)
     still = abs(float(weights @ residual))
-    return QuickFit(float(fit.point.gap), std, rms, still <= max(_LAST_STEP * std, _CLOSE * span))
+    learnt = None if machine is None else _LearntMinimum(reduction, misfit, servo, machine, fit.point, weights)
+    return QuickFit(float(fit.point.gap), std, rms, still <= max(_LAST_STEP * std, _CLOSE * span), learnt)
 
 
-def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None) -> Reduction:
+def _freedom(misfit: Misfit) -> int:
+    """Degrees of freedom of the residual."""
+    return max(1, misfit.position.size - len(misfit.basis) - 2)
+
+
+def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None, machine: FactorPrior | None) -> Reduction:
     """Decimate both channels to the rate that the structure needs."""
     assert window.theta_m is not None
     angle, position = window.theta_m, window.position
     reduce = decimation(factor_for(response(servo, window.sample_rate), angle.size))
     rows = reduce.rows(np.vstack([angle - angle[0], position - position[0]]))
-    model = response(servo, window.sample_rate / reduce.factor)
+    rate = window.sample_rate / reduce.factor
+    model = response(servo, rate) if machine is None else _as_learnt(servo, tuple(machine.mean.tolist()), rate)
     if offset is None:
-        return Reduction.of(rows[0], rows[1], model, skew=False)
+        return Reduction.of(rows[0], rows[1], model, skew=False, factor=1)
     first, home = float(angle[0] + rows[0, 0]), float(position[0] + rows[1, 0])
     gain = model.static_gain
     known = NuisancePrior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
-    return Reduction.of(rows[0], rows[1], model, known, skew=False)
+    return Reduction.of(rows[0], rows[1], model, known, skew=False, factor=1)
+
+
+@lru_cache(maxsize=64)
+def _as_learnt(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
+    """Response of a servo with other logarithms of its factors, at a rate (Hz)."""
+    return variants(servo, [np.array(factors)], rate)[0]
 
 
 def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:

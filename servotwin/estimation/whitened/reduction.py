@@ -155,9 +155,10 @@ class Reduction:
         offset: NuisancePrior | None = None,
         growth: NuisancePrior | None = None,
         skew: bool = True,
+        factor: int | None = None,
     ) -> Reduction:
-        """Prepare theta_m (n,) rad and position (n,) m, both from any origin."""
-        reduce = decimation(factor_for(model, theta_m.size))
+        """Prepare theta_m (n,) rad and position (n,) m, both from any origin; `factor` None: as the structure needs."""
+        reduce = decimation(factor_for(model, theta_m.size) if factor is None else factor)
         rows = reduce.rows(np.asarray(position - position[0])[None])
         largest = max(float(np.abs(position).max()), abs(model.static_gain) * float(np.abs(theta_m).max()))
         # From the positions as measured: far from the origin their rounding is larger than the motion suggests.

@@ -80,9 +80,9 @@ class Question:
 
     def cost(self, setting: Design, measures: MachineMeasures) -> float:
         """s: 95th percentile of the error's integral per step, plus the price of the noise."""
-        return float(np.percentile(measures.cost, 95.0)) + self._price(setting)
+        return float(np.percentile(measures.cost, 95.0)) + self.price(setting)
 
-    def _price(self, setting: Design) -> float:
+    def price(self, setting: Design) -> float:
         """s, price of the noise in the voltage."""
         law = setting.controller
         if not self.noise:

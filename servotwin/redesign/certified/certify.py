@@ -12,12 +12,13 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import COUNTS, assess
+from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, costs_to_and_fro
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
@@ -29,6 +30,18 @@ from servotwin.redesign.design import Design
 _GAINS_WITH_INTEGRAL = 3
 # Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
 _FAST = 10.0
+# Candidates that are compared on a machine that was observed.
+_MOVED = 8
+# Cost of the running setting over that of the cheapest one, up to which the running one stays.
+_WORTH = 1.03
+
+
+class _Ranked(NamedTuple):
+    """A candidate with its cost (s) on a few machines, and whether it misses a demand on them."""
+
+    setting: Design
+    fails: bool
+    cost: float
 
 
 def certify(
@@ -39,8 +52,11 @@ def certify(
     feedforward: float = 0.0,
     noise: float = 0.0,
     clock: Callable[[], float] = perf_counter,
+    running: Design | None = None,
 ) -> Certificate | NotVerified:
     """Find the cheapest setting that meets the demands on all simulated machines that the uncertainty allows.
+
+    Costs are compared on the steps that the machine usually makes, where these are known.
 
     Parameters
     ----------
@@ -56,6 +72,8 @@ def certify(
         m rms on the measured position.
     clock : callable
         s, from which the certificate's computing time is taken.
+    running : Design, optional
+        In force: it stays where it is verified too and at most a tenth dearer than the cheapest.
 
     Raises
     ------
@@ -68,9 +86,10 @@ def certify(
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)
     laws = candidates_of(servo, uncertainty, demands, disturbed, noise > 0.0)
     candidates = [with_feedforward(setting, feedforward) for setting in laws]
+    in_force = None if running is None else with_feedforward(running, feedforward)
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     attempts: list[Attempt] = []
-    for setting in _shortlist(_ranked_in_stages(question, candidates), demands.attempts):
+    for setting in _shortlist(_ranked_in_stages(question, candidates, in_force), demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -177,29 +196,60 @@ def _gains(law: Controller) -> tuple[float, float, float]:
     return law.Kp, law.Kd, law.Tf
 
 
-def _ranked_in_stages(question: Question, candidates: list[Design]) -> list[Design]:
-    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only."""
+def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> list[Design]:
+    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only.
+
+    The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
+    would otherwise take turns, whenever the evidence moves a little.
+    """
     plain = [setting for setting in candidates if not setting.controller.Ki]
-    if not plain or len(plain) == len(candidates):
-        return _ranked(question, candidates)
-    gains = {_gains(setting.controller) for setting in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
-    with_integral = [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
-    return _ranked(question, plain + with_integral)
+    if plain and len(plain) < len(candidates):
+        gains = {_gains(each.setting.controller) for each in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
+        gains.add(_gains(question.servo.controller))
+        candidates = plain + [c for c in candidates if c.controller.Ki and _gains(c.controller) in gains]
+    if running is not None:
+        candidates = list(dict.fromkeys([running, *candidates]))
+    ranked = _ranked(question, candidates)
+    if question.uncertainty.usual_step is not None:
+        ranked = _compared(question, ranked, running)
+    stays = [e for e in ranked if e.setting == running and not e.fails and e.cost <= _WORTH * ranked[0].cost]
+    return [each.setting for each in dict.fromkeys([*stays, *ranked])]
 
 
-def _ranked(question: Question, candidates: list[Design]) -> list[Design]:
+def _compared(question: Question, ranked: list[_Ranked], running: Design | None) -> list[_Ranked]:
+    """The first candidates and the running one in the order of their expected cost on the machine that was observed.
+
+    This is one machine, so that what is open about it averages; and it moves to and fro: where a law leaves the motor
+    in the gap decides the cost of the next move.
+    """
+    demands, known = question.demands, question.uncertainty
+    own = _gains(question.servo.controller)
+    always = [each.setting == running or _gains(each.setting.controller) == own for each in ranked]
+    shown = [k for k, each in enumerate(ranked) if not each.fails and (k < _MOVED or always[k])]
+    if not shown:
+        return ranked
+    known = known.replace(step=known.usual_step)
+    members = draw(question.servo, known, demands.screened, demands.conditions // 2, demands.seed)
+    moves = costs_to_and_fro([_quick(question, ranked[k].setting) for k in shown], members, question.trial.half.half)
+    costs = [float(cost.mean()) + question.price(ranked[k].setting) for k, cost in zip(shown, moves, strict=True)]
+    first = [ranked[k]._replace(cost=cost) for k, cost in zip(shown, costs, strict=True)]
+    return sorted(first, key=lambda each: each.cost) + [each for k, each in enumerate(ranked) if k not in shown]
+
+
+def _ranked(question: Question, candidates: list[Design]) -> list[_Ranked]:
     """Candidates that meet the demands on a few machines first, then by cost."""
-    demands = question.demands
-    members = draw(question.servo, question.uncertainty, demands.screened, demands.conditions, demands.seed)
+    demands, known = question.demands, question.uncertainty
+    known = known.replace(step=known.usual_step or known.step)
+    members = draw(question.servo, known, demands.screened, demands.conditions, demands.seed)
     measures = assess([_quick(question, setting) for setting in candidates], members, question.trial.half)
 
-    def rank(k: int) -> tuple[bool, float]:
-        few = measures[k]
+    def ranked(setting: Design, few: MachineMeasures) -> _Ranked:
         fails = float(np.mean(few.settled)) < demands.settled or few.overshoot.max() > demands.overshoot
-        fails = fails or bool(few.tail.max() > ROUNDED * question.largest_error(candidates[k]))
-        return fails, question.cost(candidates[k], few)
+        fails = fails or bool(few.tail.max() > ROUNDED * question.largest_error(setting))
+        return _Ranked(setting, fails, question.cost(setting, few))
 
-    return [candidates[k] for k in sorted(range(len(candidates)), key=rank)]
+    every = [ranked(setting, few) for setting, few in zip(candidates, measures, strict=True)]
+    return sorted(every, key=lambda each: (each.fails, each.cost))
 
 
 def _quick(question: Question, setting: Design) -> Design:

@@ -14,13 +14,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
+import numpy as np
+
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, known_bias
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
-from servotwin.redesign.certified.uncertainty import Range, Region
+from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
@@ -231,7 +235,12 @@ class TablePolicy:
     provisional: ClassVar[bool] = True
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """Choose the setting of a cell that contains all machines that the evidence allows; else the fallback set."""
+        """Choose the setting of a cell that contains all machines that the evidence allows; else the fallback set.
+
+        A machine that was learnt to lie outside of the stated half-widths is in no cell: its settings are verified.
+        """
+        if evidence.machine is not None and not _is_stated(evidence.machine, self.policy.uncertainty):
+            return self.policy.redesign(evidence)
         return self.policy.decide(evidence, self)
 
     def verify(self, region: Region, running: Setting | None) -> Certificate | NotVerified:
@@ -260,6 +269,14 @@ class _WithdrawnTable:
 
     def fallback(self) -> Certificate:
         return self.certificate
+
+
+def _is_stated(machine: FactorPrior, known: Uncertainty) -> bool:
+    """True where stiffness and damping over the masses, as learnt, lie within what the half-widths allow."""
+    spread = NORMAL_95 * np.sqrt(np.diag(machine.covariance)[:2])
+    low, high = np.exp(machine.mean[:2] - spread), np.exp(machine.mean[:2] + spread)
+    widths = np.array([known.k, known.c])
+    return bool(np.all((1.0 - widths) / (1.0 + known.m) <= low) and np.all(high <= (1.0 + widths) / (1.0 - known.m)))
 
 
 def _contains(cell: Range, low: float, high: float) -> bool:

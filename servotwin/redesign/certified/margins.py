@@ -107,44 +107,64 @@ def laws_within(
     InvalidInput
         There is none.
     """
+    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
+    delays = delays_of(servo.controller, uncertainty)
     scaled = [
         scaled_law(servo.controller, scale, shape, share)
         for share in integral
         for shape in demands.shapes
         for scale in demands.scales
     ]
-    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
-    laws: list[Controller] = []
-    delays = delays_of(servo.controller, uncertainty)
-    peaks: dict[Controller, float] = {}
-    for law in dict.fromkeys(scaled):
-        # A dead zone may stop the integral: the law without it must be within the bounds too.
-        if law.Ki and 0.0 in integral and law.replace(Ki=0.0) not in laws:
-            continue
-        each = np.array([plants.peaks(law, delay) for delay in delays])
-        peaks[law] = float(each.max())
-        within = each[0, 0] <= demands.Ms * _ROUNDED and peaks[law] <= demands.Ms_worst * _ROUNDED
-        # A small peak alone says nothing: that of an unstable loop may be small.
-        if within and _stable(plants, law, delays):
-            laws.append(law)
-    if not laws:
-        rate = servo.controller.sample_rate
-        at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
-        stable = [peak for law, peak in peaks.items() if _stable(plants, law, delays)]
-        found = f"; the least that any has is {min(stable):.3g}" if stable else "; none is stable there"
-        raise InvalidInput(
-            f"no candidate has Ms <= {demands.Ms:g} on this servo and <= {demands.Ms_worst:g} on every plant of the "
-            f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
-            f"{min(demands.scales):g}"
-        )
+    laws = list(dict.fromkeys(scaled))
+    known: dict[Controller, bool] = {}
+
+    def passes(law: Controller) -> bool:
+        if law not in known:
+            # A dead zone may stop the integral: the law without it must be within the bounds too.
+            stopped = law.replace(Ki=0.0) if law.Ki and 0.0 in integral else law
+            # A small peak alone says nothing: that of an unstable loop may be small.
+            known[law] = (
+                (stopped is law or passes(stopped))
+                and _keeps_to(plants, law, delays, demands)
+                and _stable(plants, law, delays)
+            )
+        return known[law]
+
+    fastest = next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
+    if fastest is None:
+        raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
     # A loop with less than half of the gain that another one may have is slower, at every gap of the presets.
-    least = _WORTH_TRYING * max(abs(law.Kp) for law in laws)
+    least = _WORTH_TRYING * abs(fastest.Kp)
     always = {scaled_law(servo.controller, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
-    return tuple(law for law in laws if abs(law.Kp) >= least or law in always)
+    return tuple(law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law))
+
+
+def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demands: Demands) -> bool:
+    """True where no peak is beyond the bounds; what fails on the model itself is not tried elsewhere."""
+    first = plants.peaks(law, delays[0])
+    if first[0] > demands.Ms * _ROUNDED:
+        return False
+    return all(plants.peaks(law, delay).max() <= demands.Ms_worst * _ROUNDED for delay in delays)
+
+
+def _none_within(
+    servo: Servo, uncertainty: Uncertainty, demands: Demands, plants: PlantSet, laws: list[Controller]
+) -> str:
+    """Reason why none of the laws is within the bounds."""
+    rate, delays = servo.controller.sample_rate, delays_of(servo.controller, uncertainty)
+    at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
+    stable = [law for law in laws if _stable(plants, law, delays)]
+    peaks = [max(float(plants.peaks(law, delay).max()) for delay in delays) for law in stable]
+    found = f"; the least that any has is {min(peaks):.3g}" if peaks else "; none is stable there"
+    return (
+        f"no candidate has Ms <= {demands.Ms:g} on this servo and <= {demands.Ms_worst:g} on every plant of the "
+        f"stated ranges{at}{found}: raise the bounds, narrow the ranges, or allow smaller scales than "
+        f"{min(demands.scales):g}"
+    )
 
 
 def _stable(plants: PlantSet, law: Controller, delays: tuple[int, ...]) -> bool:
-    return all(plants.decays(law, delay).min() > 0.0 for delay in delays)
+    return all(bool(plants.stable(law, delay).all()) for delay in delays)
 
 
 def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share: float) -> Controller:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Annotated, Any
 
@@ -76,6 +76,9 @@ class Uncertainty:
     ----------
     learnt : LearntFactors, optional
         Posterior of some parameters, which counts in place of their half-widths.
+    usual_step : (float, float), optional
+        m, sizes of the steps that the machine was seen to make: settings are compared by their cost on these, and
+        verified on all of `step`.
 
     Raises
     ------
@@ -128,6 +131,8 @@ class Uncertainty:
         ),
     ] = 0
     learnt: LearntFactors | None = None
+    # Not in the representation, which seeds the verification: its machines do not depend on this.
+    usual_step: Range | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
@@ -158,6 +163,8 @@ class Region:
         V, N m.
     noise : float
         m rms of the measured position; 0 where it is unknown.
+    usual_step : (float, float), optional
+        m, sizes of the last steps; None: none was seen.
     """
 
     gap: Range
@@ -165,10 +172,13 @@ class Region:
     input_bias: Range
     friction: Range
     noise: float
+    usual_step: Range | None = None
 
     def within(self, known: Uncertainty) -> Uncertainty:
         """Prior knowledge narrowed to the region."""
-        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction)
+        return known.replace(
+            gap=self.gap, input_bias=self.input_bias, friction=self.friction, usual_step=self.usual_step
+        )
 
     @property
     def largest_bias(self) -> float:
