@@ -147,14 +147,14 @@ def sampled(options: Options) -> Workload:
 
 def counts(options: Options) -> Workload:
     """The same with a sensor that counts."""
-    return _noisy("counts", "noise, counts of 1 um, loop filter", NoisyWorkload(options.wear, resolution=1e-6))
+    return _noisy("counts", "noise, counts of 1 um", NoisyWorkload(options.wear, resolution=1e-6))
 
 
 def calm(options: Options) -> Workload:
     """A loop that comes to rest in its gap, and an encoder's noise."""
     wear = replace(options.wear, preset="paper", calm=True)
     noisy = NoisyWorkload(wear, noise_std=1e-6, white=True, loop_filter_hz=None)
-    return _noisy("calm", "no integral action, white noise of 1 um", noisy)
+    return _noisy("calm", "noise, no integral action", noisy)
 
 
 def _noisy(name: str, what: str, workload: NoisyWorkload) -> Workload:

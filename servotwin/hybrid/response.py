@@ -1,7 +1,7 @@
 """The plant over a block of ticks as one linear map: of its state at the start, and of the inputs held tick by tick.
 
 As long as no guard fires, the position that a tick measures is the block's free response plus the pulse responses to
-the inputs so far. The law may do what it likes at every tick: noise, counts, limits and dead zone need no tables.
+the inputs so far. What sets the inputs may do as it likes at every tick: noise, rounding and limits need no tables.
 
 A guard is followed by its *lanes*: at every tick its Bernstein coefficients over every search step, as in `tables`.
 They need not be looked at where the guard cannot reach zero within the block, whatever its inputs.
