@@ -9,39 +9,28 @@ point value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain, islice
 from time import perf_counter
-from typing import NamedTuple
-
-import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, costs_to_and_fro
-from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
+from servotwin.redesign.certified.assess import COUNTS
+from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
+from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
-# Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
-_FAST = 10.0
 # Candidates that are compared on a machine that was observed.
 _MOVED = 8
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
 _WORTH = 1.03
-
-
-class _Ranked(NamedTuple):
-    """A candidate with its cost (s) on a few machines, and whether it misses a demand on them."""
-
-    setting: Design
-    fails: bool
-    cost: float
 
 
 def certify(
@@ -73,7 +62,7 @@ def certify(
     clock : callable
         s, from which the certificate's computing time is taken.
     running : Design, optional
-        In force: it stays where it is verified too and at most a tenth dearer than the cheapest.
+        In force: it stays where it is verified too and at most 3 % dearer than the cheapest.
 
     Raises
     ------
@@ -130,10 +119,16 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
+def _shortlist(ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
     """The first candidates, then as many without integral action and dead zone, which settle most surely."""
-    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
-    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
+    plain = 0
+    for place, setting in enumerate(ranked):
+        is_plain = not setting.controller.Ki and not setting.tolerance
+        if place < attempts or (is_plain and plain < attempts):
+            yield setting
+        plain += is_plain
+        if place + 1 >= attempts and plain >= attempts:
+            return
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
@@ -196,68 +191,31 @@ def _gains(law: Controller) -> tuple[float, float, float]:
     return law.Kp, law.Kd, law.Tf
 
 
-def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> list[Design]:
-    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only.
+def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> Iterator[Design]:
+    """Candidates in the order of their costs: integral action is tried with the best gains without it, and the own.
 
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
     """
+    screening, own = Screening(question), _gains(question.servo.controller)
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
-        gains = {_gains(each.setting.controller) for each in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
-        gains.add(_gains(question.servo.controller))
-        candidates = plain + [c for c in candidates if c.controller.Ki and _gains(c.controller) in gains]
-    if running is not None:
-        candidates = list(dict.fromkeys([running, *candidates]))
-    ranked = _ranked(question, candidates)
-    if question.uncertainty.usual_step is not None:
-        ranked = _compared(question, ranked, running)
-    stays = [e for e in ranked if e.setting == running and not e.fails and e.cost <= _WORTH * ranked[0].cost]
-    return [each.setting for each in dict.fromkeys([*stays, *ranked])]
-
-
-def _compared(question: Question, ranked: list[_Ranked], running: Design | None) -> list[_Ranked]:
-    """The first candidates and the running one in the order of their expected cost on the machine that was observed.
-
-    This is one machine, so that what is open about it averages; and it moves to and fro: where a law leaves the motor
-    in the gap decides the cost of the next move.
-    """
-    demands, known = question.demands, question.uncertainty
-    own = _gains(question.servo.controller)
-    always = [each.setting == running or _gains(each.setting.controller) == own for each in ranked]
-    shown = [k for k, each in enumerate(ranked) if not each.fails and (k < _MOVED or always[k])]
-    if not shown:
-        return ranked
-    known = known.replace(step=known.usual_step)
-    members = draw(question.servo, known, demands.screened, demands.conditions // 2, demands.seed)
-    moves = costs_to_and_fro([_quick(question, ranked[k].setting) for k in shown], members, question.trial.half.half)
-    costs = [float(cost.mean()) + question.price(ranked[k].setting) for k, cost in zip(shown, moves, strict=True)]
-    first = [ranked[k]._replace(cost=cost) for k, cost in zip(shown, costs, strict=True)]
-    return sorted(first, key=lambda each: each.cost) + [each for k, each in enumerate(ranked) if k not in shown]
-
-
-def _ranked(question: Question, candidates: list[Design]) -> list[_Ranked]:
-    """Candidates that meet the demands on a few machines first, then by cost."""
-    demands, known = question.demands, question.uncertainty
-    known = known.replace(step=known.usual_step or known.step)
-    members = draw(question.servo, known, demands.screened, demands.conditions, demands.seed)
-    measures = assess([_quick(question, setting) for setting in candidates], members, question.trial.half)
-
-    def ranked(setting: Design, few: MachineMeasures) -> _Ranked:
-        fails = float(np.mean(few.settled)) < demands.settled or few.overshoot.max() > demands.overshoot
-        fails = fails or bool(few.tail.max() > ROUNDED * question.largest_error(setting))
-        return _Ranked(setting, fails, question.cost(setting, few))
-
-    every = [ranked(setting, few) for setting, few in zip(candidates, measures, strict=True)]
-    return sorted(every, key=lambda each: (each.fails, each.cost))
-
-
-def _quick(question: Question, setting: Design) -> Design:
-    """The setting as it is ranked: in continuous time where the rate is so high that the order is the same there.
-
-    The verification is at the rate in any case.
-    """
-    rate = setting.controller.sample_rate
-    if rate is None or rate < _FAST * question.trial.rate:
-        return setting
-    return Design(setting.controller.replace(sample_rate=None), setting.tolerance)
+        best = islice(screening.ranked(plain), _GAINS_WITH_INTEGRAL)
+        gains = {own, *(_gains(setting.controller) for setting in best)}
+        candidates = plain + [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
+    ranked = screening.ranked(candidates)
+    always = [] if running is None else [running]
+    if question.uncertainty.usual_step is None:
+        settings = [*islice(ranked, 1), *always]
+        costs = {each: screening.cost(each) for each in settings if not screening.fails(each)}
+    else:
+        always += [each for each in candidates if _gains(each.controller) == own]
+        settings = [*islice(ranked, _MOVED), *always]
+        costs = screening.expected_costs([each for each in dict.fromkeys(settings) if not screening.fails(each)])
+    first = sorted(costs, key=costs.__getitem__)
+    stays = [each for each in first if each == running and costs[each] <= _WORTH * costs[first[0]]]
+    yielded = set[Design]()
+    for setting in chain(stays, first, settings, ranked):
+        if setting not in yielded:
+            yielded.add(setting)
+            yield setting
