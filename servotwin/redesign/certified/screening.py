@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.redesign.certified.assess import MachineMeasures, assess, joined
+from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.uncertainty import draw
 from servotwin.redesign.design import Design
@@ -27,16 +27,12 @@ _AT_ONCE = 2
 
 
 @dataclass(frozen=True, order=True)
-class Ranked:
-    """A candidate, True where it misses a demand on the few machines, its cost (s) on them, and its place in the list.
-
-    Before it was simulated on all of them, the cost is the least that it may be.
-    """
+class _Rank:
+    """Place of a candidate, or the best that it may have; candidates that are alike stand as they were listed."""
 
     fails: bool
     cost: float
     place: int
-    setting: Design = field(compare=False)
 
 
 class Screening:
@@ -45,36 +41,57 @@ class Screening:
     def __init__(self, question: Question) -> None:
         demands, known = question.demands, question.uncertainty
         self.question = question
-        known = known.replace(step=known.usual_step or known.step)
-        self._members = draw(question.servo, known, demands.screened, demands.conditions, demands.seed)
+        self._moves = known.replace(step=known.usual_step or known.step)
+        self._members = draw(question.servo, self._moves, demands.screened, demands.conditions, demands.seed)
         self._largest = float(self._members.step.max())
         self._order: NDArray[np.int64] | None = None
         self._known: dict[Design, MachineMeasures] = {}
-        self._places: dict[Design, int] = {}
 
-    def ranked(self, candidates: Sequence[Design]) -> Iterator[Ranked]:
-        """Candidates that meet the demands on the machines first, then by cost, then as they are listed."""
+    def ranked(self, candidates: Sequence[Design]) -> Iterator[Design]:
+        """Candidates that meet the demands on the machines first, then by cost."""
         self._start(candidates)
-        self._places = {setting: place for place, setting in enumerate(dict.fromkeys(candidates))}
-        waiting = [self._rank(setting) for setting in self._places]
+        waiting = [(self._rank(setting, place), setting) for place, setting in enumerate(candidates)]
         heapq.heapify(waiting)
         while waiting:
-            if self._is_whole(waiting[0].setting):
-                rank = self._rank(waiting[0].setting)
-                if heapq.heapreplace(waiting, rank) != rank:
-                    continue
-                yield heapq.heappop(waiting)
+            _, setting = waiting[0]
+            if self._is_whole(setting):
+                heapq.heappop(waiting)
+                yield setting
                 continue
-            due = [each.setting for each in heapq.nsmallest(_AT_ONCE, waiting)]
-            self._finish([setting for setting in due if not self._is_whole(setting)])
-            waiting = [self._rank(each.setting) if each.setting in due else each for each in waiting]
+            due = [waiting[0][1]]
+            due += [each for _, each in heapq.nsmallest(_AT_ONCE, waiting)[1:] if not self._is_whole(each)]
+            self._finish(due)
+            waiting = [(self._rank(each, rank.place) if each in due else rank, each) for rank, each in waiting]
             heapq.heapify(waiting)
 
-    def rank(self, setting: Design) -> Ranked:
-        """One of the candidates, simulated on all machines."""
+    def fails(self, setting: Design) -> bool:
+        """True where a setting misses a demand on the machines."""
+        self._complete(setting)
+        return self._rank(setting, 0).fails
+
+    def cost(self, setting: Design) -> float:
+        """s: 95th percentile over the machines."""
+        self._complete(setting)
+        return self._rank(setting, 0).cost
+
+    def expected_costs(self, settings: Sequence[Design]) -> dict[Design, float]:
+        """s: mean cost of a move to or fro, for settings on the machine that was observed.
+
+        It is one machine, so that what is open about it averages; and it moves to and fro: where a law leaves the motor
+        in the gap decides the cost of the next move.
+        """
+        if not settings:
+            return {}
+        question, demands = self.question, self.question.demands
+        members = draw(question.servo, self._moves, demands.screened, demands.conditions // 2, demands.seed)
+        moves = costs_to_and_fro([self._quick(each) for each in settings], members, question.trial.half.half)
+        costs = [float(cost.mean()) + question.price(each) for each, cost in zip(settings, moves, strict=True)]
+        return dict(zip(settings, costs, strict=True))
+
+    def _complete(self, setting: Design) -> None:
+        self._start([setting])
         if not self._is_whole(setting):
             self._finish([setting])
-        return self._rank(setting)
 
     def _start(self, candidates: Sequence[Design]) -> None:
         """Simulate the candidates that are new: the first of all on every machine, which tells the costliest ones."""
@@ -100,9 +117,9 @@ class Screening:
         """Measures on the machines at places first .. last - 1 of the order."""
         assert self._order is not None
         machines = self._members.each(self._order[first:last])
-        return assess([self.quick(each) for each in settings], machines, self.question.trial.half, self._largest)
+        return assess([self._quick(each) for each in settings], machines, self.question.trial.half, self._largest)
 
-    def quick(self, setting: Design) -> Design:
+    def _quick(self, setting: Design) -> Design:
         """The setting as it is ranked: in continuous time where the rate is so high that the order is the same there.
 
         The verification is at the rate in any case.
@@ -115,11 +132,11 @@ class Screening:
     def _is_whole(self, setting: Design) -> bool:
         return self._known[setting].cost.size == self._members.count
 
-    def _rank(self, setting: Design) -> Ranked:
+    def _rank(self, setting: Design, place: int) -> _Rank:
         demands, few = self.question.demands, self._known[setting]
         most = self._members.count - int(np.sum(~few.settled))
         fails = most / self._members.count < demands.settled or bool(few.overshoot.max() > demands.overshoot)
         fails = fails or bool(few.tail.max() > ROUNDED * self.question.largest_error(setting))
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
-        return Ranked(fails, self.question.cost(setting, costs), self._places[setting], setting)
+        return _Rank(fails, self.question.cost(setting, costs), place)
