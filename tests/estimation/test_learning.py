@@ -68,6 +68,18 @@ def test_one_contact_with_a_model_a_little_off_is_not_taken_for_two():
     assert "one contact" in estimate.reasons[0]
 
 
+def test_a_screw_that_begins_in_contact_teaches_too():
+    """Its place then has no derivative, which says nothing against the others."""
+    case, gap = machine_window(), math.radians(10.0)
+    settings = LearningSettings()
+    new = nameplate(settings, 0.15, 0.5, 0.1)
+    estimate = estimate_carrying(case.window, MODEL, None, whitened.WhitenedSettings(), None, new)
+    assert estimate.ok
+    assert abs(estimate.theta_d0 - float(case.window.theta_m[0])) == pytest.approx(0.5 * gap, rel=0.02)
+    assert estimate.machine is not None
+    assert np.abs(np.array(estimate.machine.factors[:3]) - TRUTH[:3]).max() < 0.02
+
+
 def test_two_contacts_are_believed_where_they_are():
     case = machine_window(factors=np.zeros(4))
     problem, points = problem_of(case, noise=1e-6)
