@@ -24,6 +24,8 @@ TWIN, OWN, SLOWER = "twin", "own PD", "0.6 x PD"
 # Constants: factors on the servo's Kp and Kd, and on its Ki.
 _SCALES, _INTEGRAL = (0.6, 0.7, 0.85, 1.0), (0.0, 0.01, 0.03)
 _GAP_OFF = math.radians(0.05)
+# Steps of which most are made with little knowledge.
+_FIRST = 4
 # A step has settled where the error's half peak-to-peak over the last third of its time is below this share of it, and
 # at least two counts of the sensor.
 _STILL = 0.01
@@ -36,6 +38,8 @@ class LoopScores(NamedTuple):
     ----------
     cost : float
         s, integral of the absolute error per step, mean of all steps.
+    later : float
+        s, the same of the steps after the first four: until then a twin knows little of its machine.
     settled : float
         1.0 where the last step has settled.
     tail : float
@@ -46,6 +50,7 @@ class LoopScores(NamedTuple):
     """
 
     cost: float
+    later: float
     settled: float
     tail: float
     updates: float = 0.0
@@ -163,10 +168,12 @@ def scored(machine: WornMachine, run: Run) -> LoopScores:
     error = (run.reference - run.position)[:-1].reshape(STEPS, -1)
     sizes = np.full(STEPS, 2.0 * machine.amplitude)
     sizes[0] = machine.amplitude
+    costs = np.abs(error).mean(axis=1) * HALF_PERIOD / sizes
     last = error[-1, -round(RATE * HALF_PERIOD / 3.0) :]
     still = _STILL * sizes[-1] + 2.0 * machine.model.position_resolution
     return LoopScores(
-        cost=float(np.mean(np.abs(error).mean(axis=1) * HALF_PERIOD / sizes)),
+        cost=float(costs.mean()),
+        later=float(costs[_FIRST:].mean()),
         settled=float(0.5 * np.ptp(last) <= still),
         tail=float(np.abs(last).max()),
     )
@@ -175,9 +182,18 @@ def scored(machine: WornMachine, run: Run) -> LoopScores:
 def shown(rows: Sequence[LoopRow]) -> Table:
     """A line for each contender."""
     result = Table(title="whole twin in the loop, worn machines", title_justify="left", box=None, pad_edge=False)
-    for heading in ("block", "contender", "machines", "settled\n%", "cost med\ns", "cost p95\ns", "tail p95\num"):
+    for heading in (
+        "block",
+        "contender",
+        "machines",
+        "settled\n%",
+        "cost med\ns",
+        "cost p95\ns",
+        "later p95\ns",
+        "tail p95\num",
+    ):
         result.add_column(heading, justify="left" if heading in ("block", "contender") else "right")
-    for heading in ("updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
+    for heading in ("later p95\ns", "tail p95\num", "updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
         result.add_column(heading, justify="right")
     for row in rows:
         result.add_row(
@@ -187,6 +203,7 @@ def shown(rows: Sequence[LoopRow]) -> Table:
             f"{100.0 * row.total('settled') / len(row.scores):.1f}",
             f"{row.at('cost', 50.0):.3f}",
             f"{row.at('cost', 95.0):.3f}",
+            f"{row.at('later', 95.0):.3f}",
             f"{1e6 * row.at('tail', 95.0):.1f}",
             *(f"{row.total(name):.0f}" for name in ("updates", "off")),
             f"{math.degrees(row.at('worst', 100.0)):.3f}",

@@ -91,12 +91,13 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
     rng = np.random.default_rng(machine.seed)
     believed = max(0.0, machine.gap + SPREAD * rng.standard_normal())
     setting = _redesigned(competitor, Evidence(_estimate(believed)), competitor.start)
-    simulation, told_for = _simulation(machine, block, setting, rng), None
+    simulation, told_for, rests = _simulation(machine, block, setting, rng), None, tuple[float, ...]()
     for end in UPDATES if competitor.policy is not None else ():
         simulation.advance(_sample(end, block))
         window = Window.from_run(simulation.run(), start=end - WINDOW, duration=WINDOW)
         measured = disturbance(window, model)
-        evidence = Evidence(_estimate(believed), measured, None, setting.setting(), told_for)
+        evidence = Evidence(_estimate(believed), measured, None, setting.setting(), told_for, rests=rests)
+        rests = (*rests, measured.bias) if measured.known else rests
         now = _redesigned(competitor, evidence, setting)
         told_for = believed
         if now != setting:

@@ -162,8 +162,8 @@ def updated(
         return before
     if estimate.ok and not counts:
         return before
-    # A window may show the machine's numbers, and the gap not well enough.
-    if estimate.ok or estimate.status is GapStatus.UNIDENTIFIABLE:
+    # A window may show the machine's numbers, and the gap not well enough or not at all.
+    if estimate.ok or estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND):
         windows = 1 if before is None else before.windows + 1
         alarm = "" if before is None else _drift(before.prior(given, now), reading)
         return LearntMachine(reading.factors, reading.covariance, now, windows, alarm)

@@ -119,8 +119,8 @@ class AutomatonStack:
     flows : (A, M, n, n) array
     rows : (A, M, G, n) array
         Guards; 0 where a mode has fewer.
-    resets : (A, M, G, n, n) array
-        0 where there is none.
+    resets : (A, M, G, n, n) or (1, M, G, n, n) array
+        0 where there is none; one where all automata have the same.
 
     Raises
     ------
@@ -172,10 +172,11 @@ def speeds(flows: Array) -> tuple[Array, Array]:
     ratio below 1 / sqrt(2)."""
     # Constant states only add eigenvalues of zero, and equal flows have equal eigenvalues.
     moving = np.flatnonzero(flows.any(axis=(*range(flows.ndim - 2), flows.ndim - 1)))
-    different = np.unique(shared_flows(flows), return_index=True)[1]
     if moving.size == 0:
         return np.zeros(flows.shape[:-3]), np.zeros(flows.shape[:-3])
-    values = np.linalg.eigvals(flows[..., different, :, :][..., moving[:, None], moving])
+    among = np.ascontiguousarray(flows[..., moving[:, None], moving])
+    different = np.unique(shared_flows(among), return_index=True)[1]
+    values = np.linalg.eigvals(among[..., different, :, :])
     sizes = np.abs(values)
     lasting = np.where(values.real > -sizes / np.sqrt(2.0), sizes, 0.0)
     return sizes.max(axis=(-2, -1)), lasting.max(axis=(-2, -1))
@@ -184,8 +185,11 @@ def speeds(flows: Array) -> tuple[Array, Array]:
 def shared_flows(flows: Array) -> NDArray[np.int64]:
     """(M,) index of each mode's flow among the different ones of (..., M, n, n), in the order of appearance."""
     result: list[int] = []
+    first = flows.reshape(-1, *flows.shape[-3:])[0]
     for m in range(flows.shape[-3]):
-        same = (k for k in range(m) if np.array_equal(flows[..., k, :, :], flows[..., m, :, :]))
+        # The flows of the first automaton tell most of them apart.
+        one, here = first[m], flows[..., m, :, :]
+        same = (k for k in range(m) if np.array_equal(first[k], one) and np.array_equal(flows[..., k, :, :], here))
         result.append(next((result[k] for k in same), max(result, default=-1) + 1))
     return np.array(result)
 

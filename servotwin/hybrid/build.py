@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare
-from servotwin.hybrid.exponential import Powers, new_powers, next_power, rebase, start_powers
+from servotwin.hybrid.exponential import next_power, rebase, start_powers
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.tables import (
     NODES_COARSE,
@@ -17,35 +15,14 @@ from servotwin.hybrid.tables import (
     PARTS,
     TERMS,
     VECTOR,
+    Numbers,
+    Pending,
+    Powers,
     Tables,
+    Workspace,
     empty_tables,
+    new_workspace,
 )
-
-
-class Numbers(NamedTuple):
-    """Numbers in which automata of one structure differ, flat: the input of `fill_tables`."""
-
-    flows: Array  # M * n * n
-    rows: Array  # M * G * n: guards
-    resets: Array  # M * G * n * n
-
-
-class Workspace(NamedTuple):
-    """Working memory of `fill_tables`."""
-
-    powers: Powers
-    slopes: Array  # M * G * n: thirds of the guards' slopes over a second
-    slope: Array
-    row: Array
-    next_row: Array
-    orders: Array
-
-
-def new_workspace(tables: Tables) -> Workspace:
-    """Working memory to fill `tables`."""
-    n = tables.states
-    slope, row, next_row = np.zeros((3, n))
-    return Workspace(new_powers(n), np.zeros(len(tables.rows)), slope, row, next_row, np.zeros(TERMS * n))
 
 
 def numbers_of(automaton: Automaton, guards: int) -> Numbers:
@@ -68,19 +45,19 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
 
 
 @bare
-def _fill_guards(t: Tables, numbers: Numbers, w: Workspace) -> None:
+def _fill_guards(t: Tables, numbers: Numbers, mode: int, w: Workspace) -> None:
     """Rows, slopes and resets."""
     n = t.states
-    for i in range(len(t.rows)):
-        t.rows[i] = numbers.rows[i]
-    for m in range(len(t.guard_count)):
-        for g in range(t.guard_count[m]):
-            at = (m * t.guards + g) * n
-            product(numbers.flows, m * n * n, n, n, t.rows[at : at + n], w.slopes[at : at + n])
-            for i in range(n):
-                w.slopes[at + i] /= 3.0
-                for j in range(n):
-                    t.reset[(at + j) * n + i] = numbers.resets[(at + i) * n + j] - (i == j)
+    for g in range(t.guard_count[mode]):
+        at = (mode * t.guards + g) * n
+        for i in range(n):
+            t.rows[at + i] = numbers.rows[at + i]
+        slopes = w.slopes[g * n : (g + 1) * n]
+        product(numbers.flows, mode * n * n, n, n, t.rows[at : at + n], slopes)
+        for i in range(n):
+            slopes[i] /= 3.0
+            for j in range(n):
+                t.reset[(at + j) * n + i] = numbers.resets[(at + i) * n + j] - (i == j)
 
 
 @bare
@@ -138,7 +115,7 @@ def _fill_guard(
     guard = (mode * t.guards + g) * n
     row = t.rows[guard : guard + n]
     for j in range(n):
-        w.slope[j] = w.slopes[guard + j] * spacing
+        w.slope[j] = w.slopes[g * n + j] * spacing
     product(w.powers.power, 0, n, n, row, w.row)
     product(w.powers.power, 0, n, n, w.slope, w.next_row)
     for j in range(n):
@@ -150,24 +127,20 @@ def _fill_guard(
 
 
 @bare
-def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, flow: int, spacing: float, w: Workspace) -> None:
-    """One scale: the present power becomes its base; its powers, and the guards at its nodes."""
-    n, p = t.states, w.powers
+def _fill_jumps(t: Tables, jumps: Array, nodes: int, flow: int, p: Powers) -> None:
+    """Jumps of one scale: the present power becomes its base, and its powers follow."""
+    n = t.states
     rebase(n, p)
     for j in range(nodes):
         if j > 0:
             next_power(n, p)
         _store(p, n, jumps, (flow * nodes + j) * n * n)
-        for m in range(len(t.guard_count)):
-            if t.flow_of[m] == flow:
-                for g in range(t.guard_count[m]):
-                    _fill_guard(t, table, nodes, m, g, j + 1, spacing, w)
 
 
 @bare
-def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, blocks: bool, w: Workspace) -> None:
-    """Everything that advances by one flow, that of `mode`, and the guards of all its modes at its nodes."""
-    n, p = t.states, w.powers
+def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+    """Everything that advances by the flow of a mode."""
+    n, flow, p = t.states, t.flow_of[mode], w.powers
     _fill_orders(t, numbers, flow, mode, step, w)
     start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
     base = flow * PARTS * n * n
@@ -177,9 +150,22 @@ def _fill_flow(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, b
         _store(p, n, t.jump_part, base + j * n * n)
         next_power(n, p)
     # Literals would have the function compiled once for each.
-    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), flow, step, w)
+    _fill_jumps(t, t.jump_fine, int(NODES_FINE), flow, p)
     if blocks:
-        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), flow, step * NODES_FINE, w)
+        _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), flow, p)
+
+
+@bare
+def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, mode: int, spacing: float, w: Workspace) -> None:
+    """The guards of a mode at the nodes of one scale."""
+    n, p = t.states, w.powers
+    for j in range(nodes):
+        base = (t.flow_of[mode] * nodes + j) * n * n
+        for i in range(n):
+            for k in range(n):
+                p.power[i * n + k] = jumps[base + k * n + i]
+        for g in range(t.guard_count[mode]):
+            _fill_guard(t, table, nodes, mode, g, j + 1, spacing, w)
 
 
 @bare
@@ -209,16 +195,44 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
 
 
 @bare
+def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+    """Tables of one mode, and of its flow where no mode before it had the same."""
+    if w.filled[t.flow_of[mode]] == 0:
+        _fill_flow(t, numbers, mode, step, blocks, w)
+        w.filled[t.flow_of[mode]] = 1
+    _fill_guards(t, numbers, mode, w)
+    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), mode, step, w)
+    if blocks:
+        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), mode, step * NODES_FINE, w)
+    for g in range(t.guard_count[mode]):
+        _fill_series(t, numbers, mode, g, step, w)
+    _fill_single(t, mode)
+
+
+@bare
 def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Workspace) -> None:
     """Tables of the automaton with these numbers; `t` has its structure. Without `blocks` the coarse scale is left out,
     for loops that only take steps."""
-    _fill_guards(t, numbers, w)
-    modes, filled = len(t.guard_count), -1
-    for m in range(modes):
-        if t.flow_of[m] > filled:
-            filled = t.flow_of[m]
-            _fill_flow(t, numbers, filled, m, step, blocks, w)
-    for m in range(modes):
-        for g in range(t.guard_count[m]):
-            _fill_series(t, numbers, m, g, step, w)
-        _fill_single(t, m)
+    for flow in range(len(w.filled)):
+        w.filled[flow] = 0
+    for mode in range(len(t.guard_count)):
+        _fill_mode(t, numbers, mode, step, blocks, w)
+
+
+@bare
+def begin_tables(pending: Pending, automaton: int) -> None:
+    """Leave the tables of all modes to the run of one automaton."""
+    pending.automaton[0] = automaton
+    for mode in range(len(pending.filled)):
+        pending.filled[mode] = 0
+    for flow in range(len(pending.workspace.filled)):
+        pending.workspace.filled[flow] = 0
+
+
+@bare
+def fill_entered(t: Tables, mode: int, pending: Pending) -> None:
+    """Tables of a mode that is entered for the first time."""
+    a = pending.automaton[0]
+    numbers = Numbers(pending.flows[a], pending.rows[a], pending.resets[min(a, len(pending.resets) - 1)])
+    _fill_mode(t, numbers, mode, pending.step[a], pending.blocks[a], pending.workspace)
+    pending.filled[mode] = 1

@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, shared_flows, speeds
-from servotwin.hybrid.build import new_workspace
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
-from servotwin.hybrid.tables import divisors, empty_tables
+from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
 from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
@@ -163,7 +162,7 @@ def _family(stack: AutomatonStack, rows: Array, sample_step: float) -> Automaton
     return AutomatonFamily(
         stack.flows.reshape(len(strides), -1),
         stack.rows.reshape(len(strides), -1),
-        stack.resets.reshape(len(strides), -1),
+        stack.resets.reshape(len(stack.resets), -1),
         np.array(rows, dtype=float).reshape(*rows.shape[:2], -1),
         sample_step / strides,
         strides,
@@ -241,12 +240,18 @@ def _run_part(
 def _new_memory(family: AutomatonFamily, structure: Automaton) -> WorkerMemory:
     flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
     tables = empty_tables(structure, shared_flows(flows))
+    pending = nothing_pending(tables)._replace(
+        flows=family.flows,
+        rows=family.guards,
+        resets=family.resets,
+        step=family.step,
+        blocks=np.ones(len(family.step), dtype=bool),
+    )
     return WorkerMemory(
         tables,
         empty_outputs(tables, family.outputs.shape[1]),
-        new_workspace(tables),
         new_output_workspace(tables.states),
-        new_scratch(tables),
+        new_scratch(tables, pending),
         np.zeros(tables.states),
         np.full(1, -1),
     )

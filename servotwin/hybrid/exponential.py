@@ -7,15 +7,13 @@ deviations are plain, because they are smaller than the deviations themselves.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import matrix_balance
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import product
+from servotwin.hybrid.tables import Powers, new_powers
 
 # More orders than any series of a matrix of norm 1/4 has terms above rounding.
 _MOST_TERMS = 40
@@ -23,26 +21,6 @@ _MOST_TERMS = 40
 _SMALL = 2.0**-60
 # Veltkamp's constant splits a double into halves whose products are exact.
 _SPLIT = 2.0**27 + 1.0
-
-
-class Powers(NamedTuple):
-    """``exp(A t) - I`` (the base) and ``exp(A j t) - I`` for the present j, row-major and flat: values and remainders,
-    with working memory; each ``(n * n,)``. Only the rows that `moving` lists are not zero."""
-
-    moving: NDArray[np.int64]  # (n,)
-    movers: NDArray[np.int64]  # (1,) how many
-    base: Array
-    base_low: Array
-    power: Array
-    power_low: Array
-    term: Array
-    change: Array
-
-
-def new_powers(states: int) -> Powers:
-    """Working memory for matrices of so many states."""
-    whole = np.zeros((2, max(states, 1)), dtype=np.int64)
-    return Powers(whole[0], whole[1, :1], *np.zeros((6, states * states)))
 
 
 @verbatim

@@ -9,7 +9,18 @@ import numpy as np
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, summed
 from servotwin.hybrid.polynomial import DEPTH
-from servotwin.hybrid.tables import NODES_COARSE, PART_TERMS, PARTS, TERMS, VECTOR, Tables, padded, zeros
+from servotwin.hybrid.tables import (
+    NODES_COARSE,
+    PART_TERMS,
+    PARTS,
+    TERMS,
+    VECTOR,
+    Pending,
+    Tables,
+    nothing_pending,
+    padded,
+    zeros,
+)
 
 # A guard's value or derivative below this part of all the terms that ever enter it is rounding, hence zero. Each
 # derivative is measured against its own terms: as a guard that looks at this derivative alone would measure it, so that
@@ -24,6 +35,7 @@ LINGERING = 2.0
 class Scratch(NamedTuple):
     """Working memory of one run."""
 
+    pending: Pending
     rows: Array
     series: Array
     change: Array
@@ -32,12 +44,12 @@ class Scratch(NamedTuple):
     ends: Array
 
 
-def new_scratch(tables: Tables) -> Scratch:
-    """Working memory for one run."""
+def new_scratch(tables: Tables, pending: Pending | None = None) -> Scratch:
+    """Working memory for one run; `pending` where not all of the tables are filled."""
     n = tables.states
     rows = max(padded(2 * tables.guards * (NODES_COARSE + 1)), n + 4 * tables.guards)
     sizes = (rows, TERMS, n, n * PART_TERMS, DEPTH + 2, DEPTH + 2)
-    return Scratch(*(zeros(size) for size in sizes))
+    return Scratch(pending or nothing_pending(tables), *(zeros(size) for size in sizes))
 
 
 @inlined

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.build import fill_entered
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.crossing import is_leaving, next_crossing
 from servotwin.hybrid.flow import Scratch, advance, advance_clean, advance_fraction, product
@@ -93,7 +94,10 @@ def fire(
     record.size[1] = at + 1
     if t.has_reset[mode, guard]:
         advance(t.reset, (mode * t.guards + guard) * t.states * t.states, x, scratch.change)
-    return t.target[mode, guard]
+    entered = t.target[mode, guard]
+    if scratch.pending.filled[entered] == 0:
+        fill_entered(t, entered, scratch.pending)
+    return entered
 
 
 @inlined

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.build import Numbers, Workspace, fill_tables
+from servotwin.hybrid.build import begin_tables, fill_entered
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, flow_until, follow_guards
@@ -52,7 +52,7 @@ class AutomatonFamily(NamedTuple):
 
     flows: Array  # (A, M * n * n)
     guards: Array  # (A, M * G * n)
-    resets: Array  # (A, M * G * n * n)
+    resets: Array  # (A, M * G * n * n), or (1, ...): those of all
     outputs: Array  # (A, O, M * n)
     step: Array  # (A,) search steps, s
     stride: NDArray[np.int64]  # (A,) search steps a sample
@@ -81,7 +81,6 @@ class WorkerMemory(NamedTuple):
 
     tables: Tables
     outputs: Outputs
-    workspace: Workspace
     block: OutputWorkspace
     scratch: Scratch
     state: Array
@@ -97,12 +96,23 @@ def output(memory: WorkerMemory, o: int) -> Outputs:
 
 @bare
 def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
-    """Fill the tables for automaton `a`."""
-    numbers = Numbers(family.flows[a], family.guards[a], family.resets[a])
-    fill_tables(memory.tables, numbers, family.step[a], True, memory.workspace)
+    """Make the tables those of automaton `a`, each to be filled when it is needed."""
+    begin_tables(memory.scratch.pending, a)
     for o in range(family.outputs.shape[1]):
-        fill_output(memory.tables, family.outputs[a, o], family.stride[a], output(memory, o), memory.block)
+        place = memory.outputs.place[o]
+        for m in range(len(place)):
+            place[m] = -1
     memory.loaded[0] = a
+
+
+@bare
+def fill_sampled(family: AutomatonFamily, a: int, record: RunRecord, memory: WorkerMemory) -> None:
+    """Fill the outputs of the modes in which the run just recorded was."""
+    for s in range(record.size[0]):
+        m = record.mode[s]
+        for o in range(family.outputs.shape[1]):
+            if memory.outputs.place[o, m] < 0:
+                fill_output(memory.tables, m, family.outputs[a, o], family.stride[a], output(memory, o), memory.block)
 
 
 @bare
@@ -177,6 +187,8 @@ def run_members(
         traces = results.traces[k if len(results.traces) > 1 else 0]
         steps = (traces.shape[1] - 1) * family.stride[a]
         record.size[0] = record.size[1] = 0
+        if memory.scratch.pending.filled[starts.mode[k]] == 0:
+            fill_entered(t, starts.mode[k], memory.scratch.pending)
         mode = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, True, record, memory.scratch)
         if mode < 0:
             return ZENO, place
@@ -184,6 +196,7 @@ def run_members(
         if status != DONE:
             return status, place
         results.events[k] = record.size[1]
+        fill_sampled(family, a, record, memory)
         sample_all(record, memory, family.stride[a], traces)
         if len(results.figures) > 0:
             for o in range(len(traces)):

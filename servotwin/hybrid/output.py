@@ -20,7 +20,7 @@ class Outputs(NamedTuple):
     """Table of one output: from the state at the start of a segment to the output up to 127 steps later."""
 
     table: Array  # M * 128 * n, or M * n * 128 for the states in `order`
-    place: NDArray[np.int64]  # (M,) mode whose rows these are: modes of equal flow and row share them
+    place: NDArray[np.int64]  # (M,) mode whose rows these are: modes of equal flow and row share them; -1: none yet
     order: NDArray[np.int64]  # (M, n) states, those that count first
     used: NDArray[np.int64]  # (M,) number of those that count
 
@@ -39,10 +39,10 @@ def new_output_workspace(states: int) -> OutputWorkspace:
 
 
 def empty_outputs(tables: Tables, *count: int) -> Outputs:
-    """Room for one output, or for `count` of them."""
+    """Room for one output, or for `count` of them; no mode is filled."""
     n, modes = tables.states, len(tables.guard_count)
     table = zeros(math.prod(count) * modes * _BLOCK * n).reshape(*count, modes * _BLOCK * n)
-    place, used = np.zeros((2, *count, modes), dtype=np.int64)
+    place, used = np.full((*count, modes), -1), np.zeros((*count, modes), dtype=np.int64)
     return Outputs(table, place, np.zeros((*count, modes, n), dtype=np.int64), used)
 
 
@@ -101,25 +101,24 @@ def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: OutputWorkspace) 
 
 
 @bare
-def fill_output(t: Tables, rows: Array, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
-    """Rows ``rows[m] @ exp(A_m j h)`` for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)`` for a
-    few."""
+def fill_output(t: Tables, m: int, rows: Array, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
+    """Rows ``rows[m] @ exp(A_m j h)`` of a mode for j = 0 .. 127, flat: ``(M, n, 128)`` for every step, ``(M, 128, n)``
+    for a few. Modes that are not filled have the place -1."""
     n = t.states
-    for m in range(len(t.guard_count)):
-        outputs.place[m] = m
-        for k in range(m - 1, -1, -1):
-            if t.flow_of[k] == t.flow_of[m] and _equal(rows, k * n, m * n, n):
-                outputs.place[m] = outputs.place[k]
-                break
-        if outputs.place[m] == m:
-            _fill_rows(t, t.flow_of[m], rows[m * n : (m + 1) * n], w)
-            _lay_out(m, n, stride, outputs, w)
+    for k in range(len(t.guard_count)):
+        if outputs.place[k] == k and t.flow_of[k] == t.flow_of[m] and _equal(rows, k * n, m * n, n):
+            outputs.place[m] = k
+            return
+    outputs.place[m] = m
+    _fill_rows(t, t.flow_of[m], rows[m * n : (m + 1) * n], w)
+    _lay_out(m, n, stride, outputs, w)
 
 
 def output_table(tables: Tables, rows: Array, stride: int) -> Outputs:
     """The output ``rows[m] @ x``, `rows` being (M, n), at every `stride`-th step."""
-    outputs = empty_outputs(tables)
-    fill_output(tables, np.array(rows, dtype=float).ravel(), stride, outputs, new_output_workspace(tables.states))
+    outputs, flat, w = empty_outputs(tables), np.array(rows, dtype=float).ravel(), new_output_workspace(tables.states)
+    for mode in range(len(rows)):
+        fill_output(tables, mode, flat, stride, outputs, w)
     return outputs
 
 

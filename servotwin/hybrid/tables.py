@@ -54,6 +54,80 @@ class Tables(NamedTuple):
     bernstein: Array  # TERMS * 16: Taylor coefficients on [0, 1] to Bernstein rows over 5 intervals
 
 
+class Numbers(NamedTuple):
+    """Numbers in which automata of one structure differ, flat: what their tables are made of."""
+
+    flows: Array  # M * n * n
+    rows: Array  # M * G * n: guards
+    resets: Array  # M * G * n * n
+
+
+class Powers(NamedTuple):
+    """``exp(A t) - I`` (the base) and ``exp(A j t) - I`` for the present j, row-major and flat: values and remainders,
+    with working memory; each ``(n * n,)``. Only the rows that `moving` lists are not zero."""
+
+    moving: NDArray[np.int64]  # (n,)
+    movers: NDArray[np.int64]  # (1,) how many
+    base: Array
+    base_low: Array
+    power: Array
+    power_low: Array
+    term: Array
+    change: Array
+
+
+def new_powers(states: int) -> Powers:
+    """Working memory for matrices of so many states."""
+    whole = np.zeros((2, max(states, 1)), dtype=np.int64)
+    return Powers(whole[0], whole[1, :1], *np.zeros((6, states * states)))
+
+
+class Workspace(NamedTuple):
+    """Working memory to fill tables."""
+
+    powers: Powers
+    slopes: Array  # G * n: thirds of the guards' slopes over a second
+    slope: Array
+    row: Array
+    next_row: Array
+    orders: Array
+    filled: NDArray[np.int8]  # (F,): 1 where a flow's tables are filled
+
+
+def new_workspace(tables: Tables) -> Workspace:
+    """Working memory to fill `tables`."""
+    n, flows = tables.states, int(tables.flow_of.max()) + 1
+    slope, row, next_row = np.zeros((3, n))
+    slopes, filled = np.zeros(tables.guards * n), np.zeros(flows, dtype=np.int8)
+    return Workspace(new_powers(n), slopes, slope, row, next_row, np.zeros(TERMS * n), filled)
+
+
+class Pending(NamedTuple):
+    """Tables that a run fills itself, those of a mode when it is first entered: most runs enter few of the modes."""
+
+    filled: NDArray[np.int8]  # (M,)
+    automaton: NDArray[np.int64]  # (1,) that the tables are of
+    flows: Array  # (A, M * n * n)
+    rows: Array  # (A, M * G * n)
+    resets: Array  # (A, M * G * n * n), or (1, ...): those of all
+    step: Array  # (A,) of the search, s
+    blocks: NDArray[np.bool_]  # (A,) with the coarse scale
+    workspace: Workspace
+
+
+def nothing_pending(tables: Tables) -> Pending:
+    """For tables that are filled as a whole."""
+    none = np.empty((0, 0))
+    return Pending(
+        np.ones(len(tables.guard_count), dtype=np.int8),
+        np.zeros(1, dtype=np.int64),
+        *(none,) * 3,
+        np.empty(0),
+        np.empty(0, dtype=bool),
+        new_workspace(tables),
+    )
+
+
 def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
     """The largest ``sample_step / k`` on which no eigenvalue turns by more than two radians, and none whose motion
     lasts by more than a quarter, and k."""

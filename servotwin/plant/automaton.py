@@ -128,22 +128,26 @@ class LoopParts:
         """The first automaton, the numbers of all `count` of them, and the rows of their outputs."""
         n, most = len(self.states), max(1, *(len(guards) for guards in self.guards))
         shape = count, len(self.modes)
-        flows, rows, resets = np.zeros((*shape, n, n)), np.zeros((*shape, most, n)), np.zeros((*shape, most, n, n))
+        # Resets of modes are mostly those of all plants.
+        every = [guard.reset for guards in self.guards for guard in guards if guard.reset is not None]
+        different = count if any(np.ndim(reset) > 2 for reset in every) else 1
+        flows, rows = np.zeros((*shape, n, n)), np.zeros((*shape, most, n))
+        resets = np.zeros((different, len(self.modes), most, n, n))
         for m, (flow, guards) in enumerate(zip(self.flows, self.guards, strict=True)):
             flows[:, m] = flow
             for g, guard in enumerate(guards):
                 rows[:, m, g] = guard.row
                 if guard.reset is not None:
                     resets[:, m, g] = guard.reset
-        every = {name: np.broadcast_to(row, (count, *row.shape[-2:])) for name, row in self.rows.items()}
+        outputs = {name: np.broadcast_to(row, (count, *row.shape[-2:])) for name, row in self.rows.items()}
         modes = tuple(
             Mode(flows[0, m], tuple(_with(each, rows[0, m, g], resets[0, m, g]) for g, each in enumerate(guards)), name)
             for m, (guards, name) in enumerate(zip(self.guards, self.modes, strict=True))
         )
         first = ServoAutomaton(
-            Automaton(modes, self.states), {name: row[0] for name, row in every.items()}, self.zones, self.frictions
+            Automaton(modes, self.states), {name: row[0] for name, row in outputs.items()}, self.zones, self.frictions
         )
-        return first, AutomatonStack(first.automaton, flows, rows, resets), every
+        return first, AutomatonStack(first.automaton, flows, rows, resets), outputs
 
 
 def _with(guard: Guard, row: Array, reset: Array) -> Guard:

@@ -211,6 +211,30 @@ class Servo:
             return changed
         return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **for_controller))  # type: ignore[arg-type]
 
+    def scaled(self, factors: Mapping[str, float]) -> Servo:
+        """A copy with some of the plant's numbers multiplied; nothing else is validated again, for machines are drawn
+        by the hundred.
+
+        Parameters
+        ----------
+        factors : mapping of str to float
+            By name of the number; positive.
+
+        Raises
+        ------
+        InvalidInput
+            A factor is not positive and finite.
+        """
+        values = {name: getattr(self, name) for name in (*_PLANT, "controller")}
+        for name, factor in factors.items():
+            if not 0.0 < factor < math.inf:
+                raise InvalidInput(f"servo {name}: factor {factor!r} must be positive and finite")
+            value = values[name]
+            values[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+        copy = object.__new__(type(self))
+        copy.__dict__.update(values)
+        return copy
+
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
 

@@ -44,6 +44,8 @@ class Evidence:
         The motor's numbers, friction and input bias, as learnt from the windows.
     rests : tuple of float
         V, input biases that the last windows before this one showed.
+    steps : tuple of float
+        m, sizes of the steps in the last windows, this one included.
     """
 
     estimate: GapEstimate
@@ -55,6 +57,7 @@ class Evidence:
     machine: FactorPrior | None = None
     motor: LearntMotor | None = None
     rests: tuple[float, ...] = ()
+    steps: tuple[float, ...] = ()
 
     @property
     def gains(self) -> Gains | None:

@@ -55,12 +55,30 @@ class Group:
     rows : (A, O, M, n) array
         Outputs of each automaton.
     members : Members
+    loops : LoopStack
+    enter : (k,) array
+        m, error below which the dead zone of each member is entered.
     """
 
     which: NDArray[np.int64]
     automata: AutomatonStack
     rows: Array
     members: Members
+    loops: LoopStack
+    enter: Array
+
+    def restarted(self, states: Array) -> Members:
+        """The members in other (k, n) states."""
+        automaton = self.members.automaton
+        return Members(automaton, _modes_at(self.loops, automaton, states, self.enter), states)
+
+
+def _modes_at(loops: LoopStack, automaton: NDArray[np.int64], states: Array, enter: Array) -> NDArray[np.int64]:
+    """(k,) modes by the error in each state; `enter` (m) matters only with a dead zone."""
+    if "inside" not in loops.first.zones:
+        return np.full(len(states), loops.first.mode("on"))
+    error = np.sum(states * loops.rows["error"][automaton, 0], axis=1)
+    return zones_at(loops.first, error, enter)
 
 
 @dataclass(frozen=True)
@@ -104,17 +122,13 @@ class EnsembleMembers:
         loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
         constants = {name: values[which] for name, values in self.constants.items()} | _constants_of(laws)
         states = starts_of(loops, automaton, constants)
-        if not shape.dead_zone:
-            modes = np.full(len(which), loops.first.mode("on"))
-        else:
-            error = np.sum(states * loops.rows["error"][automaton, 0], axis=1)
-            enter = np.array([law.enter for law in laws]) * states[:, loops.first.automaton.index("tolerance")]
-            modes = zones_at(loops.first, error, enter)
+        enter = np.array([law.enter for law in laws]) * constants["tolerance"]
+        modes = _modes_at(loops, automaton, states, enter)
         for name in outputs:
             if name not in loops.rows:
                 raise InvalidInput(f"an ensemble has no output {name!r}; allowed are {', '.join(loops.rows)}")
         rows = np.stack([loops.rows[name] for name in outputs], axis=1)
-        return Group(which, loops.automata, rows, Members(automaton, modes, states))
+        return Group(which, loops.automata, rows, Members(automaton, modes, states), loops, enter)
 
 
 def simulate_ensemble(
@@ -259,6 +273,57 @@ def summarise_members(
         values[group.which] = np.stack(figures, axis=2)
     by_output = np.moveaxis(values, (1, 2), (0, 1)).reshape(len(outputs), -1, *members.shape)
     return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
+
+
+def errors_to_and_fro(
+    servos: Any,
+    controllers: Any,
+    duration: float,
+    cases: Cases,
+    moves: int,
+    sample_rate: float,
+    threads: int | None = None,
+) -> Array:
+    """Mean size of the error (m) while a reference goes back to zero and again to its value of `cases`, in turn.
+
+    Each move begins as the one before left the loop: the motor on one flank or inside the gap, the integral as it is.
+    The first move, from rest at zero, does not count.
+
+    Parameters
+    ----------
+    servos, controllers, cases, sample_rate, threads
+        As for `summarise_members`.
+    duration : float
+        s, of each move.
+    moves : int
+        That count, at least 1.
+
+    Returns
+    -------
+    array of shape S
+        m.
+
+    Raises
+    ------
+    InvalidInput
+        As `simulate_members`.
+    """
+    members, samples = members_of(servos, controllers, cases), samples_of(duration, sample_rate)
+    errors = np.zeros(len(members.servos))
+    for group in members.groups(("error",)):
+        count, _, modes, names = group.rows.shape
+        # The states are outputs too: the mean of each over the last sample alone is the state at the end of a move.
+        every = np.broadcast_to(np.eye(names)[:, None, :], (count, names, modes, names))
+        rows, place = np.concatenate([group.rows, every], axis=1), group.automata.first.index("reference")
+        options = FigureOptions(np.full((len(group.which), 1 + names), np.inf), 1)
+        starts, goals = group.members, (0.0, group.members.state[:, place].copy())
+        for move in range(moves + 1):
+            figures = figures_of_family(group.automata, rows, starts, 1.0 / sample_rate, samples, options, threads)
+            errors[group.which] += figures.mean_size[:, 0] / moves if move > 0 else 0.0
+            ends = figures.last_mean[:, 1:].copy()
+            ends[:, place] = goals[move % 2]
+            starts = group.restarted(ends)
+    return errors.reshape(members.shape)
 
 
 def samples_of(duration: float, sample_rate: float) -> int:

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array, shared_flows, speeds
-from servotwin.hybrid.build import new_workspace
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
-from servotwin.hybrid.tables import divisors, empty_tables
+from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.servo import Servo
@@ -142,7 +141,7 @@ def _family(
     return SampledFamily(
         stack.flows.reshape(len(rates), -1),
         stack.rows.reshape(len(rates), -1),
-        stack.resets.reshape(len(rates), -1),
+        stack.resets.reshape(len(stack.resets), -1),
         period / searches,
         searches,
         np.array([tuple(law.law(None)) for law in laws], dtype=float).reshape(-1, len(LawParameters._fields)),
@@ -221,11 +220,18 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
     flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
     tables = empty_tables(structure, shared_flows(flows))
     slots, outputs = family.modes * 2 * KINDS, len(family.rows)
+    pending = nothing_pending(tables)._replace(
+        flows=family.flows,
+        rows=family.guards,
+        resets=family.resets,
+        step=family.step,
+        # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
+        blocks=family.searches >= NODES_FINE,
+    )
     return SampledWorker(
         tables,
-        new_workspace(tables),
         new_memory(group.places, family.modes, group.watches),
-        new_scratch(tables),
+        new_scratch(tables, pending),
         np.zeros(n),
         Place(np.zeros(7, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.build import Numbers, Workspace, fill_tables
+from servotwin.hybrid.build import begin_tables, fill_entered
 from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, RunRecord
 from servotwin.hybrid.members import figures_of
-from servotwin.hybrid.tables import NODES_FINE, Tables
+from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted import TICKED, UNFILLED, Segments, note, run_lifted, set_reference, take_tick
 from servotwin.simulation.lifted_output import sample_lifted
 from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places, fill_here
@@ -27,7 +27,7 @@ class SampledFamily(NamedTuple):
 
     flows: Array  # (A, M * n * n)
     guards: Array  # (A, M * G * n)
-    resets: Array  # (A, M * G * n * n)
+    resets: Array  # (A, M * G * n * n), or (1, ...): those of all
     step: Array  # (A,) of the search, s
     searches: NDArray[np.int64]  # (A,) search steps a tick
     laws: Array  # (C, number of parameters)
@@ -64,7 +64,6 @@ class SampledWorker(NamedTuple):
     """Memory of one worker, reused for every member."""
 
     tables: Tables
-    workspace: Workspace
     lifted: LiftedMemory
     scratch: Scratch
     state: Array
@@ -79,10 +78,8 @@ class SampledWorker(NamedTuple):
 def load(family: SampledFamily, plant: int, law: int, worker: SampledWorker) -> None:
     """Make the tables those of a plant and a law."""
     if worker.loaded[0] != plant:
-        numbers = Numbers(family.flows[plant], family.guards[plant], family.resets[plant])
-        # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
-        blocks = family.searches[plant] >= NODES_FINE
-        fill_tables(worker.tables, numbers, family.step[plant], blocks, worker.workspace)
+        begin_tables(worker.scratch.pending, plant)
+        fill_entered(worker.tables, family.mode, worker.scratch.pending)
     elif worker.loaded[1] == law:
         return
     worker.loaded[0], worker.loaded[1] = plant, law

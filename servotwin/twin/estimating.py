@@ -334,6 +334,14 @@ class DecodedWindow(NamedTuple):
         error = np.abs(self.window.position[-last:] - self.window.reference[-last:])
         return messages.finite(float(np.max(error)))
 
+    @property
+    def step(self) -> float:
+        """Range of the reference within the window, m; 0 where the channel is missing or the reference rests."""
+        if self.window is None or self.window.reference is None:
+            return 0.0
+        size = float(np.ptp(self.window.reference))
+        return size if math.isfinite(size) else 0.0
+
 
 def decode_window(message: messages.WindowMessage) -> Window:
     """Decode the numbers of a message; channels that no estimator uses are left out.

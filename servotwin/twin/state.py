@@ -38,6 +38,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         rad, gap of the last redesign.
     rests : tuple of float
         V, input biases that the last windows showed, the newest last.
+    steps : tuple of float
+        m, sizes of the reference's steps in the last windows, the newest last.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -52,6 +54,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     triage: TriageState | None = None
     lookups: LookupState | None = None
     rests: tuple[float, ...] = ()
+    steps: tuple[float, ...] = ()
     responses: ResponseState | None = None
 
 

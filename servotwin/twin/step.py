@@ -57,6 +57,8 @@ _STALE = "the window is not newer than what the parameters stand on, or of an ea
 
 # Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
 _RESTS = 3
+# Windows whose step is remembered.
+_STEPS = 4
 
 
 class WindowArrival(NamedTuple):
@@ -182,7 +184,11 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     in_force = state.known.get(state.versions.in_force)
     machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
     motor = None if model.motor is None else model.motor.current(state.wear.motor, arrived)
-    evidence = Evidence(estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests)
+    if decoded.step > 0.0 and not stale:
+        state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
+    evidence = Evidence(
+        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests, state.steps
+    )
     state, redesign = _redesign(model, state, evidence, stale)
     if disturbed.known and not stale:
         state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])

@@ -80,6 +80,30 @@ def test_a_screw_that_begins_in_contact_teaches_too():
     assert np.abs(np.array(estimate.machine.factors[:3]) - TRUTH[:3]).max() < 0.02
 
 
+def test_a_window_with_one_contact_teaches_the_machine_and_not_the_gap():
+    """Whether the one contact or two explain it, stiffness and damping come out alike."""
+    machine, prior = adapted(MODEL, TRUTH), nameplate(LearningSettings(), 0.05, 0.3, 0.02)
+    law = MODEL.controller.replace(Ki=0.0, Kp=0.6 * MODEL.controller.Kp, Kd=0.6 * MODEL.controller.Kd)
+    run = simulate(
+        machine, 18.0, controller=law, reference=SquareWave(1e-3, 30.0), gap=math.radians(20.0), tolerance=0.0,
+    )  # fmt: skip
+    case = cut(run, 14.7, 2.0)
+    assert not case.two_contacts
+    noisy = case.noisy(np.random.default_rng(3).normal(0.0, 1e-6, case.window.position.size))
+    estimate = estimate_carrying(noisy.window, MODEL, None, whitened.WhitenedSettings(), None, prior)
+    assert estimate.status is GapStatus.LOWER_BOUND
+    assert estimate.machine is not None
+    spread = np.sqrt(np.diag(np.array(estimate.machine.covariance).reshape(4, 4)))
+    assert np.all(np.abs(np.array(estimate.machine.factors) - TRUTH) <= 4.0 * spread)
+    assert np.all(spread[:2] <= 0.2 * np.sqrt(np.diag(prior.covariance))[:2])
+    known = updated(None, LearningSettings(), estimate, counts=False, now=0.0)
+    assert known is not None
+    again = estimate_carrying(
+        noisy.window, MODEL, None, whitened.WhitenedSettings(), None, known.prior(LearningSettings(), 0.0)
+    )
+    assert not (again.status is GapStatus.LOWER_BOUND and again.machine is not None)
+
+
 def test_two_contacts_are_believed_where_they_are():
     case = machine_window(factors=np.zeros(4))
     problem, points = problem_of(case, noise=1e-6)

@@ -257,7 +257,7 @@ def test_the_verification_covers_the_interval_not_the_point(policy: CertifiedPol
 
 
 def test_a_bias_estimated_at_rest_is_fed_forward(policy: CertifiedPolicy) -> None:
-    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.05, 1e-4)))
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(0.05, 1e-4), rests=(0.05, 0.05)))
     assert made.setting is not None
     assert made.certificate is not None
     assert made.setting.gains.feedforward == -0.05
@@ -266,7 +266,7 @@ def test_a_bias_estimated_at_rest_is_fed_forward(policy: CertifiedPolicy) -> Non
 
 
 def test_a_bias_beyond_the_limit_is_fed_forward_up_to_it(policy: CertifiedPolicy) -> None:
-    made = policy.redesign(Evidence(estimated(10.0), at_rest(-5.0)))
+    made = policy.redesign(Evidence(estimated(10.0), at_rest(-5.0), rests=(-5.0, -5.0)))
     assert made.setting is not None
     assert made.setting.gains.feedforward == policy.feedforward_limit
 
@@ -280,7 +280,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
 def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
     """The fallback set is verified for an unknown bias, without a bound on the overshoot."""
     strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))
-    made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01)))
+    made = strict.redesign(Evidence(estimated(10.0), at_rest(0.01), rests=(0.01, 0.01)))
     assert "none of" in made.reason
     assert "the fallback set is sent" in made.reason
     assert made.setting is not None
@@ -292,7 +292,7 @@ def test_without_an_estimate_the_bias_counts_with_the_trends_gap(policy: Certifi
     refused = estimated(3.0, status=GapStatus.UNIDENTIFIABLE)
     assert policy.redesign(Evidence(refused, at_rest(0.05))).setting is None
     trend = Trend.start(0.0).update(estimated(10.0))
-    made = policy.redesign(Evidence(refused, at_rest(0.05), trend))
+    made = policy.redesign(Evidence(refused, at_rest(0.05), trend, rests=(0.05, 0.05)))
     assert made.setting is not None
     assert made.setting.gains.feedforward == -0.05
     assert made.certificate is not None
@@ -309,7 +309,8 @@ def test_a_setting_in_force_is_not_sent_again(policy: CertifiedPolicy) -> None:
 
 def test_a_changed_voltage_at_rest_indicates_friction(policy: CertifiedPolicy) -> None:
     now = OWN.replace(Ki=0.0, feedforward=-0.05)
-    evidence = Evidence(estimated(10.0), at_rest(0.01), None, Setting(0.0, gains_of(now)), tuned_for=10.0 * DEG)
+    before = Setting(0.0, gains_of(now))
+    evidence = Evidence(estimated(10.0), at_rest(0.01), None, before, tuned_for=10.0 * DEG, rests=(0.01, 0.01))
     made = policy.redesign(evidence)
     assert made.certificate is not None
     assert made.certificate.friction == pytest.approx((0.0, 0.04 * SERVO.k_T / SERVO.R))

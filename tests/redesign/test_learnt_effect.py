@@ -43,7 +43,7 @@ def learnt(factors: tuple[float, ...]) -> FactorPrior:
 def evidence(machine: FactorPrior | None = None) -> Evidence:
     spread = 0.02 * DEG
     estimate = GapEstimate(GAP, spread, spread, (GAP - spread, GAP + spread), GapStatus.OK, 1.0)
-    return Evidence(estimate, Disturbance(BIAS, 1e-5, 0.0, 0.3, 0.0), machine=machine)
+    return Evidence(estimate, Disturbance(BIAS, 1e-5, 0.0, 0.3, 0.0), machine=machine, rests=(BIAS, BIAS))
 
 
 def watched(plant: Servo, setting: Setting) -> bool:

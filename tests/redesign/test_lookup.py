@@ -65,7 +65,7 @@ def region(low=9.0, high=10.0, feedforward=0.0, left=1e-3, noise=0.0, friction=(
 def evidence(degrees=10.0, bias=0.05, noise=0.0, std=0.02, **changes) -> Evidence:
     gap, spread = degrees * DEG, std * DEG
     estimate = GapEstimate(gap, spread, spread, (gap - 2.0 * spread, gap + 2.0 * spread), GapStatus.OK, 1.0)
-    return Evidence(estimate, Disturbance(bias, 1e-5, noise, 0.3, 0.0), **changes)
+    return Evidence(estimate, Disturbance(bias, 1e-5, noise, 0.3, 0.0), rests=(bias, bias), **changes)
 
 
 # --- the grid

@@ -19,7 +19,7 @@ from servotwin.estimation.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
@@ -210,7 +210,7 @@ def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_fr
     rest = Disturbance(0.05, 1e-5, 0.0, 0.3, 0.0)
     torque = SERVO.k_T / SERVO.R
     stated, sticky, smooth, unsure = (
-        policy.redesign(Evidence(estimate, rest, motor=each)).certificate
+        policy.redesign(Evidence(estimate, rest, motor=each, rests=(0.05, 0.05))).certificate
         for each in (
             None,
             motor(-0.07, 0.045, 0.03, 5e-4),
@@ -249,6 +249,40 @@ def test_a_running_setting_that_is_hardly_dearer_stays(share: float, stays: bool
     assert again.certificate is not None
     assert (again.certificate.setting.controller.Kp == running.gains.Kp) == stays
     assert again.certificate.cost <= 1.1 * best.cost
+
+
+def test_settings_are_compared_on_the_steps_that_the_machine_makes_and_verified_on_all() -> None:
+    """A gentle loop is the cheaper one where the gap is a large part of the step."""
+    policy = CertifiedPolicy(SERVO, Uncertainty(), replace(SMALL, scales=(0.3, 0.5, 0.7, 1.0), shapes=((1.0, 1.0),)))
+    gap, spread = 25.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    known = FactorPrior(np.zeros(4), np.diag(np.square([1e-3, 1e-2, 1e-3, 1e-3])))
+    rest = Disturbance(0.0, 1e-5, 0.0, 0.3, 0.0)
+    usual = (2e-3, 2.4e-3)
+    large = policy.redesign(Evidence(estimate, rest, machine=known, steps=usual)).certificate
+    assert large is not None
+    assert large.step == policy.uncertainty.step
+    costs = {}
+    for scale in policy.demands.scales:
+        law = OWN.replace(Kp=scale * OWN.Kp, Kd=scale * OWN.Kd, Ki=0.0)
+        run = simulate(SERVO, 60.0, controller=law, reference=SquareWave(1.1e-3, 20.0), gap=gap, tolerance=0.0)
+        costs[law.Kp] = float(np.abs(run.reference - run.position)[run.time > 20.0].mean())
+    assert large.setting.controller.Kp == min(costs, key=costs.__getitem__)
+
+
+def test_a_first_voltage_at_rest_may_be_frictions_and_is_not_fed_forward() -> None:
+    policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5, 0.7)))
+    gap, spread = 10.0 * DEG, 0.02 * DEG
+    estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)
+    rest = Disturbance(0.05, 1e-5, 0.0, 0.3, 0.0)
+    made = [policy.redesign(Evidence(estimate, rest, rests=rests)) for rests in ((), (0.05,), (0.05, 0.05))]
+    assert [each.setting.gains.feedforward for each in made] == [0.0, 0.0, -0.05]
+    for each in made[:2]:
+        low, high = each.certificate.input_bias
+        assert low < 0.0
+        assert high > 0.05
+    smooth = policy.redesign(Evidence(estimate, rest, motor=motor(0.0, 0.0, 0.05, 5e-4)))
+    assert smooth.setting.gains.feedforward == -0.05
 
 
 # --- demands

@@ -8,8 +8,15 @@ from servotwin.hybrid.automaton import Automaton, Guard, Mode
 from servotwin.hybrid.ensemble import Members, run_ensemble, run_family
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import simulate
-from servotwin.simulation.ensemble import Cases, simulate_ensemble, simulate_members, summarise_members
+from servotwin.simulation.ensemble import (
+    Cases,
+    errors_to_and_fro,
+    simulate_ensemble,
+    simulate_members,
+    summarise_members,
+)
 
 DEGREE = np.pi / 180.0
 TABLE1 = Servo.preset("table1")
@@ -157,3 +164,32 @@ def test_a_family_has_one_structure() -> None:
         run_family((down, Automaton((Mode([[0.0]]),), ("x",))), np.ones((2, 1, 1, 1)), members, 0.1, 3)
     with pytest.raises(InvalidInput, match="automaton of 0 to 0"):
         run_family((down,), np.ones((1, 1, 1, 1)), members, 0.1, 3)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_moves_to_and_fro_are_those_of_one_run(seed: int) -> None:
+    """An elastic screw, integral action that stops, saturation, friction and bias, each in some of the cases."""
+    rng = np.random.default_rng(seed)
+    servo = Servo.preset(("paper", "table1")[seed % 2])
+    servo = servo.replace(k_d=20.0 * float(servo.stiffnesses.max())) if seed == 1 else servo
+    scale, stops = rng.uniform(0.6, 1.2), seed in (2, 3)
+    law = servo.controller.replace(Kp=scale * servo.controller.Kp, Kd=scale * servo.controller.Kd, Ki=0.0)
+    law = law.replace(Ki=0.02 * servo.controller.Ki, integral_only=True, leave=2.0) if stops else law
+    law = law.replace(voltage_limit=0.5) if seed == 4 else law
+    size, gap, tolerance = rng.uniform(1e-4, 2e-3), rng.uniform(0.0, 0.6), 2e-5 if stops else 0.0
+    friction, bias = 0.05 * servo.k_T / servo.R if seed in (3, 5) else 0.0, rng.uniform(-0.05, 0.05)
+    found = errors_to_and_fro(servo, law, 10.0, Cases(size, gap, tolerance, 0.0, bias, friction), 2, 200.0)
+    run = simulate(
+        servo,
+        30.0,
+        controller=law,
+        reference=PiecewiseCubic.held([0.0, 10.0, 20.0], [size, 0.0, size]),
+        gap=gap,
+        tolerance=tolerance or None,
+        theta_d0=0.0,
+        sample_rate=200.0,
+        input_bias=bias,
+        friction=friction,
+    )
+    back, forth = np.abs(run.position[2000:4001]), np.abs(size - run.position[4000:])
+    assert found == pytest.approx(0.5 * (back.mean() + forth.mean()), rel=1e-5 if friction else 1e-12)

@@ -24,6 +24,7 @@ from servotwin.estimation.whitened.gate import (
     contacts_seen,
     judge,
     lower_bound,
+    misfits,
     model_shift,
     observer_shift,
     one_sided,
@@ -131,7 +132,11 @@ class WindowFit:
             contacts = contacts_seen(self.aligned, self.servo)
             if status is not GapStatus.UNIDENTIFIABLE and not contacts.two:
                 reasons = reasons or (_ONE_CONTACT,)
-                return _one_contact(self.blank, evidence, contacts, reasons, self.settings)
+                bound = _one_contact(self.blank, evidence, contacts, reasons, self.settings)
+                if self.learnt is None or misfits(evidence, self.settings):
+                    return bound
+                either = self.learnt.reading_of_either(contacts.single, self.settings.calibration)
+                return replace(bound, machine=either)
             teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
             fault = likely_fault(self.window, self.angle, self.servo, evidence.unexplained, self.second)

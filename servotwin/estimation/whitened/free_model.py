@@ -107,6 +107,12 @@ class FreeFit:
         """(6, 6) of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal: not known."""
         return _covariance(self.rows, self.movable)
 
+    @property
+    def factor_covariance(self) -> Array:
+        """(4, 4) of the factors alone, whether or not gap and place are known, for a residual of variance 1."""
+        left = project_out(orthonormal(self.rows[:2]), self.rows[2:])
+        return np.asarray(np.linalg.inv(left @ left.T))
+
 
 def adapted(servo: Servo, factors: Array) -> Servo:
     """Return the servo with other logarithms of `FACTORS`.
@@ -217,11 +223,14 @@ class ContactEvidence:
         rad, range by which the motor leads the screw in the fit of one contact: the gap is at least as wide.
     lead_std : float
         rad, its standard deviation with the model free; 0 where the screw did not move.
+    single : Point
+        The fit of one contact.
     """
 
     rise: float
     lead: float
     lead_std: float
+    single: Point
 
     @property
     def two(self) -> bool:
@@ -268,7 +277,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     # The way to the contact is what the place says: half the gap per unit.
     moved = motion.forwards + motion.backwards > 0.0
     std = 0.5 * wide * math.sqrt(variance * best.covariance[1, 1]) if moved else 0.0
-    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std)
+    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std, best.point)
 
 
 def same_way(point: Point, gap: float) -> tuple[float, float, float]:

@@ -279,8 +279,7 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     """
     too_little = one_sided(evidence.travel, evidence.needed, settings)
     disagreements = () if too_little else _disagreements(evidence, settings)
-    own = (_unexplained(evidence), _delayed(evidence, settings), _growing(evidence.aligned.whitened))
-    mismatches = tuple(filter(None, (*own, *disagreements)))
+    mismatches = (*misfits(evidence, settings), *disagreements)
     silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
     bound = lower_bound(evidence, settings) > evidence.smallest and math.isinf(evidence.interval[1])
     if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
@@ -288,6 +287,12 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     if silence:
         return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
+
+
+def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
+    """List what the fit leaves of the window that neither noise nor the model explains."""
+    own = (_unexplained(evidence), _delayed(evidence, settings), _growing(evidence.aligned.whitened))
+    return tuple(filter(None, own))
 
 
 def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:

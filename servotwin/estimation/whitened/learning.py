@@ -15,7 +15,16 @@ import numpy as np
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
-from servotwin.estimation.whitened.free_model import FACTORS, LARGEST, FactorPrior, FreeFit, FreeProblem, adapted
+from servotwin.estimation.whitened.free_model import (
+    BELIEVED,
+    FACTORS,
+    LARGEST,
+    FactorPrior,
+    FreeFit,
+    FreeProblem,
+    adapted,
+)
+from servotwin.estimation.whitened.reduction import Point
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -39,18 +48,19 @@ class LearntFit:
         With this servo's response.
     free : FreeFit
         In the same noise, with the factors' prior.
-    prior : FactorPrior
+    problem : FreeProblem
+        Of which `free` is the minimum.
     """
 
     servo: Servo
     aligned: AlignedFit
     free: FreeFit
-    prior: FactorPrior
+    problem: FreeProblem
 
     @property
     def beyond(self) -> str:
         """Sentence on a factor that lies at the end of what is allowed; empty where none does."""
-        low, high = self.prior.limits()
+        low, high = self.problem.prior.limits()
         ends = _AT_END * (high - low)
         for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
             if not least < factor < most:
@@ -66,9 +76,31 @@ class LearntFit:
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
-        scale = calibration**2 * max(1.0, self.aligned.whitened.variance)
-        covariance = scale * self.free.covariance[2:, 2:]
-        return MachineReading(tuple(self.free.factors.tolist()), tuple(covariance.ravel().tolist()))
+        return _reading(self.free.factors, self._scale(calibration) * self.free.covariance[2:, 2:])
+
+    def reading_of_either(self, single: Point, calibration: float) -> MachineReading | None:
+        """Factors after a window that a `single` contact explains as well as two.
+
+        Both fits count alike, and what they differ by is part of the spread. None: the factors are known well already,
+        or with what is known of them one contact does not explain the window.
+        """
+        low, high = self.problem.prior.limits()
+        if not np.any(high - low > 2.0 * LARGEST * np.array(_WIDE)) or self.beyond:
+            return None
+        one = self.problem.descend(np.array([self.problem.largest, single.place, *self.free.factors]), (False, True))
+        if one.cost > self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance):
+            return None
+        away = one.factors - self.free.factors
+        spread = 0.5 * self._scale(calibration) * (self.free.factor_covariance + one.factor_covariance)
+        return _reading(self.free.factors + 0.5 * away, spread + 0.25 * np.outer(away, away))
+
+    def _scale(self, calibration: float) -> float:
+        """Factor on covariances for a residual of variance 1."""
+        return calibration**2 * max(1.0, self.aligned.whitened.variance)
+
+
+def _reading(factors: Array, covariance: Array) -> MachineReading:
+    return MachineReading(tuple(factors.tolist()), tuple(covariance.ravel().tolist()))
 
 
 def learn_and_fit(
@@ -104,4 +136,4 @@ def learn_and_fit(
         if np.all(still):
             break
         factors, points = free.factors, [free.point]
-    return LearntFit(here, aligned, free, machine)
+    return LearntFit(here, aligned, free, problem)

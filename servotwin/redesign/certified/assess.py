@@ -16,16 +16,20 @@ from numpy.typing import NDArray
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
-from servotwin.simulation.ensemble import Cases, summarise_members
+from servotwin.simulation.ensemble import Cases, errors_to_and_fro, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 
 NEAR = 0.02
 """Share of the step within which the loop has arrived."""
 COUNTS = 2.0
 """Counts of the position sensor within which the loop may hunt: a quantised loop without friction has no rest."""
+
+# Moves after the first one: an integral needs some until each is like the one before.
+_MOVES = 3
 
 # Half peak-to-peak of the error of a loop that has settled: shares of the step and of the lost motion. A limit cycle in
 # a gap is several times as large as the lost motion; where there is hardly a gap, only the step counts.
@@ -99,10 +103,7 @@ def assess(
     largest : float, optional
         m, the step whose `nearness` counts for settling; that of these machines by default.
     """
-    laws = np.empty((len(settings), 1, 1), dtype=object)
-    laws[:, 0, 0] = [setting.simulated.controller for setting in settings]
-    plants = np.empty((len(members.plants), 1), dtype=object)
-    plants[:, 0] = members.plants
+    laws, plants = _columns(settings, members)
     largest = float(members.step.max()) if largest is None else largest
     near = np.stack([nearness(setting, members, largest) for setting in settings])
     figures = _figures(laws, plants, np.array([setting.tolerance for setting in settings]), members, near, trial)
@@ -121,6 +122,44 @@ def assess(
         )
         for k, limit in enumerate(limits)
     ]
+
+
+def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:
+    """(P, C) s for every setting: integral of abs(error) per step of machines that move to and fro.
+
+    A move begins where the one before ended, on the flank of the gap where the law leaves the motor. The first one
+    counts in sampled loops only.
+
+    Parameters
+    ----------
+    settings, members
+        As for `assess`; the machines begin in the middle of their gaps.
+    trial : Trial
+        Its duration is that of each move.
+    """
+    laws, plants = _columns(settings, members)
+    tolerance = np.array([setting.tolerance for setting in settings])[:, None, None]
+    cases = Cases(members.step, members.gap, tolerance, 0.0, members.input_bias, members.friction)
+    if laws[0, 0, 0].sample_rate is None:
+        sizes = errors_to_and_fro(plants, laws, trial.duration, cases, _MOVES, trial.rate, trial.threads)
+        return list(sizes * trial.duration / members.step)
+    sampled = SampledCases(*cases, delay=members.delay, resolution=members.model.position_resolution)
+    times = trial.duration * np.arange(_MOVES + 1)
+    reference = PiecewiseCubic.held(times, 1.0 - np.arange(_MOVES + 1) % 2)
+    length = trial.duration * (_MOVES + 1)
+    figures = summarise_sampled(
+        plants, laws, length, sampled, trial.last, None, ("error",), trial.rate, trial.threads, reference
+    )
+    return list(figures["error"].mean_size * trial.duration / members.step)
+
+
+def _columns(settings: Sequence[Design], members: SimulatedMachines) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
+    """(S, 1, 1) controllers and (P, 1) servos, which broadcast against the (P, C) conditions."""
+    laws = np.empty((len(settings), 1, 1), dtype=object)
+    laws[:, 0, 0] = [setting.simulated.controller for setting in settings]
+    plants = np.empty((len(members.plants), 1), dtype=object)
+    plants[:, 0] = members.plants
+    return laws, plants
 
 
 def _figures(

@@ -11,6 +11,7 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, joined, left_over
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import (
@@ -78,11 +79,11 @@ class Question:
         sensor = setting.controller.leave * setting.tolerance + COUNTS * self.servo.position_resolution
         return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor)
 
-    def cost(self, setting: Design, measures: MachineMeasures) -> float:
-        """s: 95th percentile of the error's integral per step, plus the price of the noise."""
-        return float(np.percentile(measures.cost, 95.0)) + self._price(setting)
+    def cost(self, setting: Design, costs: Array) -> float:
+        """s: 95th percentile of the error's integral per step (s, of each machine), plus the price of the noise."""
+        return float(np.percentile(costs, 95.0)) + self.price(setting)
 
-    def _price(self, setting: Design) -> float:
+    def price(self, setting: Design) -> float:
         """s, price of the noise in the voltage."""
         law = setting.controller
         if not self.noise:
@@ -132,7 +133,7 @@ class Attempt:
             friction=known.friction,
             members=members.count,
             settled=settled / members.count,
-            cost=question.cost(setting, measures),
+            cost=question.cost(setting, measures.cost),
             tail=float(measures.tail.max()),
             tail_p95=float(np.percentile(measures.tail, 95.0)),
             error_rms=float(measures.error_rms.max()),

@@ -9,26 +9,28 @@ point value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain, islice
 from time import perf_counter
-
-import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import COUNTS, assess
-from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question, with_feedforward
+from servotwin.redesign.certified.assess import COUNTS
+from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
+from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
-# Ticks per sample of the trial, from which on a sampled loop is ranked as a continuous one.
-_FAST = 10.0
+# Candidates that are compared on a machine that was observed.
+_MOVED = 8
+# Cost of the running setting over that of the cheapest one, up to which the running one stays.
+_WORTH = 1.03
 
 
 def certify(
@@ -39,8 +41,11 @@ def certify(
     feedforward: float = 0.0,
     noise: float = 0.0,
     clock: Callable[[], float] = perf_counter,
+    running: Design | None = None,
 ) -> Certificate | NotVerified:
     """Find the cheapest setting that meets the demands on all simulated machines that the uncertainty allows.
+
+    Costs are compared on the steps that the machine usually makes, where these are known.
 
     Parameters
     ----------
@@ -56,6 +61,8 @@ def certify(
         m rms on the measured position.
     clock : callable
         s, from which the certificate's computing time is taken.
+    running : Design, optional
+        In force: it stays where it is verified too and at most 3 % dearer than the cheapest.
 
     Raises
     ------
@@ -68,9 +75,10 @@ def certify(
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)
     laws = candidates_of(servo, uncertainty, demands, disturbed, noise > 0.0)
     candidates = [with_feedforward(setting, feedforward) for setting in laws]
+    in_force = None if running is None else with_feedforward(running, feedforward)
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     attempts: list[Attempt] = []
-    for setting in _shortlist(_ranked_in_stages(question, candidates), demands.attempts):
+    for setting in _shortlist(_ranked_in_stages(question, candidates, in_force), demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -111,10 +119,16 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _shortlist(ranked: list[Design], attempts: int) -> list[Design]:
+def _shortlist(ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
     """The first candidates, then as many without integral action and dead zone, which settle most surely."""
-    plain = [setting for setting in ranked if not setting.controller.Ki and not setting.tolerance]
-    return list(dict.fromkeys([*ranked[:attempts], *plain[:attempts]]))
+    plain = 0
+    for place, setting in enumerate(ranked):
+        is_plain = not setting.controller.Ki and not setting.tolerance
+        if place < attempts or (is_plain and plain < attempts):
+            yield setting
+        plain += is_plain
+        if place + 1 >= attempts and plain >= attempts:
+            return
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
@@ -177,37 +191,31 @@ def _gains(law: Controller) -> tuple[float, float, float]:
     return law.Kp, law.Kd, law.Tf
 
 
-def _ranked_in_stages(question: Question, candidates: list[Design]) -> list[Design]:
-    """Candidates in the order of `_ranked`: integral action is tried with the best gains without it only."""
-    plain = [setting for setting in candidates if not setting.controller.Ki]
-    if not plain or len(plain) == len(candidates):
-        return _ranked(question, candidates)
-    gains = {_gains(setting.controller) for setting in _ranked(question, plain)[:_GAINS_WITH_INTEGRAL]}
-    with_integral = [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
-    return _ranked(question, plain + with_integral)
+def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> Iterator[Design]:
+    """Candidates in the order of their costs: integral action is tried with the best gains without it, and the own.
 
-
-def _ranked(question: Question, candidates: list[Design]) -> list[Design]:
-    """Candidates that meet the demands on a few machines first, then by cost."""
-    demands = question.demands
-    members = draw(question.servo, question.uncertainty, demands.screened, demands.conditions, demands.seed)
-    measures = assess([_quick(question, setting) for setting in candidates], members, question.trial.half)
-
-    def rank(k: int) -> tuple[bool, float]:
-        few = measures[k]
-        fails = float(np.mean(few.settled)) < demands.settled or few.overshoot.max() > demands.overshoot
-        fails = fails or bool(few.tail.max() > ROUNDED * question.largest_error(candidates[k]))
-        return fails, question.cost(candidates[k], few)
-
-    return [candidates[k] for k in sorted(range(len(candidates)), key=rank)]
-
-
-def _quick(question: Question, setting: Design) -> Design:
-    """The setting as it is ranked: in continuous time where the rate is so high that the order is the same there.
-
-    The verification is at the rate in any case.
+    The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
+    would otherwise take turns, whenever the evidence moves a little.
     """
-    rate = setting.controller.sample_rate
-    if rate is None or rate < _FAST * question.trial.rate:
-        return setting
-    return Design(setting.controller.replace(sample_rate=None), setting.tolerance)
+    screening, own = Screening(question), _gains(question.servo.controller)
+    plain = [setting for setting in candidates if not setting.controller.Ki]
+    if plain and len(plain) < len(candidates):
+        best = islice(screening.ranked(plain), _GAINS_WITH_INTEGRAL)
+        gains = {own, *(_gains(setting.controller) for setting in best)}
+        candidates = plain + [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
+    ranked = screening.ranked(candidates)
+    always = [] if running is None else [running]
+    if question.uncertainty.usual_step is None:
+        settings = [*islice(ranked, 1), *always]
+        costs = {each: screening.cost(each) for each in settings if not screening.fails(each)}
+    else:
+        always += [each for each in candidates if _gains(each.controller) == own]
+        settings = [*islice(ranked, _MOVED), *always]
+        costs = screening.expected_costs([each for each in dict.fromkeys(settings) if not screening.fails(each)])
+    first = sorted(costs, key=costs.__getitem__)
+    stays = [each for each in first if each == running and costs[each] <= _WORTH * costs[first[0]]]
+    yielded = set[Design]()
+    for setting in chain(stays, first, settings, ranked):
+        if setting not in yielded:
+            yielded.add(setting)
+            yield setting

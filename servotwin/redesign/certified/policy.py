@@ -30,13 +30,14 @@ from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
-# Relative: a smaller change of a gain is not worth an update; cost of the running setting over that of the cheapest
-# one, up to which the running one stays.
-_SAME, _WORTH = 1e-3, 1.1
+# Relative: a smaller change of a gain is not worth an update.
+_SAME = 1e-3
 # Voltages, relative to the answer of the servo's own Kp to the smallest step: a smaller change of the feedforward is
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
+# Earlier rests without which a voltage at rest may be friction: the last window's may be the same rest.
+_RESTS_AGREE = 2
 # Friction holds the motor at up to so much more than half the difference of two rests.
 _HOLDS = 1.25
 
@@ -127,7 +128,7 @@ class CertifiedPolicy:
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None and not self._shows_disturbance(evidence):
+        if estimate is None and not self._tells_more(evidence):
             return Redesign(None, math.nan, evidence.unusable)
         gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
         best = math.nan if estimate is None else estimate.gap
@@ -138,7 +139,8 @@ class CertifiedPolicy:
             )
             return Redesign(None, math.nan, reason)
         feedforward, input_bias = self._input_bias(evidence)
-        region = Region(gap, feedforward, input_bias, self._friction(evidence), _noise(evidence))
+        friction, noise, usual = self._friction(evidence), _noise(evidence), self._usual_step(evidence)
+        region = Region(gap, feedforward, input_bias, friction, noise, usual)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
@@ -156,15 +158,10 @@ class CertifiedPolicy:
     ) -> Certificate | NotVerified:
         """Verify as `verify` does, on a servo with an uncertainty of its own."""
         demands, trial = self.demands_within_band(), self.simulations
-        found = certify(servo, known, demands, trial, region.feedforward, region.noise, self.clock)
-        if isinstance(found, NotVerified) or running is None or running.gains is None or alike(found.setting, running):
-            return found
-        law = with_gains(servo.controller, running.gains).replace(feedforward=region.feedforward)
-        other = confirm(servo, known, Design(law, running.tolerance), demands, trial, region.noise, self.clock)
-        # Two settings that are as good would otherwise take turns, whenever the evidence moves a little.
-        if isinstance(other, NotVerified) or other.cost > _WORTH * found.cost:
-            return found
-        return replace(other, looked_at=found.looked_at + 1, seconds=found.seconds + other.seconds)
+        fed, in_force = region.feedforward, None
+        if running is not None and running.gains is not None:
+            in_force = Design(with_gains(servo.controller, running.gains), running.tolerance)
+        return certify(servo, known, demands, trial, fed, region.noise, self.clock, in_force)
 
     def confirm(
         self,
@@ -220,10 +217,20 @@ class CertifiedPolicy:
         if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
         limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
+        if self._may_be_friction(evidence):
+            return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
         # Only a significant change: every new feedforward is an update at the edge.
         if abs(bias + fed) > spread:
             fed = min(max(-bias, -limit), limit)
         return fed, (bias - spread, bias + spread)
+
+    def _usual_step(self, evidence: Evidence) -> Range | None:
+        """Range of the steps in the last windows (m), as far as it lies within the stated one; None: none was seen."""
+        if not evidence.steps:
+            return None
+        least, most = self.uncertainty.step
+        low, high = (min(max(size, least), most) for size in (min(evidence.steps), max(evidence.steps)))
+        return low, high
 
     def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
         """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
@@ -243,11 +250,25 @@ class CertifiedPolicy:
             return bias, std, 0.0
         return 0.5 * (max(rests) + min(rests)), std, half
 
-    def _shows_disturbance(self, evidence: Evidence) -> bool:
-        """True where a window tells more of bias and friction than the setting in force answers to."""
+    def _may_be_friction(self, evidence: Evidence) -> bool:
+        """True at the first rests, unless the motor's motion told friction: the voltage there is of bias or friction.
+
+        Fed forward, a friction would push the wrong way after the next reversal.
+        """
+        alone = len(evidence.rests) < _RESTS_AGREE and self._motor(evidence) is None
+        return alone and self.uncertainty.friction[1] == 0.0 and self._moved(evidence.disturbance.bias)
+
+    def _moved(self, voltage: float) -> bool:
+        """True where a voltage at rest is no small change."""
+        return abs(voltage) > _BIAS_MOVED * self.smallest_answer
+
+    def _tells_more(self, evidence: Evidence) -> bool:
+        """True where a window tells more of machine, bias or friction than the setting in force answers to."""
         gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
         if gains is None or not rested or evidence.estimate.ok:
             return False
+        if evidence.estimate.machine is not None:
+            return True
         fed, _ = self._input_bias(evidence)
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True

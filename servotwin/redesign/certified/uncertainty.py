@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
@@ -22,8 +23,8 @@ PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
-# Gap, step, bias, start of the screw, friction, delay.
-_CONDITIONS = 6
+_CONDITION_NAMES = ("gap", "step", "input_bias", "theta_d0", "friction", "delay")
+_CONDITIONS = len(_CONDITION_NAMES)
 _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 
 
@@ -76,6 +77,9 @@ class Uncertainty:
     ----------
     learnt : LearntFactors, optional
         Posterior of some parameters, which counts in place of their half-widths.
+    usual_step : (float, float), optional
+        m, sizes of the steps that the machine was seen to make: settings are compared by their cost on these, and
+        verified on all of `step`.
 
     Raises
     ------
@@ -128,6 +132,8 @@ class Uncertainty:
         ),
     ] = 0
     learnt: LearntFactors | None = None
+    # Not in the representation, which seeds the verification: its machines do not depend on this.
+    usual_step: Range | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
@@ -158,6 +164,8 @@ class Region:
         V, N m.
     noise : float
         m rms of the measured position; 0 where it is unknown.
+    usual_step : (float, float), optional
+        m, sizes of the last steps; None: none was seen.
     """
 
     gap: Range
@@ -165,10 +173,13 @@ class Region:
     input_bias: Range
     friction: Range
     noise: float
+    usual_step: Range | None = None
 
     def within(self, known: Uncertainty) -> Uncertainty:
         """Prior knowledge narrowed to the region."""
-        return known.replace(gap=self.gap, input_bias=self.input_bias, friction=self.friction)
+        return known.replace(
+            gap=self.gap, input_bias=self.input_bias, friction=self.friction, usual_step=self.usual_step
+        )
 
     @property
     def largest_bias(self) -> float:
@@ -210,9 +221,14 @@ class SimulatedMachines:
 
     def part(self, first: int, last: int) -> SimulatedMachines:
         """Machines of some of the plants."""
-        names = ("gap", "step", "input_bias", "theta_d0", "friction", "delay")
-        conditions = {name: getattr(self, name)[first:last] for name in names}
+        conditions = {name: getattr(self, name)[first:last] for name in _CONDITION_NAMES}
         return SimulatedMachines(self.plants[first:last], **conditions, whole=self)
+
+    def each(self, places: NDArray[np.int64]) -> SimulatedMachines:
+        """Machines at flat places, each a plant in one condition."""
+        conditions = {name: getattr(self, name).ravel()[places, None] for name in _CONDITION_NAMES}
+        plants = tuple(self.plants[place // self.gap.shape[1]] for place in places)
+        return SimulatedMachines(plants, **conditions, whole=self)
 
 
 def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> SimulatedMachines:
@@ -298,15 +314,7 @@ def _machines(plants: tuple[Servo, ...], uncertainty: Uncertainty, places: Array
 
 
 def _scaled_plants(servo: Servo, factors: Array) -> tuple[Servo, ...]:
-    return tuple(_scaled(servo, dict(zip(PARAMETERS, row.tolist(), strict=True))) for row in factors)
-
-
-def _scaled(servo: Servo, factors: dict[str, float]) -> Servo:
-    changes: dict[str, Any] = {}
-    for name, factor in factors.items():
-        value = getattr(servo, name)
-        changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
-    return servo.replace(**changes)
+    return tuple(servo.scaled(dict(zip(PARAMETERS, row, strict=True))) for row in factors.tolist())
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
