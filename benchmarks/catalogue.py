@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -142,26 +142,34 @@ def w3(options: Options) -> Workload:
 
 def sampled(options: Options) -> Workload:
     """The deployed loop, in noise."""
-    noisy = NoisyWorkload(options.wear)
+    return _noisy("sampled", "noise, loop filter", NoisyWorkload(options.wear))
+
+
+def counts(options: Options) -> Workload:
+    """The same with a sensor that counts."""
+    return _noisy("counts", "noise, counts of 1 um", NoisyWorkload(options.wear, resolution=1e-6))
+
+
+def calm(options: Options) -> Workload:
+    """A loop that comes to rest in its gap, and an encoder's noise."""
+    wear = replace(options.wear, preset="paper", calm=True)
+    noisy = NoisyWorkload(wear, noise_std=1e-6, white=True, loop_filter_hz=None)
+    return _noisy("calm", "noise, no integral action", noisy)
+
+
+def _noisy(name: str, what: str, workload: NoisyWorkload) -> Workload:
     return Workload(
-        "sampled",
-        f"{noisy.wear.duration:g} s, law sampled at 5 kHz, noise, loop filter",
-        (ours.noisy(noisy), hold.noisy(noisy)),
-        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_noisy(noisy))),),
-        lambda seconds: f"{noisy.wear.duration / seconds:,.0f} x real time",
+        name,
+        f"{workload.wear.duration:g} s, law sampled at 5 kHz, {what}",
+        (ours.noisy(workload), ours.ticked(workload), hold.noisy(workload)),
+        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_noisy(workload))),),
+        lambda seconds: f"{workload.wear.duration / seconds:,.0f} x real time",
     )
 
 
 def quiet(options: Options) -> Workload:
     """The deployed loop without noise, as settings are verified."""
-    workload = NoisyWorkload(options.wear, noise_std=None)
-    return Workload(
-        "quiet",
-        f"{workload.wear.duration:g} s, law sampled at 5 kHz, loop filter, no noise",
-        (ours.noisy(workload), ours.ticked(workload), hold.noisy(workload)),
-        (Check("error", MILLIMETRE, lambda q: _largest(q - ours.refined_noisy(workload))),),
-        lambda seconds: f"{workload.wear.duration / seconds:,.0f} x real time",
-    )
+    return _noisy("quiet", "loop filter, no noise", NoisyWorkload(options.wear, noise_std=None))
 
 
 def decision(options: Options) -> Workload:
@@ -188,15 +196,18 @@ WORKLOADS: dict[str, Build] = {
     "W2": w2,
     "W3": w3,
     "sampled": sampled,
+    "counts": counts,
+    "calm": calm,
     "quiet": quiet,
     "decision": decision,
     "start": start,
 }
-_WITH = {"sampled": ("sampled", "quiet")}
+_WITH = {"sampled": ("sampled", "counts", "calm", "quiet")}
 
 
 def chosen(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of workloads in their usual order, whatever their case; none means all, and sampled brings quiet along.
+    """Names of workloads in their usual order, whatever their case; none means all, and sampled brings counts,
+    calm and quiet along.
 
     Raises
     ------

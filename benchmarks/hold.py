@@ -35,7 +35,8 @@ class HeldLoop(NamedTuple):
 
 
 class HoldInputs(NamedTuple):
-    """Square wave (level, steps a half period), half gap c0 + c2 t^2 + c3 t^3, tolerance, noise (empty: none)."""
+    """Square wave (level, steps a half period), half gap c0 + c2 t^2 + c3 t^3, tolerance, noise (empty: none), counts
+    of the sensor (1: of a resolution, 0: none)."""
 
     level: float
     half_period: int
@@ -44,6 +45,8 @@ class HoldInputs(NamedTuple):
     c3: float
     tolerance: float
     noise: Array
+    counted: int
+    resolution: float
 
 
 def hold_of(model: LoopEquations, rate: float, loop_filter_hz: float | None = None) -> HeldLoop:
@@ -79,6 +82,9 @@ def run(h: HeldLoop, inputs: HoldInputs, every: int, out: Array) -> None:
     for j in range((out.size - 1) * every):
         position = h.position[0] * a + h.position[1] * b + h.position[2] * c + h.position[3] * d
         sensed = position + inputs.noise[j] if noisy else position
+        # A loop, for as a choice it would cost a run without counts the division too.
+        for _ in range(inputs.counted):
+            sensed = np.round(sensed / inputs.resolution) * inputs.resolution
         measured += h.loop_step * (sensed - measured)
         level = inputs.level if (j // inputs.half_period) % 2 == 0 else -inputs.level
         error, voltage = level - measured, 0.0
@@ -110,7 +116,7 @@ def run_members(h: HeldLoop, level: float, half_gaps: Array, tolerances: Array, 
     """One run for each row of `out`, constant inputs."""
     nothing = np.empty(0)
     for k in range(len(out)):
-        inputs = HoldInputs(level, out.shape[1] * every, half_gaps[k], 0.0, 0.0, tolerances[k], nothing)
+        inputs = HoldInputs(level, out.shape[1] * every, half_gaps[k], 0.0, 0.0, tolerances[k], nothing, 0, 0.0)
         run(h, inputs, every, out[k])
 
 
@@ -135,7 +141,7 @@ def noisy(workload: NoisyWorkload) -> Contestant:
             noise = np.empty(0)
             if workload.noise is not None:
                 noise = workload.noise.samples(wear.samples, rate, np.random.default_rng(workload.seed))
-            return _recorded(hold, _wear_inputs(wear, rate, noise), 1, wear.samples)
+            return _recorded(hold, _wear_inputs(wear, rate, noise, workload.resolution), 1, wear.samples)
 
         return job
 
@@ -173,9 +179,10 @@ def _recorded(hold: HeldLoop, inputs: HoldInputs, every: int, samples: int) -> A
     return out
 
 
-def _wear_inputs(workload: WearWorkload, rate: float, noise: Array) -> HoldInputs:
-    half_period = round(0.5 * workload.period * rate)
-    return HoldInputs(workload.amplitude, half_period, *workload.half_gap, workload.tolerance, noise)
+def _wear_inputs(workload: WearWorkload, rate: float, noise: Array, resolution: float = 0.0) -> HoldInputs:
+    half_period, counted = round(0.5 * workload.period * rate), 1 if resolution > 0.0 else 0
+    gap, tolerance = workload.half_gap, workload.tolerance
+    return HoldInputs(workload.amplitude, half_period, *gap, tolerance, noise, counted, resolution)
 
 
 def _name(rate: float) -> str:

@@ -36,7 +36,7 @@ def run_noisy(workload: NoisyWorkload, sample_rate: float | None = None) -> Run:
     """The sampled run, recorded at its own rate or at a multiple of it."""
     wear = workload.wear
     return simulate(
-        wear.servo,
+        workload.servo,
         wear.duration,
         controller=workload.controller,
         reference=wear.reference,
@@ -63,14 +63,14 @@ def noisy(workload: NoisyWorkload) -> Contestant:
 
 
 def ticked(workload: NoisyWorkload) -> Contestant:
-    """The sampled run without noise, tick by tick as with noise."""
+    """The sampled run, tick by tick as a run that is stopped and changed on its way."""
     return Contestant(f"{NAME}, tick by tick", lambda: lambda: _ticked(workload, workload.wear.sample_rate))
 
 
 def _ticked(workload: NoisyWorkload, sample_rate: float) -> Array:
     wear = workload.wear
     simulation = Simulation(
-        wear.servo,
+        workload.servo,
         wear.duration,
         controller=workload.controller,
         reference=wear.reference,

@@ -19,9 +19,10 @@ PRESET = "table1"
 
 
 @cache
-def the_servo() -> Servo:
-    """The preset of all workloads, read once."""
-    return Servo.preset(PRESET)
+def the_servo(preset: str = PRESET, calm: bool = False) -> Servo:
+    """A preset, read once; `calm` without integral action, so that it comes to rest in its gap."""
+    servo = Servo.preset(preset)
+    return servo.replace(controller=servo.controller.replace(Ki=0.0)) if calm else servo
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class WearWorkload:
         rad, total gap at the end, and the gap that the constant tolerance is made for.
     sample_rate : float
         Hz, of the output.
+    preset : str
+    calm : bool
+        A loop without integral action.
     """
 
     duration: float = 200.0
@@ -46,10 +50,12 @@ class WearWorkload:
     final_gap: float = math.radians(60.0)
     tolerance_gap: float = math.radians(10.0)
     sample_rate: float = 5000.0
+    preset: str = PRESET
+    calm: bool = False
 
     @property
     def servo(self) -> Servo:
-        return the_servo()
+        return the_servo(self.preset, self.calm)
 
     @property
     def tolerance(self) -> float:
@@ -128,17 +134,38 @@ class SweepWorkload:
 
 @dataclass(frozen=True)
 class NoisyWorkload:
-    """The same wear with a sampled controller in measurement noise, behind the paper's loop filter (section 4.3)."""
+    """The same wear with a sampled controller in measurement noise, behind the paper's loop filter (section 4.3).
+
+    Parameters
+    ----------
+    wear : WearWorkload
+    noise_std : float or None
+        m; None: no noise.
+    white : bool
+        White noise instead of the paper's, which is high-passed.
+    resolution : float
+        Count of the position sensor, m; 0: none.
+    loop_filter_hz : float or None
+        Hz.
+    seed : int
+    """
 
     wear: WearWorkload
     noise_std: float | None = 0.22e-3
-    loop_filter_hz: float = 20.0
+    white: bool = False
+    resolution: float = 0.0
+    loop_filter_hz: float | None = 20.0
     seed: int = 1
 
     @property
+    def servo(self) -> Servo:
+        """The wear's, with its sensor."""
+        return self.wear.servo.replace(position_resolution=self.resolution)
+
+    @property
     def noise(self) -> Noise | None:
-        """The paper's noise, high-passed; None: the run without noise."""
-        return None if self.noise_std is None else Noise(std=self.noise_std)
+        """None: the run without noise."""
+        return None if self.noise_std is None else Noise(std=self.noise_std, kind="white" if self.white else "highpass")
 
     @property
     def controller(self) -> Controller:

@@ -108,6 +108,25 @@ def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out:
         at += step
 
 
+@inlined
+def wide_product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
+    """The same for sixteen columns and a multiple of eight rows, in one go."""
+    at, step = np.uint64(base), np.uint64(stride)
+    x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+    x8, x9, xa, xb, xc, xd, xe, xf = x[8], x[9], x[10], x[11], x[12], x[13], x[14], x[15]
+    for r in range(np.uint64(rows)):
+        i0 = at + r
+        i4 = i0 + step * np.uint64(4)
+        i8 = i4 + step * np.uint64(4)
+        ic = i8 + step * np.uint64(4)
+        s2, s3 = step + step, step + step + step
+        a = (table[i0] * x0 + table[i0 + step] * x1) + (table[i0 + s2] * x2 + table[i0 + s3] * x3)
+        b = (table[i4] * x4 + table[i4 + step] * x5) + (table[i4 + s2] * x6 + table[i4 + s3] * x7)
+        c = (table[i8] * x8 + table[i8 + step] * x9) + (table[i8 + s2] * xa + table[i8 + s3] * xb)
+        d = (table[ic] * xc + table[ic + step] * xd) + (table[ic + s2] * xe + table[ic + s3] * xf)
+        out[r] = (a + b) + (c + d)
+
+
 @summed
 def dot(table: Array, base: int, x: Array) -> float:
     """``sum of table[base + j] * x[j]``."""

@@ -91,13 +91,19 @@ class PiecewiseCubic:
         c = self.coeffs[piece]
         return np.asarray(((c[..., 3] * elapsed + c[..., 2]) * elapsed + c[..., 1]) * elapsed + c[..., 0])
 
+    def constant_between(self, first: float, last: float) -> float | None:
+        """The value from one time to another, where it does not change; None where it may."""
+        pieces = np.searchsorted(self.times, _rounded_up(np.array([first, last])), side="right")
+        piece = max(int(pieces[0]) - 1, 0)
+        return float(self.coeffs[piece, 0]) if pieces[0] == pieces[1] and not self.coeffs[piece, 1:].any() else None
+
     def on(self, times: Array) -> Array:
         """`value` at increasing times ``(n,)``, piece by piece: quicker where there are many times in few pieces."""
         if times.size == 0:
             return np.empty(0)
-        first, last = np.searchsorted(self.times, _rounded_up(times[[0, -1]]), side="right").tolist()
-        if first == last and not self.coeffs[max(first - 1, 0), 1:].any():
-            return np.full(times.size, self.coeffs[max(first - 1, 0), 0])
+        held = self.constant_between(float(times[0]), float(times[-1]))
+        if held is not None:
+            return np.full(times.size, held)
         result = np.empty(times.size)
         bounds = np.concatenate([[0], np.searchsorted(_rounded_up(times), self.times[1:], side="left"), [times.size]])
         for piece in np.flatnonzero(np.diff(bounds)):

@@ -34,7 +34,7 @@ from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
-_CHUNK = 1 << 15
+_CHUNK, _LARGEST_CHUNK = 1 << 15, 1 << 16
 _RECORDED = ("theta_m", "theta_d", "voltage")
 
 
@@ -78,19 +78,24 @@ class SampledEngine:
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
-        chain = [i for i, name in enumerate(names) if name.startswith("chain")]
-        recorded = [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
         return Port(
             names.index("voltage"),
             int(np.argmax(self.plant.rows["position"][0])),
             self.servo.position_resolution,
-            np.array(recorded),
+            1 if self.servo.position_resolution > 0.0 else 0,
+            np.array(self._recorded()),
             self.tick_every,
             self.record_every,
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
             np.zeros(self.delay),
         )
+
+    def _recorded(self) -> list[int]:
+        """States that are written at every sample."""
+        names = self.plant.automaton.names
+        chain = [i for i, name in enumerate(names) if name.startswith("chain")]
+        return [names.index(name) for name in _RECORDED] + chain[: len(chain) // 2]
 
     @property
     def index(self) -> int:
@@ -116,10 +121,7 @@ class SampledEngine:
             self._run_through(base, jumps)
         self._run(end)
         if index == self.samples - 1:
-            tick_inputs = self.tick_inputs(-(-self.base // self.tick_every), self.base // self.tick_every + 1)
-            self.law_state = tick_and_record(
-                self.base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
-            )
+            self._tick_and_record(self.base)
             self.finished = True
 
     def make_room(self, index: int) -> None:
@@ -143,16 +145,26 @@ class SampledEngine:
     def tick_inputs(self, first: int, last: int) -> TickInputs:
         """Inputs of ticks first .. last - 1."""
         count = max(last - first, 0)
-        times = np.arange(first, first + count) / self.tick_rate
+        enter, leave = self._thresholds(first, count)
+        reference, noise = self._on_ticks(self.inputs.reference, first, count), self.draws.take(count)
+        return TickInputs(
+            first, reference, noise, enter, leave, *(0 if each.size == 1 else -1 for each in (reference, noise, enter))
+        )
+
+    def _on_ticks(self, signal: PiecewiseCubic, first: int, count: int) -> Array:
+        """Values at ticks; one value where it is constant."""
+        held = signal.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
+        return np.array([held]) if held is not None else signal.on(np.arange(first, first + count) / self.tick_rate)
+
+    def _thresholds(self, first: int, count: int) -> tuple[Array, Array]:
+        """Thresholds of the dead zone at ticks; one pair where they are constant."""
         if self.inputs.tolerance is None:
-            enter = leave = np.full(count, -1.0)
-        else:
-            tolerance = self.inputs.tolerance.on(times)
-            # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
-            zero = tolerance == 0.0
-            enter = np.where(zero, -1.0, self.controller.enter * tolerance)
-            leave = np.where(zero, -1.0, self.controller.leave * tolerance)
-        return TickInputs(first, self.inputs.reference.on(times), self.draws.take(count), enter, leave)
+            return np.array([-1.0]), np.array([-1.0])
+        tolerance = self._on_ticks(self.inputs.tolerance, first, count)
+        # No dead zone: thresholds of zero would cut the voltage whenever a quantised error is zero.
+        zero = tolerance == 0.0
+        enter = np.where(zero, -1.0, self.controller.enter * tolerance)
+        return enter, np.where(zero, -1.0, self.controller.leave * tolerance)
 
     def _run(self, end: int) -> None:
         if self.noise is None or end - self.base <= _CHUNK:
@@ -160,15 +172,19 @@ class SampledEngine:
                 stop = min(end, self.base + _CHUNK)
                 self.flow(stop, self._inputs_until(self.base, stop))
             return
-        # The noise of the next chunk is drawn while this one runs.
+        # The noise of the next chunk is drawn while this one runs. The first one, which is waited for, is short, and
+        # they grow slowly, so that no later one is waited for.
         with ThreadPoolExecutor(1) as pool:
-            coming = pool.submit(self._inputs_until, self.base, self.base + _CHUNK)
+            chunk = _CHUNK // 2
+            stop = min(end, self.base + chunk)
+            coming = pool.submit(self._inputs_until, self.base, stop)
             while self.base < end:
-                stop = min(end, self.base + _CHUNK)
-                tick_inputs = coming.result()
+                tick_inputs, chunk = coming.result(), min(chunk + chunk // 4, _LARGEST_CHUNK)
+                following = min(end, stop + chunk)
                 if stop < end:
-                    coming = pool.submit(self._inputs_until, stop, min(end, stop + _CHUNK))
+                    coming = pool.submit(self._inputs_until, stop, following)
                 self.flow(stop, tick_inputs)
+                stop = following
 
     def _inputs_until(self, base: int, end: int) -> TickInputs:
         """Inputs of the ticks from one base step up to another."""
@@ -195,10 +211,7 @@ class SampledEngine:
 
     def _run_through(self, base: int, jumps: list[Jump]) -> None:
         """One base step in which the gap's cubic changes."""
-        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
-        self.law_state = tick_and_record(
-            base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
-        )
+        self._tick_and_record(base)
         at = np.array([base * self.port.searches, self.mode, 0, 0], dtype=np.int64)
         end = (base + 1) * self.port.searches
         steps, fractions, values, modes = schedule_of(jumps, self.step, self.plant.automaton, end)
@@ -212,6 +225,13 @@ class SampledEngine:
             self.record.size[0] = 0
             self._check(status)
         self.mode, self.base = int(at[1]), base + 1
+
+    def _tick_and_record(self, base: int) -> None:
+        """What is due at a base step, without the flow after it."""
+        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
+        self.law_state = tick_and_record(
+            base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output
+        )
 
     def _check(self, status: int) -> None:
         if status == ZENO:
@@ -341,9 +361,9 @@ class NoiseBuffer:
     drawn: Array = field(default_factory=lambda: np.zeros(0))
 
     def take(self, count: int) -> Array:
-        """Noise (m) of the next ticks."""
+        """Noise (m) of the next ticks; one zero without noise."""
         if self.source is None:
-            return np.zeros(count)
+            return np.zeros(1)
         if (missing := count - self.drawn.size) > 0:
             self.drawn = np.concatenate([self.drawn, self.source.block(max(missing, self.ahead))])
         values, self.drawn = self.drawn[:count], self.drawn[count:]

@@ -16,6 +16,7 @@ from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonne
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.inputs import RunInputs, quantised, spliced
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
+from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
 
@@ -286,6 +287,10 @@ def simulate(
     )
     if noise is None and (run := _run_in_blocks(simulation, theta_d0)) is not None:
         return run
+    if isinstance(simulation.engine, SampledEngine) and fits_plant_blocks(simulation.engine):
+        engine = in_plant_blocks(simulation.engine)
+        engine.advance(engine.samples - 1)
+        return Run(servo, simulation.inputs, simulation.samples, engine.channel, engine.events)
     simulation.advance(simulation.samples - 1)
     return simulation.run()
 

@@ -24,6 +24,7 @@ class Port(NamedTuple):
     voltage: int
     position: int
     resolution: float
+    counted: int  # 1: the sensor counts, 0: it is ideal
     recorded: NDArray[np.int64]  # states written at every recorded step
     tick_every: int
     record_every: int
@@ -33,13 +34,16 @@ class Port(NamedTuple):
 
 
 class TickInputs(NamedTuple):
-    """Inputs of the ticks from tick `first` on."""
+    """Inputs of the ticks from tick `first` on; one value stands for all of them where a mask is 0 and not -1."""
 
     first: int
     reference: Array
     noise: Array
     enter: Array
     leave: Array
+    reference_mask: int
+    noise_mask: int
+    zone_mask: int
 
 
 class Output(NamedTuple):
@@ -53,21 +57,27 @@ class Output(NamedTuple):
 
 
 @inlined
-def take_tick(
-    i: int, x: Array, parameters: LawParameters, state: LawState, port: Port, tick_inputs: TickInputs, output: Output
-) -> LawState:
-    """Measure, tick, hold the voltage (that of `delayed.size` ticks ago)."""
-    k = i - tick_inputs.first
-    y = x[port.position] + tick_inputs.noise[k]
-    if port.resolution > 0.0:
+def measured(position: float, noise: float, port: Port) -> float:
+    """The measurement: noise, then whole counts."""
+    y = position + noise
+    # A loop, for a branch would be compiled as a choice, and the tick would wait for a division without need.
+    for _ in range(port.counted):
         y = np.round(y / port.resolution) * port.resolution
+    return y
+
+
+@inlined
+def tick_between(
+    parameters: LawParameters, enter: float, leave: float, state: LawState, reference: float, y: float
+) -> LawState:
+    """The edge's tick with its thresholds of the instant."""
     now = LawParameters(
         parameters.Kp,
         parameters.integral_step,
         parameters.derivative_gain,
         parameters.filter_step,
-        tick_inputs.enter[k],
-        tick_inputs.leave[k],
+        enter,
+        leave,
         parameters.voltage_limit,
         parameters.rate_step,
         parameters.loop_step,
@@ -76,16 +86,39 @@ def take_tick(
         parameters.release_step,
         parameters.acting_inside,
     )
-    state = tick(now, state, tick_inputs.reference[k], y)
-    if port.delayed.size == 0:
-        x[port.voltage] = state.voltage
-    else:
-        place = i % port.delayed.size
-        x[port.voltage] = port.delayed[place]
-        port.delayed[place] = state.voltage
-    output.measured[i - output.first_tick] = y
-    output.active[i - output.first_tick] = 1 if state.active > 0.5 else 0
+    return tick(now, state, reference, y)
+
+
+@inlined
+def take_tick(
+    i: int,
+    position: float,
+    parameters: LawParameters,
+    state: LawState,
+    port: Port,
+    tick_inputs: TickInputs,
+    output: Output,
+) -> LawState:
+    """Measure, tick, record both."""
+    k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
+    zone = np.uint64(k & tick_inputs.zone_mask)
+    y = measured(position, tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)], port)
+    reference = tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)]
+    state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
+    output.measured[at] = y
+    output.active[at] = 1 if state.active > 0.5 else 0
     return state
+
+
+@inlined
+def to_hold(i: int, voltage: float, port: Port) -> float:
+    """The voltage to hold from tick i on: that of `delayed.size` ticks ago."""
+    if port.delayed.size == 0:
+        return voltage
+    place = i % port.delayed.size
+    held = port.delayed[place]
+    port.delayed[place] = voltage
+    return held
 
 
 @inlined
@@ -101,7 +134,9 @@ def tick_and_record(
 ) -> LawState:
     """Tick and record where they are due at a base step, before the plant flows on."""
     if base % port.tick_every == 0:
-        state = take_tick(base // port.tick_every, x, parameters, state, port, tick_inputs, output)
+        i, position = base // port.tick_every, x[port.position]
+        state = take_tick(i, position, parameters, state, port, tick_inputs, output)
+        x[port.voltage] = to_hold(i, state.voltage, port)
     if base % port.record_every == 0:
         write_sample(base // port.record_every, x, port, output)
     return state
@@ -131,7 +166,8 @@ def run_ticks(
         if record.size[1] > port.room:
             return FULL, base, mode, state
         if to_tick == 0:
-            state = take_tick(i, x, parameters, state, port, tick_inputs, output)
+            state = take_tick(i, x[port.position], parameters, state, port, tick_inputs, output)
+            x[port.voltage] = to_hold(i, state.voltage, port)
             to_tick = port.tick_every
             i += 1
         if to_record == 0:

@@ -106,7 +106,15 @@ def test_json_holds_every_run(written):
     assert document["date"] == "2026-01-02T03:04:05+00:00"
     assert document["quick"] is True
     assert document["machine"]["cores"] >= 1
-    assert [workload["name"] for workload in document["workloads"]] == ["W1", "W2", "W3", "sampled", "quiet"]
+    assert [workload["name"] for workload in document["workloads"]] == [
+        "W1",
+        "W2",
+        "W3",
+        "sampled",
+        "counts",
+        "calm",
+        "quiet",
+    ]
     for workload, result in zip(document["workloads"], results, strict=True):
         assert workload["contestants"][0]["ratio"] == 1.0
         for entry, row in zip(workload["contestants"], result.rows, strict=True):
@@ -161,9 +169,11 @@ def test_slow_contestants_run_on_request():
 
 
 def test_workloads_are_chosen_by_name():
-    assert catalogue.chosen([]) == ("W1", "W2", "W3", "sampled", "quiet", "decision", "start")
-    assert catalogue.chosen(["SAMPLED", "w1"]) == ("W1", "sampled", "quiet")
-    with pytest.raises(InvalidInput, match=r"workload 'W9' does not exist.*W3, sampled, quiet, decision, start"):
+    assert catalogue.chosen([]) == ("W1", "W2", "W3", "sampled", "counts", "calm", "quiet", "decision", "start")
+    assert catalogue.chosen(["SAMPLED", "w1"]) == ("W1", "sampled", "counts", "calm", "quiet")
+    with pytest.raises(
+        InvalidInput, match=r"workload 'W9' does not exist.*W3, sampled, counts, calm, quiet, decision, start"
+    ):
         catalogue.chosen(["W9"])
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SquareWave, Step, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.inputs import RunInputs
@@ -41,6 +42,13 @@ class SampledCase:
         )
         engine.advance(self.samples - 1)
         return engine
+
+    def noisy(self, std: float, seed: int) -> SampledEngine:
+        """The run in white noise (m), tick by tick, not yet begun."""
+        noise, rng = Noise(std=std, kind="white"), np.random.default_rng(seed)
+        return SampledEngine(
+            self.servo, self.controller, self.inputs, self.theta_d0, self.samples, noise, rng, delay=self.delay
+        )
 
     def in_blocks(self) -> LiftedEngine:
         """The run in blocks."""
