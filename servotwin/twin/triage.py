@@ -19,7 +19,7 @@ from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
-from servotwin.estimation.whitened.quick import NO_SPREAD, QuickFit, quick_fit
+from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
@@ -195,7 +195,7 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
     usual, spread = max(state.misfit, settings.misfit_limit), NO_SPREAD
     if not (off <= allowed(std, settings) and result.misfit <= settings.misfit * usual):
         # Only here does it matter what is open of the machine: it may be all that differs.
-        spread = fit.machine_spread()
+        spread = _open(fit, settings)
     if not off <= allowed(math.hypot(std, spread.gap), settings):
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
@@ -205,6 +205,12 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
     if abs(result.bias - state.bias) > max(settings.bias_limit, spread_of_bias):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
     return ""
+
+
+def _open(fit: QuickFit, settings: TriageSettings) -> MachineSpread:
+    """Effect of what is open of the machine; none where it is so much that it could hide any move."""
+    spread = fit.machine_spread()
+    return spread if spread.gap <= settings.widest else NO_SPREAD
 
 
 def allowed(std: float, settings: TriageSettings) -> float:
@@ -292,7 +298,7 @@ class Triage:
         off = abs(fit.gap - estimate.gap)
         std = math.hypot(fit.std, estimate.std)
         if off <= allowed(std, self.settings) or off <= allowed(
-            math.hypot(std, fit.machine_spread().gap), self.settings
+            math.hypot(std, _open(fit, self.settings).gap), self.settings
         ):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"

@@ -68,6 +68,18 @@ def test_one_contact_with_a_model_a_little_off_is_not_taken_for_two():
     assert "one contact" in estimate.reasons[0]
 
 
+def test_a_screw_that_begins_in_contact_teaches_too():
+    """Its place then has no derivative, which says nothing against the others."""
+    case, gap = machine_window(), math.radians(10.0)
+    settings = LearningSettings()
+    new = nameplate(settings, 0.15, 0.5, 0.1)
+    estimate = estimate_carrying(case.window, MODEL, None, whitened.WhitenedSettings(), None, new)
+    assert estimate.ok
+    assert abs(estimate.theta_d0 - float(case.window.theta_m[0])) == pytest.approx(0.5 * gap, rel=0.02)
+    assert estimate.machine is not None
+    assert np.abs(np.array(estimate.machine.factors[:3]) - TRUTH[:3]).max() < 0.02
+
+
 def test_a_window_with_one_contact_teaches_the_machine_and_not_the_gap():
     """Whether the one contact or two explain it, stiffness and damping come out alike."""
     machine, prior = adapted(MODEL, TRUTH), nameplate(LearningSettings(), 0.05, 0.3, 0.02)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import msgspec
@@ -21,7 +22,7 @@ from servotwin.twin.estimating import decode_window
 from servotwin.twin.evidence import EvidenceLog, plain
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
-from servotwin.twin.triage import Glance
+from servotwin.twin.triage import Glance, TriageState, glance
 from servotwin.twin.twin import Twin
 
 DEG = math.pi / 180.0
@@ -74,6 +75,18 @@ def test_without_learning_such_a_machine_shows_nothing(calm: bool) -> None:
     log = off_twin(OFF_BY[0], calm, learn=False)
     assert not any(estimate.ok for estimate in log.estimates.values())
     assert all(one.machine is None for one in log.glances.values())
+
+
+def test_a_machine_of_which_too_much_is_open_hides_no_move() -> None:
+    window = decode_window(off_windows(OFF_BY[0], 10.0, False, 0.0)[2])
+    usual = TriageState(doubt="", boot="b", gap=9.5 * DEG, std=0.005 * DEG, misfit=1e-6)
+    message, whys = message_of(window, start=0.0), []
+    for spread in (1e-5, 1.0):
+        machine = FactorPrior(np.log(OFF_BY[0]), np.diag(np.square(spread * np.array([0.1, 0.5, 0.01, 0.01]))))
+        whys.append(glance(message, window, SERVO, usual, settings=SETTINGS, machine=machine).why)
+    assert all("the gap moved" in why for why in whys)
+    wider = replace(SETTINGS, widest=1.0)
+    assert not glance(message, window, SERVO, usual, settings=wider, machine=machine).moved
 
 
 def test_what_a_glance_stood_on_is_part_of_its_evidence() -> None:

@@ -148,7 +148,8 @@ class WindowFit:
 
     def _teaches(self, evidence: FitEvidence, status: GapStatus) -> bool:
         """True where the window shows the machine's numbers, whether or not it shows the gap well enough."""
-        known = self.learnt is not None and bool(np.all(np.isfinite(self.learnt.free.covariance)))
+        # A screw that begins in contact does not show its place, which then does not matter.
+        known = self.learnt is not None and bool(np.all(np.isfinite(self.learnt.free.covariance[2:, 2:])))
         wide = status is GapStatus.UNIDENTIFIABLE and math.isfinite(evidence.interval[1]) and not self.one_sided()
         return known and (status is GapStatus.OK or wide)
 

@@ -159,7 +159,7 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None, mach
     return Reduction.of(rows[0], rows[1], model, known, skew=False, factor=1)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8192)
 def _as_learnt(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
     """Response of a servo with other logarithms of its factors, at a rate (Hz)."""
     return variants(servo, [np.array(factors)], rate)[0]
