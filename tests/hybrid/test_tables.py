@@ -5,8 +5,18 @@ import pytest
 from test_exponential import exact, off
 
 from servotwin.hybrid.automaton import Automaton
-from servotwin.hybrid.build import build_tables, fill_tables, new_workspace, numbers_of
-from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, PART_TERMS, PARTS, TERMS, Tables, search_step
+from servotwin.hybrid.build import begin_tables, build_tables, fill_entered, fill_tables, new_workspace, numbers_of
+from servotwin.hybrid.tables import (
+    NODES_COARSE,
+    NODES_FINE,
+    PART_TERMS,
+    PARTS,
+    TERMS,
+    Tables,
+    empty_tables,
+    nothing_pending,
+    search_step,
+)
 from servotwin.plant.automaton import Shape, continuous_loop
 from servotwin.plant.servo import Servo
 
@@ -88,6 +98,26 @@ def test_filled_again_they_are_as_new(shape: Shape) -> None:
     assert not same(fresh, reused)
     fill_tables(reused, numbers_of(second, reused.guards), other, True, new_workspace(reused))
     assert same(fresh, reused)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_filled_mode_by_mode_in_any_order_they_are_the_same(shape: Shape) -> None:
+    automaton, step = loop(shape)
+    whole, tables = build_tables(automaton, step), empty_tables(automaton)
+    numbers, order = numbers_of(automaton, tables.guards), range(len(automaton.modes) - 1, -1, -1)
+    pending = nothing_pending(tables)._replace(
+        flows=numbers.flows[None],
+        rows=numbers.rows[None],
+        resets=numbers.resets[None],
+        step=np.array([step]),
+        blocks=np.array([True]),
+    )
+    begin_tables(pending, 0)
+    for mode in order:
+        assert pending.filled[mode] == 0
+        fill_entered(tables, mode, pending)
+    assert pending.filled.all()
+    assert same(whole, tables)
 
 
 def same(one: Tables, other: Tables) -> bool:

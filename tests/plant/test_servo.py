@@ -211,3 +211,11 @@ def test_to_control_and_its_absence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(InvalidInput, match=r"needs control, which is not installed.*servotwin\[interop\]"):
         servo.to_control()
+
+
+def test_a_scaled_servo_is_the_one_with_those_numbers() -> None:
+    servo = Servo.preset("paper").replace(k=(1e4, 2e4, 3e4))
+    expected = servo.replace(k=(1.1 * 1e4, 1.1 * 2e4, 1.1 * 3e4), k_T=0.9 * servo.k_T)
+    assert servo.scaled({"k": 1.1, "k_T": 0.9}) == expected
+    with pytest.raises(InvalidInput, match="k: factor"):
+        servo.scaled({"k": 0.0})
