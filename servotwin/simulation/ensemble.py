@@ -275,57 +275,6 @@ def summarise_members(
     return {name: Figures(*figures) for name, figures in zip(outputs, by_output, strict=True)}
 
 
-def errors_to_and_fro(
-    servos: Any,
-    controllers: Any,
-    duration: float,
-    cases: Cases,
-    moves: int,
-    sample_rate: float,
-    threads: int | None = None,
-) -> Array:
-    """Mean size of the error (m) while a reference goes back to zero and again to its value of `cases`, in turn.
-
-    Each move begins as the one before left the loop: the motor on one flank or inside the gap, the integral as it is.
-    The first move, from rest at zero, does not count.
-
-    Parameters
-    ----------
-    servos, controllers, cases, sample_rate, threads
-        As for `summarise_members`.
-    duration : float
-        s, of each move.
-    moves : int
-        That count, at least 1.
-
-    Returns
-    -------
-    array of shape S
-        m.
-
-    Raises
-    ------
-    InvalidInput
-        As `simulate_members`.
-    """
-    members, samples = members_of(servos, controllers, cases), samples_of(duration, sample_rate)
-    errors = np.zeros(len(members.servos))
-    for group in members.groups(("error",)):
-        count, _, modes, names = group.rows.shape
-        # The states are outputs too: the mean of each over the last sample alone is the state at the end of a move.
-        every = np.broadcast_to(np.eye(names)[:, None, :], (count, names, modes, names))
-        rows, place = np.concatenate([group.rows, every], axis=1), group.automata.first.index("reference")
-        options = FigureOptions(np.full((len(group.which), 1 + names), np.inf), 1)
-        starts, goals = group.members, (0.0, group.members.state[:, place].copy())
-        for move in range(moves + 1):
-            figures = figures_of_family(group.automata, rows, starts, 1.0 / sample_rate, samples, options, threads)
-            errors[group.which] += figures.mean_size[:, 0] / moves if move > 0 else 0.0
-            ends = figures.last_mean[:, 1:].copy()
-            ends[:, place] = goals[move % 2]
-            starts = group.restarted(ends)
-    return errors.reshape(members.shape)
-
-
 def samples_of(duration: float, sample_rate: float) -> int:
     """Number of samples of a run, both ends included."""
     if not (0.0 < duration < np.inf and 0.0 < sample_rate < np.inf):

@@ -12,11 +12,11 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import simulate
 from servotwin.simulation.ensemble import (
     Cases,
-    errors_to_and_fro,
     simulate_ensemble,
     simulate_members,
     summarise_members,
 )
+from servotwin.simulation.to_and_fro import errors_to_and_fro
 
 DEGREE = np.pi / 180.0
 TABLE1 = Servo.preset("table1")

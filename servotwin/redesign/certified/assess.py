@@ -20,8 +20,9 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
-from servotwin.simulation.ensemble import Cases, errors_to_and_fro, summarise_members
+from servotwin.simulation.ensemble import Cases, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
+from servotwin.simulation.to_and_fro import errors_to_and_fro
 
 NEAR = 0.02
 """Share of the step within which the loop has arrived."""

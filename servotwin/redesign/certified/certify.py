@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
@@ -203,19 +203,31 @@ def _ranked_in_stages(question: Question, candidates: list[Design], running: Des
         best = islice(screening.ranked(plain), _GAINS_WITH_INTEGRAL)
         gains = {own, *(_gains(setting.controller) for setting in best)}
         candidates = plain + [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
-    ranked = screening.ranked(candidates)
-    always = [] if running is None else [running]
     if question.uncertainty.usual_step is None:
-        settings = [*islice(ranked, 1), *always]
-        costs = {each: screening.cost(each) for each in settings if not screening.fails(each)}
-    else:
-        always += [each for each in candidates if _gains(each.controller) == own]
-        settings = [*islice(ranked, _MOVED), *always]
-        costs = screening.expected_costs([each for each in dict.fromkeys(settings) if not screening.fails(each)])
-    first = sorted(costs, key=costs.__getitem__)
-    stays = [each for each in first if each == running and costs[each] <= _WORTH * costs[first[0]]]
-    yielded = set[Design]()
-    for setting in chain(stays, first, settings, ranked):
-        if setting not in yielded:
-            yielded.add(setting)
+        return _with_running(screening, candidates, running)
+    always = [each for each in candidates if _gains(each.controller) == own]
+    return _by_moves(screening, candidates, [*always, running] if running is not None else always, running)
+
+
+def _with_running(screening: Screening, candidates: list[Design], running: Design | None) -> Iterator[Design]:
+    """Candidates by their cost over all steps, the running setting where it is hardly dearer than the next one."""
+    waits = running is not None and not screening.fails(running)
+    for setting in screening.ranked(candidates):
+        if waits and running is not None and screening.cost(running) <= _WORTH * screening.cost(setting):
+            waits = False
+            yield running
+        if setting != running:
             yield setting
+
+
+def _by_moves(
+    screening: Screening, candidates: list[Design], always: list[Design], running: Design | None
+) -> Iterator[Design]:
+    """The first candidates and those of `always` by their cost while they move to and fro, then the others."""
+    ranked = screening.ranked(candidates)
+    settings = dict.fromkeys([*islice(ranked, _MOVED), *always])
+    costs = screening.expected_costs([each for each in settings if not screening.fails(each)])
+    first = sorted(costs, key=lambda each: costs[each] / (_WORTH if each == running else 1.0))
+    yield from first
+    yield from (each for each in settings if each not in costs)
+    yield from (each for each in ranked if each not in settings)
