@@ -56,10 +56,14 @@ def _held(name: str, steps: Array) -> str:
     """Describe samples that repeat the one before them in full motion; empty without them.
 
     What comes to rest slows down, and what starts has no speed yet. A channel that stands still with the next sample,
-    or leaves with a leap, was held: samples are missing. A count more or less is no motion.
+    or leaves with a leap, was held: samples are missing. A count more or less is no motion, and a channel that is
+    recorded more often than measured repeats most values: nothing is said of it.
     """
     still = np.concatenate([[False], steps == 0.0, [False]])
     begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
+    moving = np.flatnonzero(steps > 0.0)
+    if moving.size < 2 or np.median(np.diff(moving)) > 1.0:
+        return ""
     long = ends - begins >= _HELD - 1
     least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
     for begin, end in zip(begins[long], ends[long], strict=True):
