@@ -189,7 +189,9 @@ class OpenLoopPlant:
         self._first, self._last = first, last
         self._tick_inputs = self._engine.tick_inputs(first, last)
         self._changes = {base for base, _ in self._engine.knots(last)}
-        self._reference, self._noise = self._tick_inputs.reference.tolist(), self._tick_inputs.noise.tolist()
+        # A signal that is constant has one value for all of these ticks.
+        signals = (self._tick_inputs.reference, self._tick_inputs.noise)
+        self._reference, self._noise = (np.broadcast_to(each, last - first).tolist() for each in signals)
 
 
 def _rounded(value: float, resolution: float) -> float:
