@@ -36,8 +36,6 @@ _SAME = 1e-3
 # not worth an update; the least half-width of the range of input biases, however well one is estimated; a voltage at
 # rest that differs by so much from the feedforward indicates friction, which stops the motor short of its reference.
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
-# Earlier rests without which a voltage at rest may be friction: the last window's may be the same rest.
-_RESTS_AGREE = 2
 # Friction holds the motor at up to so much more than half the difference of two rests.
 _HOLDS = 1.25
 
@@ -251,11 +249,11 @@ class CertifiedPolicy:
         return 0.5 * (max(rests) + min(rests)), std, half
 
     def _may_be_friction(self, evidence: Evidence) -> bool:
-        """True at the first rests, unless the motor's motion told friction: the voltage there is of bias or friction.
+        """True at the first rest, unless the motor's motion told friction: the voltage there is of bias or friction.
 
         Fed forward, a friction would push the wrong way after the next reversal.
         """
-        alone = len(evidence.rests) < _RESTS_AGREE and self._motor(evidence) is None
+        alone = not evidence.rests and self._motor(evidence) is None
         return alone and self.uncertainty.friction[1] == 0.0 and self._moved(evidence.disturbance.bias)
 
     def _moved(self, voltage: float) -> bool:
