@@ -182,18 +182,10 @@ def scored(machine: WornMachine, run: Run) -> LoopScores:
 def shown(rows: Sequence[LoopRow]) -> Table:
     """A line for each contender."""
     result = Table(title="whole twin in the loop, worn machines", title_justify="left", box=None, pad_edge=False)
-    for heading in (
-        "block",
-        "contender",
-        "machines",
-        "settled\n%",
-        "cost med\ns",
-        "cost p95\ns",
-        "later p95\ns",
-        "tail p95\num",
-    ):
-        result.add_column(heading, justify="left" if heading in ("block", "contender") else "right")
-    for heading in ("later p95\ns", "tail p95\num", "updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
+    for heading in ("block", "contender"):
+        result.add_column(heading)
+    numbers = ("machines", "settled\n%", "cost med\ns", "cost p95\ns", "later p95\ns", "tail p95\num")
+    for heading in (*numbers, "updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
         result.add_column(heading, justify="right")
     for row in rows:
         result.add_row(

@@ -83,6 +83,12 @@ def test_a_smooth_stop_and_the_counts_of_an_encoder_are_not_taken_for_held_sampl
         assert faults_of(angle) == ()
 
 
+def test_a_motor_that_friction_held_until_its_voltage_stepped_was_not_held_by_its_encoder():
+    """A motor that is quicker than a sample moves at once at full speed."""
+    angle = np.concatenate([np.full(400, 0.3), 0.3 + np.cumsum(0.002 * np.exp(-np.arange(4600) / 800.0))])
+    assert faults_of(angle) == ()
+
+
 def test_a_ramp_of_the_gap_is_refused_or_lies_within_the_interval():
     for case in corrupted_windows("ramp of 2 deg/s", 6, 11):
         estimate = estimate_gap(case.window, case.servo)

@@ -23,7 +23,8 @@ from servotwin.plant.signals import Array
 
 _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there
 _JUMP = 50.0  # times the usual fastest motion
-_HELD, _ABRUPT = 4, 4.0  # equal samples; times the usual change of speed there, at which motion begins or ends
+# Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
+_HELD, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
 _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder: below, nothing; above, the lowest cut
 _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
@@ -55,8 +56,9 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
 def _held(name: str, steps: Array) -> str:
     """Describe samples that repeat the one before them in full motion; empty without them.
 
-    What comes to rest slows down, and what starts has no speed yet. A channel that stands still with the next sample,
-    or leaves with a leap, was held: samples are missing. A count more or less is no motion, and a channel that is
+    What comes to rest slows down, and what starts is no faster in its first sample than in the next ones, as a motor
+    that friction held until its voltage stepped. A channel that stands still with the next sample, or leaves with a
+    leap, was held: samples are missing. A count more or less is no motion, and a channel that is
     recorded more often than measured repeats most values: nothing is said of it.
     """
     still = np.concatenate([[False], steps == 0.0, [False]])
@@ -67,11 +69,17 @@ def _held(name: str, steps: Array) -> str:
     long = ends - begins >= _HELD - 1
     least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
     for begin, end in zip(begins[long], ends[long], strict=True):
-        for side in (steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]):
-            if side.size == _RUN and side[0] > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))):
-                held = f"{name} repeats one value in full motion, in samples {begin} to {end}"
-                return f"{held}: it was held while samples were missing"
+        before, after = steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]
+        leaps = _abrupt(after, least) and after[0] > _LEAP * float(np.max(after[1:]))
+        if leaps or _abrupt(before, least):
+            held = f"{name} repeats one value in full motion, in samples {begin} to {end}"
+            return f"{held}: it was held while samples were missing"
     return ""
+
+
+def _abrupt(side: Array, least: float) -> bool:
+    """True where the first of some steps is beyond `least` and beyond the change of speed in the others."""
+    return side.size == _RUN and bool(side[0] > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
 
 
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
