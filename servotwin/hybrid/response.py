@@ -23,7 +23,7 @@ TICKS = 8
 """Ticks of a block."""
 
 
-class Responses(NamedTuple):
+class BlockResponses(NamedTuple):
     """Flat tables of `M` modes, `n` states, `G` guards and at most `L` lanes a tick; inputs follow the states."""
 
     lanes: int
@@ -76,7 +76,7 @@ class _Mode(NamedTuple):
         return out
 
 
-def new_response_memory(r: Responses, states: int) -> ResponseMemory:
+def new_response_memory(r: BlockResponses, states: int) -> ResponseMemory:
     """Working memory for one run."""
     return ResponseMemory(
         position=zeros(2 * TICKS),
@@ -88,7 +88,9 @@ def new_response_memory(r: Responses, states: int) -> ResponseMemory:
     )
 
 
-def build_responses(automaton: Automaton, t: Tables, step: float, searches: int, held: int, position: int) -> Responses:
+def build_responses(
+    automaton: Automaton, t: Tables, step: float, searches: int, held: int, position: int
+) -> BlockResponses:
     """All responses to the input that is the state `held`, with so many search steps (s) a tick."""
     n, row = t.states, np.eye(t.states)[[position]]
     modes = [_mode(automaton, t, m, step, searches, held) for m in range(len(automaton.modes))]
@@ -97,7 +99,7 @@ def build_responses(automaton: Automaton, t: Tables, step: float, searches: int,
     pulses = [np.array([row[0] @ pulse for pulse in mode.pulses]) for mode in modes]
     watched = [_watched(mode, lanes) for mode in modes]
     changes = [_changes(mode, t.guards) for mode in modes]
-    return Responses(
+    return BlockResponses(
         lanes=lanes,
         lane_count=np.array([len(mode.owners) for mode in modes]),
         position=_flat([each[:, :TICKS] for each in positions]),
@@ -120,7 +122,7 @@ def build_responses(automaton: Automaton, t: Tables, step: float, searches: int,
     )
 
 
-def output_responses(r: Responses, row: Array, held: int) -> tuple[Array, Array]:
+def output_responses(r: BlockResponses, row: Array, held: int) -> tuple[Array, Array]:
     """(M, 8, n) and (M, 8): an output at the ticks of a block, of the state at its start, and after an input's tick."""
     n = row.size
     step = r.step.reshape(-1, TICKS, n + TICKS, n)
@@ -214,7 +216,7 @@ def _product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arr
 
 
 @inlined
-def begin_block(r: Responses, mode: int, held: int, fresh: bool, x: Array, memory: ResponseMemory) -> None:
+def begin_block(r: BlockResponses, mode: int, held: int, fresh: bool, x: Array, memory: ResponseMemory) -> None:
     """The free response from `x`, whose input becomes zero; `fresh` where the block before ended early."""
     n = x.size
     x[held] = 0.0
@@ -233,7 +235,7 @@ def begin_block(r: Responses, mode: int, held: int, fresh: bool, x: Array, memor
 
 
 @inlined
-def hold_input(r: Responses, mode: int, j: int, u: float, memory: ResponseMemory) -> None:
+def hold_input(r: BlockResponses, mode: int, j: int, u: float, memory: ResponseMemory) -> None:
     """Add the response to the input of tick j, but for the position one tick later."""
     at = np.uint64(mode * 4 * TICKS + 2 * TICKS) - np.uint64(j)
     for k in range(np.uint64(memory.position.size)):
@@ -242,7 +244,7 @@ def hold_input(r: Responses, mode: int, j: int, u: float, memory: ResponseMemory
 
 
 @inlined
-def calm_ticks(t: Tables, r: Responses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> int:
+def calm_ticks(t: Tables, r: BlockResponses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> int:
     """Number of ticks, at most `ticks`, before the first in which some guard may fire; `x` as the block began."""
     n, lanes, z = t.states, r.lane_count[mode], memory.start
     if r.slow[mode]:
@@ -275,7 +277,7 @@ def calm_ticks(t: Tables, r: Responses, mode: int, ticks: int, x: Array, memory:
 
 
 @inlined
-def advance_block(r: Responses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> None:
+def advance_block(r: BlockResponses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> None:
     """Advance `x`, which may be the start in `memory`, by the first ticks of a block."""
     n, z = x.size, memory.start
     tall_product(r.step, (mode * TICKS + ticks - 1) * z.size * n, n, n, z, memory.change)
@@ -284,7 +286,7 @@ def advance_block(r: Responses, mode: int, ticks: int, x: Array, memory: Respons
 
 
 @inlined
-def end_block(r: Responses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> None:
+def end_block(r: BlockResponses, mode: int, ticks: int, x: Array, memory: ResponseMemory) -> None:
     """Advance `x` by the first ticks of the block that began with it."""
     n = x.size
     if ticks == TICKS:

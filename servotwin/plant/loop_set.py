@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.exponential import expm1
+from servotwin.plant.frequency_curves import distances, encirclements, least_values, squares
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.loop import StateMatrices, continuous_law, sampled_law
 from servotwin.plant.signals import Array
@@ -28,14 +29,10 @@ _BEYOND = 1e2
 # Frequencies about each pole, in its half widths.
 _ABOUT = np.array([-8.0, -4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0, 8.0])
 _NARROWEST = 1e-6
-_DISTINCT = 1e-9
 # Poles below this part of the fastest one's size are integrators.
 _ZERO = 1e-9
-# Steps of 1 + L from one frequency to the next, relative to its size, up to which the curve between them is known.
-_RESOLVED = 0.8
+# Logarithm, per sample, of a decay that is taken for one at once.
 _AT_ONCE = 700.0
-# The least value between two frequencies is searched for by zooming in.
-_ZOOMS, _INSIDE = 2, np.linspace(0.0, 1.0, 17)
 
 
 class SetMargins(NamedTuple):
@@ -100,7 +97,7 @@ class PlantSet:
         return self._grid.omega
 
     @cached_property
-    def _grid(self) -> Grid:
+    def _grid(self) -> FrequencyGrid:
         poles = self._frequencies(_eigenvalues(self.A))
         sizes = np.abs(poles)
         # The integrator's pole is zero only to within rounding.
@@ -113,7 +110,7 @@ class PlantSet:
         both = np.concatenate([np.broadcast_to(common, (len(poles), common.size)), about], axis=1)
         order = np.argsort(both, axis=1, kind="stable")
         omega = np.take_along_axis(both, order, axis=1)
-        return Grid(omega, order, self.points(common), self.points(about), np.sum(~real, axis=1))
+        return FrequencyGrid(omega, order, self.points(common), self.points(about), np.sum(~real, axis=1))
 
     @cached_property
     def response(self) -> Complex:
@@ -186,7 +183,7 @@ class PlantSet:
 
     def peaks(self, law: Controller, delay: int = 0) -> Array:
         """(P,) sensitivity peaks on the stored frequencies: at most what `margins` finds, and much cheaper."""
-        return self._once("peak", law, delay, lambda: 1.0 / np.sqrt(_squares(self._returned(law, delay)).min(axis=1)))
+        return self._once("peak", law, delay, lambda: 1.0 / np.sqrt(squares(self._returned(law, delay)).min(axis=1)))
 
     def stable(self, law: Controller, delay: int = 0) -> NDArray[np.bool_]:
         """(P,) stability of the closed loop, from the turns of 1 + L about zero (Nyquist); by its poles where a plant's
@@ -194,7 +191,7 @@ class PlantSet:
         if ("decay", law, delay) in self._stored:
             return np.asarray(self.decays(law, delay) > 0.0)
         integrators = self._grid.integrators + (law.Ki != 0.0)
-        circled, resolved = _encirclements(self._returned(law, delay), integrators)
+        circled, resolved = encirclements(self._returned(law, delay), integrators)
         stable = circled == 0
         if not resolved.all():
             few = PlantSet(self.A[~resolved], self.B[~resolved], self.C[~resolved], self.rate)
@@ -233,10 +230,10 @@ class PlantSet:
         def value(omega: Array) -> Complex:
             return self.loop(law, delay, omega)
 
-        gain, phase, late = _distances(omega, loop, value)
-        closest = _least(omega, np.abs(1.0 + loop), lambda w: np.abs(1.0 + value(w)))
+        gain, phase, late = distances(omega, loop, value)
+        closest = least_values(omega, np.abs(1.0 + loop), lambda w: np.abs(1.0 + value(w)))
         peak = np.where(stable, 1.0 / closest, np.inf)
-        passivity = 1.0 + _least(omega, loop.real, lambda w: value(w).real)
+        passivity = 1.0 + least_values(omega, loop.real, lambda w: value(w).real)
         return SetMargins(stable, peak, gain, phase, late, -growth, passivity)
 
     def _frequencies(self, poles: Complex) -> Complex:
@@ -282,7 +279,7 @@ class PlantSet:
         return closed
 
 
-class Grid(NamedTuple):
+class FrequencyGrid(NamedTuple):
     """Frequencies at which the plants of a set are stored.
 
     Attributes
@@ -353,79 +350,9 @@ def _eigenvalues(matrices: Array) -> Complex:
     return np.asarray(np.linalg.eigvals(matrices), dtype=np.complex128)
 
 
-def _squares(values: Complex) -> Array:
-    return np.asarray(values.real**2 + values.imag**2)
-
-
-def _encirclements(returned: Complex, integrators: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(P,) numbers of pairs of closed-loop poles beyond the boundary, and True where the frequencies resolve the curve.
-
-    `returned` is 1 + L along the boundary, (P, F) at ascending frequencies; of a stable loop it turns by a quarter for
-    each of the integrators.
-    """
-    steps = _squares(np.diff(returned, axis=1))
-    sizes = _squares(returned)
-    resolved = np.all(steps < _RESOLVED**2 * np.minimum(sizes[:, 1:], sizes[:, :-1]), axis=1)
-    upper, left = returned.imag >= 0.0, returned.real < 0.0
-    # Steps are short beside the distance from zero: a crossing of the negative real axis has an end left of zero.
-    across = (upper[:, 1:] != upper[:, :-1]) & (left[:, 1:] | left[:, :-1])
-    turns = np.sum(np.where(across, np.where(upper[:, :-1], 1, -1), 0), axis=1)
-    turned = np.angle(returned[:, -1]) - np.angle(returned[:, 0]) + 2.0 * np.pi * turns
-    return np.rint(0.25 * integrators - turned / (2.0 * np.pi)).astype(np.int64), resolved
-
-
 def _about(poles: Complex) -> Array:
     """(P, K) rad/s: frequencies about poles (1/s)."""
     poles = np.where(np.isfinite(poles), poles, 0.0)
     width = np.maximum(np.abs(poles.real), _NARROWEST * np.abs(poles))
     near = np.abs(poles.imag)[..., None] + width[..., None] * _ABOUT
     return np.asarray(np.abs(near).reshape(len(poles), -1))
-
-
-def _least(omega: Array, values: Array, value: Callable[[Array], Array]) -> Array:
-    """(P,) least values of a function of frequency: about the lowest of (P, F) samples the search is refined."""
-    place = np.argmin(values, axis=1)[:, None]
-    best, least = (np.take_along_axis(each, place, axis=1) for each in (omega, values))
-    # Not simply the neighbours: equal frequencies may stand side by side.
-    low = np.max(np.where(omega < best * (1.0 - _DISTINCT), omega, omega[:, :1]), axis=1, keepdims=True)
-    high = np.min(np.where(omega > best * (1.0 + _DISTINCT), omega, omega[:, -1:]), axis=1, keepdims=True)
-    least = least[:, 0]
-    for _ in range(_ZOOMS):
-        fine = low + (high - low) * _INSIDE
-        found = value(fine)
-        place = np.argmin(found, axis=1)[:, None]
-        least = np.minimum(least, np.take_along_axis(found, place, axis=1)[:, 0])
-        low, high = (np.take_along_axis(fine, np.clip(place + k, 0, fine.shape[1] - 1), axis=1) for k in (-1, 1))
-    return np.asarray(least)
-
-
-@np.errstate(all="ignore")
-def _crossings(omega: Array, loop: Complex) -> Array:
-    """(3, P, F - 1) gain margin, phase margin (rad) and delay margin (s) between each two frequencies; inf: no
-    crossing."""
-    size = np.log(np.abs(loop))
-    # The angle of -L: pi plus the phase of L. Between two frequencies it turns by less than half a turn.
-    before, turn = np.angle(-loop[:, :-1]), np.angle(loop[:, 1:] / loop[:, :-1])
-    share = size[:, :-1] / (size[:, :-1] - size[:, 1:])
-    crosses = (size[:, :-1] >= 0.0) != (size[:, 1:] >= 0.0)
-    angle = before + share * turn
-    phase = np.where(crosses, np.abs(np.mod(angle + np.pi, 2.0 * np.pi) - np.pi), np.inf)
-    late = np.where(crosses, np.mod(angle, 2.0 * np.pi) / (omega[:, :-1] + share * np.diff(omega, axis=1)), np.inf)
-    # Where L crosses the negative real axis the angle of -L crosses zero without a jump.
-    crosses = (np.abs(before) < 0.5 * np.pi) & ((before >= 0.0) != (before + turn >= 0.0))
-    share = np.where(crosses, before / -turn, 0.0)
-    distance = np.abs(size[:, :-1] + share * np.diff(size, axis=1))
-    return np.array([np.where(crosses, np.exp(np.minimum(distance, _AT_ONCE)), np.inf), phase, late])
-
-
-def _distances(omega: Array, loop: Complex, value: Callable[[Array], Complex]) -> tuple[Array, Array, Array]:
-    """(P,) least gain margins, phase margins (rad) and delay margins (s); the crossing of each is refined."""
-    coarse = _crossings(omega, loop)
-    least = []
-    for kind, every in enumerate(coarse):
-        place = np.argmin(every, axis=1)[:, None]
-        low, high = (np.take_along_axis(omega, place + k, axis=1) for k in (0, 1))
-        fine = low + (high - low) * _INSIDE
-        refined = _crossings(fine, value(fine))[kind].min(axis=1)
-        least.append(np.where(np.isfinite(refined), refined, every.min(axis=1)))
-    return least[0], np.minimum(least[1], np.pi), least[2]

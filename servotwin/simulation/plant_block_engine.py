@@ -9,7 +9,7 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.kernel import FULL
-from servotwin.hybrid.response import Responses, build_responses, new_response_memory, output_responses
+from servotwin.hybrid.response import BlockResponses, build_responses, new_response_memory, output_responses
 from servotwin.hybrid.trajectory import tables_for
 from servotwin.simulation.plant_blocks import (
     LAW_STATES,
@@ -30,7 +30,7 @@ _LEAST_TICKS, _MOST_SEARCHES = 20_000, 8
 
 
 @lru_cache(maxsize=64)
-def _responses_for(automaton: Automaton, step: float, searches: int, held: int, position: int) -> Responses:
+def _responses_for(automaton: Automaton, step: float, searches: int, held: int, position: int) -> BlockResponses:
     return build_responses(automaton, tables_for(automaton, step), step, searches, held, position)
 
 

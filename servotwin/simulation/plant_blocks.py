@@ -14,8 +14,8 @@ from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.response import (
     TICKS,
+    BlockResponses,
     ResponseMemory,
-    Responses,
     advance_block,
     begin_block,
     calm_ticks,
@@ -86,7 +86,7 @@ def stored(law_states: Array, j: int) -> LawState:
 
 @inlined
 def take_ticks(
-    r: Responses,
+    r: BlockResponses,
     tick: int,
     count: int,
     mode: int,
@@ -127,7 +127,7 @@ def take_ticks(
 @bare
 def run_plant_blocks(
     t: Tables,
-    r: Responses,
+    r: BlockResponses,
     x: Array,
     tick: int,
     end: int,
@@ -184,7 +184,13 @@ def run_plant_blocks(
 
 @bare
 def sample_blocks(
-    blocks: PlantBlocks, r: Responses, free: Array, late: Array, voltages: Array, memory: ResponseMemory, out: Array
+    blocks: PlantBlocks,
+    r: BlockResponses,
+    free: Array,
+    late: Array,
+    voltages: Array,
+    memory: ResponseMemory,
+    out: Array,
 ) -> None:
     """An output at every tick, from its ``(M, 8, n)`` free responses and ``(M, 8)`` responses to the voltages."""
     n, count = free.shape[2], blocks.size[0]

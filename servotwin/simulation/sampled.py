@@ -227,7 +227,7 @@ class SampledEngine:
         self.mode, self.base = int(at[1]), base + 1
 
     def _tick_and_record(self, base: int) -> None:
-        """What is due at a base step, without the flow after it."""
+        """Tick and record where they are due at a base step, without the flow after it."""
         tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
         self.law_state = tick_and_record(
             base, self.state, self.parameters, self.law_state, self.port, tick_inputs, self.output

@@ -285,14 +285,21 @@ def simulate(
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
-    if noise is None and (run := _run_in_blocks(simulation, theta_d0)) is not None:
+    run = _run_in_blocks(simulation, theta_d0) if noise is None else None
+    run = _run_plant_in_blocks(simulation) if run is None else run
+    if run is not None:
         return run
-    if isinstance(simulation.engine, SampledEngine) and fits_plant_blocks(simulation.engine):
-        engine = in_plant_blocks(simulation.engine)
-        engine.advance(engine.samples - 1)
-        return Run(servo, simulation.inputs, simulation.samples, engine.channel, engine.events)
     simulation.advance(simulation.samples - 1)
     return simulation.run()
+
+
+def _run_plant_in_blocks(simulation: Simulation) -> Run | None:
+    """The whole run with the plant in blocks and the law tick by tick; None where they do not fit or do not pay."""
+    if not (isinstance(simulation.engine, SampledEngine) and fits_plant_blocks(simulation.engine)):
+        return None
+    engine = in_plant_blocks(simulation.engine)
+    engine.advance(engine.samples - 1)
+    return Run(simulation.servo, simulation.inputs, simulation.samples, engine.channel, engine.events)
 
 
 def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:

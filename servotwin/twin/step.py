@@ -193,14 +193,9 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     if disturbed.known and not stale:
         state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
-    if model.requests is not None and state.requests is not None and not stale and estimate.method != UNUSABLE:
-        widest = state.wear.expect(trends, message.boot, estimate.time, arrived).widest
-        asking, decision = model.requests.decide(state.requests, message, estimate, widest, in_force, now)
-        state = replace(state, requests=asking)
-        records.append(ExcitationRecord(message, decision))
-        if decision.ask is not None and asking.pending is not None:
-            records.append(asking.pending)
-            others = (*others, asking.pending)
+    if not stale:
+        state, asked, decided = _ask(model, state, message, estimate, arrived, now)
+        others, records = (*others, *asked), [*records, *decided]
     if redesign.setting is None:
         return StepResult(state, others, tuple(records))
     versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))
@@ -210,6 +205,21 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + others, all_records)
+
+
+def _ask(
+    model: TwinModel, state: TwinState, message: WindowMessage, estimate: GapEstimate, arrived: float, now: float
+) -> tuple[TwinState, tuple[Message, ...], list[Record]]:
+    """Decide if a probing move is asked for after an estimate; return the request, and the records of both."""
+    if model.requests is None or state.requests is None or estimate.method == UNUSABLE:
+        return state, (), []
+    widest = state.wear.expect(model.settings.trend, message.boot, estimate.time, arrived).widest
+    in_force = state.known.get(state.versions.in_force)
+    asking, decision = model.requests.decide(state.requests, message, estimate, widest, in_force, now)
+    state, record = replace(state, requests=asking), ExcitationRecord(message, decision)
+    if decision.ask is None or asking.pending is None:
+        return state, (), [record]
+    return state, (asking.pending,), [record, asking.pending]
 
 
 def _glance(

@@ -18,8 +18,9 @@ from servotwin.messages import Setting, Update
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
+from servotwin.redesign.certified.learnt_servo import learnt_servo
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, TablePolicy, certify_cell
-from servotwin.redesign.certified.policy import CertifiedPolicy, learnt_servo
+from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.policy import Evidence
 from servotwin.simulation import simulate

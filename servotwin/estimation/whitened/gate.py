@@ -164,7 +164,7 @@ class FitEvidence:
 
     @property
     def systematic(self) -> float:
-        """What other models than the fitted one may do to the gap, rad."""
+        """Change of the gap that other models than the fitted one allow, rad."""
         return max(abs(self.shift.gap), self.doubt)
 
 

@@ -36,7 +36,7 @@ _ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 
 
 
 class MachineSpread(NamedTuple):
-    """What the open numbers of a machine do to a fit: spread of the gap (rad), root mean square left over (m)."""
+    """Effect of a machine's open numbers on a fit: spread of the gap (rad), root mean square left over (m)."""
 
     gap: float
     misfit: float

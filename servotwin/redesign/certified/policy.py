@@ -9,21 +9,18 @@ from functools import lru_cache
 from time import perf_counter
 from typing import ClassVar, Protocol
 
-import numpy as np
-from scipy.linalg import block_diag
-
 from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
-from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LAG, LearntMotor
+from servotwin.estimation.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.trend import Trend
-from servotwin.estimation.whitened.free_model import FactorPrior, adapted
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
+from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
@@ -172,7 +169,7 @@ class CertifiedPolicy:
         servo, known = self.servo, region.within(self.uncertainty)
         learnt = learnt_servo(servo, self.uncertainty, machine, motor)
         if learnt is not None:
-            servo, known = learnt[0], _narrowed(known, learnt[1])
+            servo, known = learnt[0], narrowed(known, learnt[1])
         demands = self.demands_within_band()
         return confirm(servo, known, setting, demands, self.simulations, region.noise, self.clock)
 
@@ -295,13 +292,6 @@ class CertifiedPolicy:
         return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
 
 
-# Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
-# leaves out does not average away with the windows.
-_LEAST_K, _LEAST_C = 0.002, 0.01
-# Of a stated half-width: a number of the motor that is not known better than that stays as stated.
-_TOLD = 0.5
-
-
 @dataclass(frozen=True)
 class _LearntVerifier:
     """Verification by simulation on what was learnt of the machine, in place of the model's stated error.
@@ -315,43 +305,11 @@ class _LearntVerifier:
     provisional: ClassVar[bool] = False
 
     def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
-        known = _narrowed(region.within(self.policy.uncertainty), self.learnt)
+        known = narrowed(region.within(self.policy.uncertainty), self.learnt)
         return self.policy.verify_on(self.servo, known, region, running)
 
     def fallback(self) -> Certificate:
         return self.policy.fallback()
-
-
-def _narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
-    """Prior knowledge with what was learnt in place of the stated half-widths."""
-    # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
-    return known.replace(learnt=learnt, m=0.0 if "k" in learnt.names else known.m)
-
-
-def learnt_servo(
-    servo: Servo, known: Uncertainty, machine: FactorPrior | None, motor: LearntMotor | None
-) -> tuple[Servo, LearntFactors] | None:
-    """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
-
-    The motor's numbers count where the windows told more of them than was stated.
-    """
-    names, variances = list[str](), list[Array]()
-    if machine is not None:
-        servo = adapted(servo, machine.mean)
-        names += ["k", "c", "p"]
-        variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
-    if motor is not None:
-        for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
-            relative = motor.std(index) / (1.0 + motor.mean[index])
-            if math.sqrt(3.0) * relative < _TOLD * width:
-                servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
-                names.append(name)
-                variances.append(np.array([[relative**2]]))
-    if not names:
-        return None
-    covariance = block_diag(*variances)
-    spread = tuple(tuple(row) for row in covariance.tolist())
-    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
 
 
 def _noise(evidence: Evidence) -> float:

@@ -1,0 +1,52 @@
+"""The servo with the numbers that were learnt of it, and the uncertainty that is left of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from servotwin.estimation.motor import BACK_EMF, LAG, LearntMotor
+from servotwin.estimation.whitened.free_model import FactorPrior, adapted
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
+
+# Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
+# leaves out does not average away with the windows.
+_LEAST_K, _LEAST_C = 0.002, 0.01
+# Of a stated half-width: a number of the motor that is not known better than that stays as stated.
+_TOLD = 0.5
+
+
+def narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
+    """Prior knowledge with what was learnt in place of the stated half-widths."""
+    # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
+    return known.replace(learnt=learnt, m=0.0 if "k" in learnt.names else known.m)
+
+
+def learnt_servo(
+    servo: Servo, known: Uncertainty, machine: FactorPrior | None, motor: LearntMotor | None
+) -> tuple[Servo, LearntFactors] | None:
+    """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
+
+    The motor's numbers count where the windows told more of them than was stated.
+    """
+    names, variances = list[str](), list[Array]()
+    if machine is not None:
+        servo = adapted(servo, machine.mean)
+        names += ["k", "c", "p"]
+        variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
+    if motor is not None:
+        for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
+            relative = motor.std(index) / (1.0 + motor.mean[index])
+            if math.sqrt(3.0) * relative < _TOLD * width:
+                servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
+                names.append(name)
+                variances.append(np.array([[relative**2]]))
+    if not names:
+        return None
+    covariance = block_diag(*variances)
+    spread = tuple(tuple(row) for row in covariance.tolist())
+    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
