@@ -131,13 +131,15 @@ def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
         for i in range(n):
             at = i * stride
             for k in range(n):
-                w.row[k] = u[at + last + k]
+                w.row[k] = w.product[k] = u[at + last + k]
             w.row[i] += 1.0
             to = at + known * n
-            tall_product(u, 0, stride, known * n, w.row, u[to : to + known * n])
+            # By way of another array: what it reads and writes side by side would not be vectorised.
+            new = w.rows[: known * n]
+            tall_product(u, 0, stride, known * n, w.row, new)
             for j in range(known):
                 for k in range(np.uint64(n)):
-                    u[to + j * n + k] += u[at + last + k]
+                    u[to + j * n + k] = new[j * n + k] + w.product[k]
         known *= 2
 
 
@@ -290,8 +292,8 @@ def _fill_scale(
 
 
 @bare
-def fill_slot(t: LiftedTables, slot: int, watches: int, deep: bool, w: LiftedWorkspace) -> None:
-    """All tables of the map and the watches in `w`; those of the vast scale only where it is to be `deep`."""
+def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """The tables of the map and the watches in `w`, but for those of the vast scale."""
     n, n2 = t.states, t.states * t.states
     for watch in range(watches):
         for i in range(n):
@@ -304,10 +306,28 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, deep: bool, w: LiftedWor
     # Literals would have the function compiled once for each.
     _fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
     _rebase(n, int(FINE), int(COARSE), w)
-    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), not deep, w)
-    if deep:
-        _rebase(n, int(COARSE), int(COARSE), w)
-        _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
+    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)
+
+
+@bare
+def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """The tables of the vast scale, from those of the coarse one and the watches in `w`."""
+    n, stride, block = t.states, _stride(t, COARSE), (COARSE + 1) * t.states
+    for i in range(n):
+        for k in range(n):
+            w.powers[i * COARSE * n + k] = t.jump_coarse[((slot * n + k + 1) * COARSE - 1) * n + i]
+    for watch in range(watches):
+        for j in range(n):
+            at = (slot * n + j) * stride + watch * (3 * COARSE + 1 + n)
+            for i in range(COARSE + 1):
+                w.rows[i * n + j] = t.coarse[at + i]
+            for i in range(COARSE):
+                w.rows[block + i * n + j] = t.coarse[at + COARSE + 1 + i] / FINE
+                w.rows[2 * block + (i + 1) * n + j] = t.coarse[at + 2 * COARSE + 1 + i] / FINE
+            for i in range(n):
+                w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
+        _add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
+    _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
 
 
 @inlined

@@ -74,6 +74,7 @@ class MemberResults(NamedTuple):
     traces: Array  # (K, O, samples), or (1, O, samples) when only figures are computed
     figures: Array  # (K, O, number of figures), or (0, O, number of figures)
     events: NDArray[np.int64]  # (K,)
+    ends: Array  # (K, n) states at the end, or (0, n)
 
 
 class WorkerMemory(NamedTuple):
@@ -196,6 +197,9 @@ def run_members(
         if status != DONE:
             return status, place
         results.events[k] = record.size[1]
+        if len(results.ends) > 0:
+            for i in range(t.states):
+                results.ends[k, i] = memory.state[i]
         fill_sampled(family, a, record, memory)
         sample_all(record, memory, family.stride[a], traces)
         if len(results.figures) > 0:
