@@ -30,8 +30,9 @@ tick = verbatim(law.tick)
 
 UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
-# The vast scale's tables pay after so many calm ticks, and where so many more are to come.
-_CALM, _WORTH = 8 * BLOCK, 16 * COARSE * BLOCK
+# The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
+# earlier.
+_PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
 VAST = -2
@@ -169,7 +170,7 @@ def note(segments: Segments, k: int, slot: int, z: Array) -> None:
 @inlined
 def deepens(place: Place, end: int, filled: int) -> bool:
     """True where a run has been calm, and goes on so long that the tables of the vast scale pay."""
-    return filled < 2 and place.at[5] >= _CALM and end - place.at[0] >= _WORTH
+    return filled < 2 and place.at[5] >= _PAYS and end - place.at[0] >= _WORTH
 
 
 @inlined
