@@ -25,9 +25,7 @@ from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, D
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Setting
-from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.simulation import Run, Simulation
-from servotwin.simulation.inputs import shifted
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
 SOFTER = {"Kp": 1000.0, "Ki": 9000.0, "leave": 1.4, "feedforward": 0.02}
@@ -91,7 +89,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
     same.advance(changed)
     same.set_controller(controller, 2e-5)
     same.advance(moved)
-    same.set_reference(shifted(as_pieces(scenario.reference, 10.0), PiecewiseCubic.constant(2e-4)))
+    same.move(2e-4)
     run, blocks = whole(same), before + between + after
     assert changed == 2345 + wire.MAX_SAMPLES
     assert [block.version for block in blocks] == [0, 0] + [7] * (len(blocks) - 2)
