@@ -337,7 +337,7 @@ def test_the_edge_ends_after_the_link_process_has_taken_all_windows(monkeypatch:
     box = PipeOutlet(True)
     edge = edge_of(box)
     for k in range(50):
-        box.offer(cut(k), 0.0)
+        box.offer(cut(k))
     clock = edge.clock
 
     def pause(seconds: float) -> None:

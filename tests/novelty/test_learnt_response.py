@@ -18,7 +18,7 @@ import servotwin as st
 from benchmarks.novelty.command import FALSE_ALARMS, QUICK, charted
 from benchmarks.novelty.windows import NoveltyCondition
 from servotwin.cosim.driver import Cosimulation
-from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.machine import SimulatedMachine, simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent
 from servotwin.edge.outlet import FILTERED
@@ -67,10 +67,11 @@ def looped(factors: tuple[float, ...], learn: bool, novelty: bool = True) -> tup
         recording=replace(packaged.recording, novelty=NoveltyRules() if novelty else None),
         twin=packaged.twin.replace(learning=LearningSettings(learn=learn)),
     )
-    loop = Cosimulation(scenario, simulation_of(scenario, adapted(SERVO, np.log(factors))))
+    plant = simulation_of(scenario, adapted(SERVO, np.log(factors)))
+    loop = Cosimulation(scenario, SimulatedMachine(scenario, plant))
     while not loop.done:
         loop.advance()
-    return loop, loop.loop(loop.machine.run())
+    return loop, loop.loop(plant.run())
 
 
 @pytest.mark.parametrize("factors", OFF_BY)
