@@ -113,7 +113,7 @@ def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
 def compile_ahead(scenario: Scenario) -> None:
     """Compile everything that a machine of this kind runs, so that no sample waits for a compilation."""
     rate = scenario.law.sample_rate or scenario.recording.sample_rate
-    gap = PiecewiseCubic.held([0.0, 1.5 / rate], [0.01, 0.02])
+    gap = PiecewiseCubic.zero_order_hold([0.0, 1.5 / rate], [0.01, 0.02])
     simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
 
 

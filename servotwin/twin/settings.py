@@ -239,5 +239,5 @@ class TwinSettings:
 def read_twin_settings(table: Table, folder: Path = Path()) -> TwinSettings:
     """Read [twin] with its inner tables; the method declares the keys of [estimator]."""
     estimator = part(table, "estimator", METHODS[attribute(table, TwinSettings, "method")].settings)
-    made: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
-    return made
+    settings: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
+    return settings

@@ -73,7 +73,9 @@ def windows(sent: list[Message]) -> list[WindowMessage]:
 def test_a_longer_window_counts_from_the_next_change_on() -> None:
     agent = SendingAgent(settings())
     feed(agent, [0.0] * 9 + [1e-3])
-    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer("axis-1", "b0", 1, 10, RequestOutcome.TAKEN, 1)
+    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer(
+        "axis-1", "b0", 1, 10, RequestOutcome.ACCEPTED, 1
+    )
     (short,) = windows(feed(agent, [1e-3] * 20))
     (longer,) = windows(feed(agent, [0.0] * 20))
     assert (short.start, short.samples) == (0.9, 8)
@@ -82,7 +84,7 @@ def test_a_longer_window_counts_from_the_next_change_on() -> None:
 
 def test_windows_never_get_shorter_than_configured() -> None:
     agent = SendingAgent(settings(pre_trigger_s=0.2))
-    assert answer(agent, request(ask=LongerWindow(0.3, 0.1))).taken
+    assert answer(agent, request(ask=LongerWindow(0.3, 0.1))).accepted
     (window,) = windows(feed(agent, [0.0] * 5 + [1e-3] * 20))
     assert (window.start, window.samples) == (0.3, 8)
 
@@ -90,7 +92,7 @@ def test_windows_never_get_shorter_than_configured() -> None:
 def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> None:
     agent = SendingAgent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
-    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, RequestOutcome.TAKEN, 1)
+    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, RequestOutcome.ACCEPTED, 1)
     sent = feed(agent, [2e-3] * 40)
     (window,) = windows(sent)
     assert (window.reason, window.start, window.samples) == ("probe", 2.8, 18)
@@ -102,7 +104,7 @@ def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> Non
 def test_the_move_ends_when_the_reference_moves_and_its_window_is_another() -> None:
     agent = SendingAgent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     (window,) = windows(feed(agent, [2e-3] * 3 + [0.0] * 30))
     assert agent.offset == 0.0
     assert (window.reason, window.start, window.samples) == ("reference", 3.1, 8)
@@ -112,7 +114,7 @@ def test_the_move_ends_when_the_reference_moves_and_its_window_is_another() -> N
 def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
     monkeypatch.setattr(Supervisor, "check", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
@@ -124,7 +126,7 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_law_that_ignores_the_offset_ends_the_move() -> None:
     agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     for _ in range(3):
         agent.absorb(0.0, 0.0, 0.0, 0.0)
     assert agent.probe is None
@@ -149,8 +151,8 @@ def test_a_probing_move_without_permission_is_refused() -> None:
         (request(ask=Probe(1e-3, 0.4, 3)), RequestOutcome.TOO_LARGE),
         (request(ask=LongerWindow(2.1, 0.3)), RequestOutcome.TOO_LARGE),
         (request(ask=LongerWindow(2.0, 0.6)), RequestOutcome.TOO_LARGE),
-        (request(ask=Probe(-1e-3, 1.0)), RequestOutcome.TAKEN),
-        (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.TAKEN),
+        (request(ask=Probe(-1e-3, 1.0)), RequestOutcome.ACCEPTED),
+        (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.ACCEPTED),
     ],
 )
 def test_a_refused_request_has_its_reason(message: Request, outcome: RequestOutcome) -> None:
@@ -158,7 +160,7 @@ def test_a_refused_request_has_its_reason(message: Request, outcome: RequestOutc
     feed(agent, [0.0] * 30)
     before = agent._requests
     assert answer(agent, message).outcome is outcome
-    assert (replace(agent._requests, answer=None) == before) == (outcome is not RequestOutcome.TAKEN)
+    assert (replace(agent._requests, answer=None) == before) == (outcome is not RequestOutcome.ACCEPTED)
 
 
 def test_a_request_counts_once_and_is_answered_again() -> None:
@@ -168,7 +170,7 @@ def test_a_request_counts_once_and_is_answered_again() -> None:
     feed(agent, [0.0] * 90)
     assert answer(agent, request()) == first
     assert agent.probe is None
-    assert answer(agent, request(serial=4, ask=LongerWindow(1.5, 0.3))).taken
+    assert answer(agent, request(serial=4, ask=LongerWindow(1.5, 0.3))).accepted
     late = answer(agent, request(serial=2))
     assert (late.outcome, late.newest) == (RequestOutcome.DUPLICATE, 4)
 
@@ -180,17 +182,17 @@ def test_a_probing_move_begins_only_at_rest(fed: int) -> None:
     feed(agent, ([0.0] * 30 + [1e-3] * 10)[:fed])
     assert answer(agent, request()) == Answer("axis-1", "b0", 1, fed, RequestOutcome.BUSY, 0)
     feed(agent, [1e-3] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
 
 
 def test_moves_keep_their_distance_and_the_same_request_may_come_again() -> None:
     agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     feed(agent, [0.0] * 49)
     assert answer(agent, request(serial=2)).outcome is RequestOutcome.TOO_SOON
     feed(agent, [0.0])
-    assert answer(agent, request(serial=2)).taken
+    assert answer(agent, request(serial=2)).accepted
 
 
 @given(

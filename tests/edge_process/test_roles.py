@@ -284,7 +284,7 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Link
     exchange_all(box)
     (answer,) = letters(far, Answer)
     assert isinstance(answer, Answer)
-    assert answer.taken
+    assert answer.accepted
     role.stop()
     assert drive.log[-1] == "move 0.0"
 

@@ -60,7 +60,7 @@ SETTINGS = NoveltySettings(model_of(SERVO, RATE), NoveltyRules(), GAP)
 def looped(factors: tuple[float, ...], learn: bool, novelty: bool = True) -> tuple[Cosimulation, st.Loop]:
     """The calm loop of a machine that is off, whose gap grows by 0.3 deg at 160 s."""
     packaged = Scenario.preset("calm")
-    gap = st.PiecewiseCubic.held([0.0, 160.0], [GAP, GAP + 0.3 * DEG])
+    gap = st.PiecewiseCubic.zero_order_hold([0.0, 160.0], [GAP, GAP + 0.3 * DEG])
     scenario = packaged.replace(
         duration=240.0,
         gap=gap,
