@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.control.gains import with_gains
 from servotwin.cosim import machine
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.messages import Gains
+from servotwin.messages import Gains, Setting
 from servotwin.simulation.endless import OpenLoopPlant
 
 _HISTORY = 1024
@@ -145,10 +144,7 @@ class SupervisedPlant:
         InvalidInput
             The controller does not allow them.
         """
-        if gains is None:
-            self._machine.set_tolerance(tolerance)
-        else:
-            self._machine.set_controller(with_gains(self._law, gains), tolerance)
+        machine.put_in_force(self._machine, self._law, Setting(tolerance, gains))
         self.version = version
 
     def move(self, offset: float) -> None:

@@ -80,7 +80,7 @@ def burg(series: Array, most: int) -> Autoregression:
     return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
 
 
-def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
+def with_noise_restored(residual: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
     """(2, n) equally likely series of the noise in a residual (n,), with what the fit may have taken put back.
 
     A fit takes noise away with every parameter, and most where the gap shows, so that the residual looks quieter there
@@ -97,8 +97,8 @@ def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float =
     scale : float
         Standard deviation of the whitened noise.
     """
-    taken = scale * math.sqrt(len(root)) * (root @ columns)
-    return np.vstack([left + taken, left - taken])
+    restored = scale * math.sqrt(len(root)) * (root @ columns)
+    return np.vstack([residual + restored, residual - restored])
 
 
 def _criteria(power: Array, size: int) -> Array:
