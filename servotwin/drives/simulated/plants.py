@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from itertools import islice
 from math import isfinite
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -116,13 +119,22 @@ class SupervisedPlant:
             self._blocks.popleft()
 
     def read(self, first: int, most: int) -> SampleBlock | None:
-        """Samples from number `first` on, or from the oldest one retained; None where none is there yet."""
-        block = None
-        for earlier in reversed(self._blocks):
-            if earlier.last <= first:
+        """At most `most` samples from number `first` on, or from the oldest one retained; None where none is there yet.
+
+        A reader that is behind catches up: it receives the samples of many blocks at once.
+        """
+        place = bisect_right(self._blocks, first, key=attrgetter("last"))
+        if place == len(self._blocks):
+            return None
+        block = self._blocks[place]
+        values = [block.part(max(first, block.first), most).values]
+        count = values[0].shape[1]
+        for later in islice(self._blocks, place + 1, None):
+            if count >= most or later.version != block.version:
                 break
-            block = earlier
-        return None if block is None else block.part(max(first, block.first), most)
+            values.append(later.part(later.first, most - count).values)
+            count += values[-1].shape[1]
+        return SampleBlock(max(first, block.first), block.version, np.hstack(values))
 
     def write(self, version: int, tolerance: float, gains: Gains | None) -> None:
         """Put parameters in force from the present sample on.

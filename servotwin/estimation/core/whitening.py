@@ -63,11 +63,9 @@ class Autoregression:
 
         The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
         """
-        poles = self.predictors[-1]
-        # Here, because scipy.signal takes long to import and many commands never estimate.
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])
+        out = np.empty(weights.size)
+        filter_backwards(np.ascontiguousarray(weights), self.predictors[-1], float(self.spread[-1]), out)
+        return out
 
 
 def burg(series: Array, most: int) -> Autoregression:
@@ -184,3 +182,14 @@ def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None
                 left[i] += weights[j] * column[i + most - j]
         for i in range(left.size):
             left[i] /= spread[most]
+
+
+@bare
+def filter_backwards(weights: Array, poles: Array, gain: float, out: Array) -> None:
+    """Filter (n,) weights backwards in time, from rest, with a gain over the polynomial `poles`, into `out`."""
+    size, order = weights.size, poles.size - 1
+    for i in range(size - 1, -1, -1):
+        total = gain * weights[i]
+        for j in range(1, min(order, size - 1 - i) + 1):
+            total -= poles[j] * out[i + j]
+        out[i] = total
