@@ -21,7 +21,7 @@ QUICK = catalogue.Options(quick=True)
 
 
 def quiet():
-    return Console(file=io.StringIO(), width=100)
+    return Console(file=io.StringIO(), width=120)
 
 
 # The timing.
