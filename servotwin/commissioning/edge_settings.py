@@ -167,7 +167,9 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     laws = _candidates(policy, demands)
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
-    factor = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values()) * _ROUNDING
+    kick = max(abs(law.velocity_feedforward) / law.velocity_time for law in laws)
+    widest = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values())
+    factor = max(widest, kick / abs(middle["Kp"]) if kick else 0.0) * _ROUNDING
     leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
     limits = Limits(
         maximum=demands.tolerance,

@@ -235,7 +235,8 @@ def _lag(servo: Servo, law: Controller) -> float:
     plant = servo.plant()
     corners = np.abs(plant.poles())
     slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
-    return 1.0 / (abs(law.Kp) * slow * float(np.abs(plant.response(slow))))
+    needed = 1.0 / (slow * float(np.abs(plant.response(slow))))
+    return abs(needed - law.velocity_feedforward) / abs(law.Kp)
 
 
 def _seed(servo: Servo, uncertainty: Uncertainty, setting: Design, seed: int) -> int:
