@@ -79,8 +79,11 @@ class LawState(NamedTuple):
     offset : float
         Voltage offset after a change of parameters, V: added to the voltage, inside the dead zone too; it fades
         exponentially.
-    lagging : float
-        The reference behind the low-pass filter of the velocity feedforward, m.
+    reference : float
+        The reference of the last tick, m.
+    ahead : float
+        What the reference was ahead of its low-pass in the velocity feedforward, m: where the reference rests it
+        fades beyond all rounding.
     """
 
     integral: float
@@ -89,12 +92,13 @@ class LawState(NamedTuple):
     voltage: float
     active: float
     offset: float = 0.0
-    lagging: float = 0.0
+    reference: float = 0.0
+    ahead: float = 0.0
 
 
 def start(measurement: float) -> LawState:
     """State at rest at `measurement` (m), the loop closed."""
-    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement)
+    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement, 0.0)
 
 
 def tick(parameters: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
@@ -134,7 +138,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     driven = error * acting
     slope = driven - state.derivative
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
-    ahead = reference - state.lagging
+    ahead = (1.0 - parameters.velocity_step) * state.ahead + (reference - state.reference)
     wanted = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
     voltage = wanted
     if voltage > parameters.voltage_limit:
@@ -151,8 +155,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)
-    lagging = state.lagging + parameters.velocity_step * ahead
-    return LawState(integral, derivative, filtered, voltage, active, offset, lagging)
+    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead)
 
 
 def replaced(integral: float, feedforward: float) -> float:

@@ -68,7 +68,8 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("filtered", controller.loop_filter_hz is not None),
         ("rate", controller.rate_limit is not None),
         ("feedforward", controller.feedforward != 0.0),
-        ("lagging", controller.velocity_feedforward != 0.0),
+        ("past", controller.velocity_feedforward != 0.0),
+        ("ahead", controller.velocity_feedforward != 0.0),
     ):
         places[name] = count if exists else -1
         count += exists
@@ -141,7 +142,7 @@ class LiftedEngine:
         set_states(self.plant, start, {"input bias": bias, "friction": friction})
         self.state = np.zeros(self.places.states)
         self.state[: self.places.plant] = start
-        for follower in (self.places.filtered, self.places.lagging):
+        for follower in (self.places.filtered, self.places.past):
             if follower >= 0:
                 self.state[follower] = start[self.places.position]
         if self.places.feedforward >= 0:

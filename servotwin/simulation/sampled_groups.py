@@ -115,7 +115,7 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     places = places_of(loops.first, laws[0], delay, degree(span.shape))
     states = np.zeros((len(which), places.states))
     states[:, : places.plant] = starts_of(loops, plant, constants)
-    for follower in (places.filtered, places.lagging):
+    for follower in (places.filtered, places.past):
         if follower >= 0:
             states[:, follower] = states[:, places.position]
     if places.feedforward >= 0:

@@ -107,9 +107,14 @@ def test_a_ramp_of_the_reference_is_fed_forward_in_proportion_to_its_speed() -> 
     assert voltages[-1] == pytest.approx(190.0 * speed, rel=6e-3)
 
 
-def test_the_velocity_feedforward_starts_from_rest() -> None:
-    law = PAPER.replace(velocity_feedforward=190.0).law()
+def test_the_velocity_feedforward_starts_from_rest_and_ends_in_it() -> None:
+    law = PAPER.replace(Ki=0.0, velocity_feedforward=190.0).law()
     assert tick(law, start(2e-3), 2e-3, 2e-3).voltage == 0.0
+    state = tick(law, start(2e-3), 3e-3, 3e-3)
+    assert state.voltage == pytest.approx(190.0 / 0.1 * 1e-3, rel=1e-12)
+    for _ in range(400_000):
+        state = tick(law, state, 3e-3, 3e-3)
+    assert abs(state.voltage) < 1e-300
 
 
 def test_outside_its_dead_zone_either_law_is_the_same() -> None:
@@ -271,7 +276,8 @@ def _compiled_run(parameters: Any, state: Any, references: Any, measurements: An
     for k in range(len(references)):
         state = _compiled_tick(parameters, state, references[k], measurements[k])
         out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
-        out[k, 3], out[k, 4], out[k, 5], out[k, 6] = state.voltage, state.active, state.offset, state.lagging
+        out[k, 3], out[k, 4], out[k, 5] = state.voltage, state.active, state.offset
+        out[k, 6], out[k, 7] = state.reference, state.ahead
 
 
 def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -296,7 +302,7 @@ FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03)
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
     law, samples = controller.law(1e-3), 1_000_000
     reference, measurement = _signals(samples)
-    compiled = np.empty((samples, 7))
+    compiled = np.empty((samples, 8))
     first = start(0.0)._replace(offset=2.3)
     numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
     state, interpreted = first, array("d")

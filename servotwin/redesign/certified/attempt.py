@@ -156,7 +156,7 @@ class Attempt:
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
             error_per_volt=0.0 if law.Ki else 1.0 / abs(law.Kp),
-            lag=_lag(question.servo, law),
+            lag=_lag(question.servo, setting.controller),
         )
 
     @cached_property

@@ -137,7 +137,7 @@ class Demands:
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
-    velocity: tuple[float, ...] = (0.4, 0.6)
+    velocity: tuple[float, ...] = (0.3, 0.5)
     known: float = 0.0726
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
     effort_weight: float = 14.0
