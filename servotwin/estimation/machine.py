@@ -24,7 +24,7 @@ from servotwin.plant.signals import Array
 _SIZE = len(FACTORS)
 _DAY_S = 86400.0
 _AGREEMENT = 4.0  # standard deviations, of the distance of two readings with as many degrees of freedom as factors
-_LEAST_SHOWN = 1e-2  # of the prior's variance: along directions that shrink by less, the window shows nothing
+_LEAST_INFORMATION = 1e-2  # of the prior's variance: along directions that shrink by less, the window shows nothing
 _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
 
 
@@ -120,10 +120,10 @@ class LearntMachine(Struct, frozen=True):
     alarm: str = ""
     rival: LearntMachine | None = None
 
-    def prior(self, given: LearningSettings, now: float) -> FactorPrior:
+    def prior(self, settings: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
-        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
-        short = np.maximum(0.0, given.floor - np.diag(covariance))
+        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(settings.walk(now - self.time))
+        short = np.maximum(0.0, settings.floor - np.diag(covariance))
         return FactorPrior(np.array(self.factors), covariance + np.diag(short))
 
     def words(self) -> str:
@@ -134,14 +134,14 @@ class LearntMachine(Struct, frozen=True):
         return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
 
 
-def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
+def nameplate(settings: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
     """Prior before any window, for half-widths of stiffness, damping and mass within which all values are alike."""
     k_std, c_std, ratio_std = (math.hypot(one, other) / math.sqrt(3.0) for one, other in ((k, m), (c, m), (m, m)))
-    return FactorPrior.of_spreads(k_std, c_std, given.pitch, max(ratio_std, given.ratio_floor))
+    return FactorPrior.of_spreads(k_std, c_std, settings.pitch, max(ratio_std, settings.ratio_floor))
 
 
 def updated(
-    before: LearntMachine | None, given: LearningSettings, estimate: GapEstimate, counts: bool, now: float
+    before: LearntMachine | None, settings: LearningSettings, estimate: GapEstimate, counts: bool, now: float
 ) -> LearntMachine | None:
     """Update what is known of the machine by a window.
 
@@ -165,15 +165,15 @@ def updated(
     # A window may show the machine's numbers, and the gap not well enough or not at all.
     if estimate.ok or estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND):
         windows = 1 if before is None else before.windows + 1
-        alarm = "" if before is None else _drift(before.prior(given, now), reading)
+        alarm = "" if before is None else _drift(before.prior(settings, now), reading)
         return LearntMachine(reading.factors, reading.covariance, now, windows, alarm)
     if before is None:
         return before
     rival = LearntMachine(reading.factors, reading.covariance, now)
-    if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
+    if before.rival is not None and _distance(before.rival.prior(settings, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
-    if rival.windows >= given.restart_after:
+    if rival.windows >= settings.restart_after:
         return replace(rival, alarm=f"{alarm}; it is learnt anew from {rival.windows} windows that agree")
     return replace(before, alarm=alarm, rival=rival)
 
@@ -196,8 +196,8 @@ def _drift(known: FactorPrior, reading: MachineReading) -> str:
     spread = np.sqrt(np.diag(known.covariance))
     shrunk = (known.covariance - np.array(reading.covariance).reshape(_SIZE, _SIZE)) / np.outer(spread, spread)
     values, vectors = np.linalg.eigh(shrunk)
-    shown = values > _LEAST_SHOWN
-    if float(np.sum(np.square(vectors[:, shown].T @ (moved / spread)) / values[shown])) <= _DRIFT**2:
+    informative = values > _LEAST_INFORMATION
+    if float(np.sum(np.square(vectors[:, informative].T @ (moved / spread)) / values[informative])) <= _DRIFT**2:
         return ""
     index = int(np.argmax(np.abs(moved) / spread))
     change = 100.0 * math.expm1(float(moved[index]))

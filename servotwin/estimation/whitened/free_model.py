@@ -110,8 +110,8 @@ class FreeFit:
     @property
     def factor_covariance(self) -> Array:
         """(4, 4) of the factors alone, whether or not gap and place are known, for a residual of variance 1."""
-        left = project_out(orthonormal(self.rows[:2]), self.rows[2:])
-        return np.asarray(np.linalg.inv(left @ left.T))
+        remainder = project_out(orthonormal(self.rows[:2]), self.rows[2:])
+        return np.asarray(np.linalg.inv(remainder @ remainder.T))
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
@@ -172,8 +172,8 @@ class FreeProblem:
         whole[RESIDUAL, seen : seen + factors.size] = root @ (self.prior.mean - factors)
         whole[last:, seen + factors.size :] = np.eye(len(motions) - factors.size)
         basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
-        left = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
-        return left[RESIDUAL], left[GAP:]
+        remainder = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
+        return remainder[RESIDUAL], remainder[GAP:]
 
     def descend(
         self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
@@ -207,8 +207,8 @@ class FreeProblem:
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
     """Squared length of what is left of a residual where all derivatives may have any share of it."""
-    left = project_out(orthonormal(rows[movable]), residual[None])[0]
-    return float(left @ left)
+    remainder = project_out(orthonormal(rows[movable]), residual[None])[0]
+    return float(remainder @ remainder)
 
 
 @dataclass(frozen=True)
