@@ -128,7 +128,7 @@ def _measured(servo: Servo, machines: SimulatedMachines, form: str, time: float,
     laws = np.array([_law(own, each, time) for each in fed.tolist()], dtype=object)
     plants = np.array(machines.plants, dtype=object)
     begins = MOVE * np.arange(MOVES)
-    shape = PiecewiseCubic.held(begins, 1.0 - np.arange(MOVES) % 2)
+    shape = PiecewiseCubic.zero_order_hold(begins, 1.0 - np.arange(MOVES) % 2)
     cases = SampledCases(step, gap, 0.0, machines.theta_d0[:, 0])
     figures = summarise_sampled(
         plants, laws, MOVE * MOVES, cases, MOVE / 3.0, None, ("error", "position"), 100.0, None, shape

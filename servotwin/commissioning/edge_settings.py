@@ -30,7 +30,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
-from servotwin.redesign.certified.uncertainty import PARAMETERS
+from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors
 from servotwin.redesign.dead_zones import HysteresisPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.runtime.retry import Retry
@@ -183,7 +183,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
 
 def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[Controller]:
     """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
-    exact = policy.uncertainty.replace(**dict.fromkeys(PARAMETERS, 0.0))
+    exact = policy.uncertainty.replace(**dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors((), (), ()))
     known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
     pairs = ((policy.uncertainty, demands), (exact, known))
     return [each.controller for pair in pairs for each in candidates_of(policy.servo, *pair, True, False)]

@@ -63,6 +63,8 @@ class Demands:
         Factors on Kp and Kd.
     shapes : tuple of (float, float)
         Factors on Kd / (Kp Tf) and on Tf, tried with every scale: they move the derivative action.
+    learnt_shapes : tuple of (float, float)
+        Further ones, tried on a machine that was learnt.
     integral : tuple of float
         Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
     known : float
@@ -135,6 +137,7 @@ class Demands:
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
+    learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     velocity: tuple[float, ...] = (0.3, 0.5)
