@@ -183,7 +183,9 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
 
 def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[Controller]:
     """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
-    exact = policy.uncertainty.replace(**dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors((), (), ()))
+    exact = policy.uncertainty.replace(
+        **dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors(("k",), (0.0,), ((0.0,),))
+    )
     known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
     pairs = ((policy.uncertainty, demands), (exact, known))
     return [each.controller for pair in pairs for each in candidates_of(policy.servo, *pair, True, False)]

@@ -170,7 +170,7 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
-    exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0, learnt=LearntFactors((), (), ()))
+    exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0, learnt=LearntFactors(("k",), (0.0,), ((0.0,),)))
     sets = ((policy.uncertainty, Demands()), (exact, Demands(beyond=Beyond(k_T=0.0))))
     laws = [s.controller for pair in sets for s in candidates_of(policy.servo, *pair, True, True)]
     for law in laws:
