@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.twin.settings import read_twin_settings
+
+_TURN = 2.0 * math.pi
 
 
 def square_wave(
@@ -70,15 +73,15 @@ REFERENCES: Mapping[str, Maker] = {
 
 
 def constant_gap(
-    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
+    total: Annotated[float, key("total_deg", minimum=0.0, maximum=_TURN, help="Total gap.")],
 ) -> SignalLike:
     """Constant gap."""
     return total
 
 
 def growing_gap(
-    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap.")],
-    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap.")],
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, maximum=_TURN, help="First total gap.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, maximum=_TURN, help="Last total gap.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
     begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
 ) -> SignalLike:
