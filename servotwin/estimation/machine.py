@@ -107,6 +107,8 @@ class LearntMachine(Struct, frozen=True):
         s, on the twin's clock, of the last window that counted.
     windows : int
         Windows that counted.
+    softness : (float, float)
+        Of the screw, as of `MachineReading`.
     alarm : str
         Sentence on a machine that is not what was learnt; empty without one.
     rival : LearntMachine or None
@@ -119,12 +121,13 @@ class LearntMachine(Struct, frozen=True):
     windows: int = 1
     alarm: str = ""
     rival: LearntMachine | None = None
+    softness: tuple[float, float] = (0.0, 0.0)
 
     def prior(self, given: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
         covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
         short = np.maximum(0.0, given.floor - np.diag(covariance))
-        return FactorPrior(np.array(self.factors), covariance + np.diag(short))
+        return FactorPrior(np.array(self.factors), covariance + np.diag(short), self.softness)
 
     def words(self) -> str:
         """The factors in per cent off the model."""
@@ -166,10 +169,11 @@ def updated(
     if estimate.ok or estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND):
         windows = 1 if before is None else before.windows + 1
         alarm = "" if before is None else _drift(before.prior(given, now), reading)
-        return LearntMachine(reading.factors, reading.covariance, now, windows, alarm)
+        alarm = alarm or _softened((0.0, 0.0) if before is None else before.softness, reading.softness)
+        return LearntMachine(reading.factors, reading.covariance, now, windows, alarm, softness=reading.softness)
     if before is None:
         return before
-    rival = LearntMachine(reading.factors, reading.covariance, now)
+    rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
     if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
@@ -183,6 +187,17 @@ def _distance(known: FactorPrior, reading: MachineReading) -> float:
     away = np.array(reading.factors) - known.mean
     return math.sqrt(
         float(away @ np.linalg.solve(known.covariance + np.array(reading.covariance).reshape(_SIZE, _SIZE), away))
+    )
+
+
+def _softened(before: tuple[float, float], after: tuple[float, float]) -> str:
+    """Sentence on a screw that has turned out to be soft with this window; empty where it has not."""
+    (was, known), (softness, information) = before, after
+    if softness * math.sqrt(information) <= _DRIFT or was * math.sqrt(known) > _DRIFT:
+        return ""
+    return (
+        f"the screw is not rigid: the windows show one about {1.0 / softness:.2g} times as stiff as the structure, and "
+        "intervals are widened by what that does to the gap"
     )
 
 
