@@ -17,7 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.config.keys import check, key, settings
-from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.whitened.free_model import FACTORS, FactorPrior
 from servotwin.plant.signals import Array
 
@@ -109,6 +109,10 @@ class LearntMachine(Struct, frozen=True):
         Windows that counted.
     softness : (float, float)
         Of the screw, as of `MachineReading`.
+    other : LearntMachine or None
+        The last machine that was not this one: a rival whose windows have ended, or the one before this.
+    mixed : int
+        Windows in a row of one machine that are still missing, since windows of two came by turns.
     alarm : str
         Sentence on a machine that is not what was learnt; empty without one.
     rival : LearntMachine or None
@@ -122,12 +126,24 @@ class LearntMachine(Struct, frozen=True):
     alarm: str = ""
     rival: LearntMachine | None = None
     softness: tuple[float, float] = (0.0, 0.0)
+    other: LearntMachine | None = None
+    mixed: int = 0
+
+    @property
+    def disputed(self) -> bool:
+        """True while windows contradict it, or come from two machines: no setting may rest on it."""
+        return self.rival is not None or self.mixed > 0
 
     def prior(self, given: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
         covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
         short = np.maximum(0.0, given.floor - np.diag(covariance))
         return FactorPrior(np.array(self.factors), covariance + np.diag(short), self.softness)
+
+    def surely(self) -> Array:
+        """(4,) least sizes of the factors' logarithms, at 95 %."""
+        spread = np.sqrt(np.diag(np.array(self.covariance).reshape(_SIZE, _SIZE)))
+        return np.abs(self.factors) - NORMAL_95 * spread
 
     def words(self) -> str:
         """The factors in per cent off the model."""
@@ -144,7 +160,12 @@ def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPr
 
 
 def updated(
-    before: LearntMachine | None, given: LearningSettings, estimate: GapEstimate, counts: bool, now: float
+    before: LearntMachine | None,
+    given: LearningSettings,
+    estimate: GapEstimate,
+    counts: bool,
+    now: float,
+    stated: FactorPrior | None = None,
 ) -> LearntMachine | None:
     """Update what is known of the machine by a window.
 
@@ -159,27 +180,61 @@ def updated(
         True where the trend accepted the estimate.
     now : float
         s, on the twin's clock.
+    stated : FactorPrior, optional
+        The nameplate's (`nameplate`): a machine that turns out to lie outside of it is an alarm.
     """
     reading = estimate.machine
-    if reading is None:
-        return before
-    if estimate.ok and not counts:
+    if reading is None or (estimate.ok and not counts):
         return before
     # A window may show the machine's numbers, and the gap not well enough or not at all.
     if estimate.ok or estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND):
-        windows = 1 if before is None else before.windows + 1
-        alarm = "" if before is None else _drift(before.prior(given, now), reading)
-        alarm = alarm or _softened((0.0, 0.0) if before is None else before.softness, reading.softness)
-        return LearntMachine(reading.factors, reading.covariance, now, windows, alarm, softness=reading.softness)
-    if before is None:
-        return before
+        made = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
+        if before is None:
+            return replace(made, alarm=_outside(None, made, stated) or _softened((0.0, 0.0), made.softness))
+        alarm = _drift(before.prior(given, now), reading) or _outside(before, made, stated)
+        return replace(
+            made,
+            windows=before.windows + 1,
+            alarm=alarm or _softened(before.softness, made.softness),
+            other=before.rival or before.other,
+            mixed=max(0, before.mixed - estimate.ok),
+        )
+    return before and _contradicted(before, given, reading, now)
+
+
+def _contradicted(before: LearntMachine, given: LearningSettings, reading: MachineReading, now: float) -> LearntMachine:
+    """What is known after a window that only other numbers explain."""
     rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
     if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
+    # A rival that comes back is no new machine: there are two.
+    back = before.other is not None and _distance(before.other.prior(given, now), reading) <= _AGREEMENT
+    mixed = given.restart_after if back or before.mixed > 0 else 0
+    if back:
+        alarm = (
+            f"windows of two machines come under this name, or of one with two loads: {rival.words()}, and "
+            f"{before.words()}; no setting follows until {mixed} windows in a row are of one of them"
+        )
     if rival.windows >= given.restart_after:
-        return replace(rival, alarm=f"{alarm}; it is learnt anew from {rival.windows} windows that agree")
-    return replace(before, alarm=alarm, rival=rival)
+        alarm = f"{alarm}; it is learnt anew from {rival.windows} windows that agree"
+        return replace(rival, alarm=alarm, other=replace(before, rival=None, other=None, alarm=""), mixed=mixed)
+    return replace(before, alarm=alarm, rival=rival, mixed=mixed)
+
+
+def _outside(before: LearntMachine | None, after: LearntMachine, stated: FactorPrior | None) -> str:
+    """Sentence on a factor that has turned out to be outside of what is stated of it; empty without one."""
+    if stated is None:
+        return ""
+    allowed = math.sqrt(3.0) * np.sqrt(np.diag(stated.covariance))  # half-widths within which all values are alike
+    now, then = after.surely(), None if before is None else before.surely()
+    for name, off, was, most in zip(FACTORS, now, now if then is None else then, allowed, strict=True):
+        if off > most and (then is None or was <= most):
+            return (
+                f"the machine is not what is stated: {name} is at least {100.0 * off:.3g} % (logarithm) off the model, "
+                f"and {100.0 * most:.3g} % are stated; check the nameplate"
+            )
+    return ""
 
 
 def _distance(known: FactorPrior, reading: MachineReading) -> float:

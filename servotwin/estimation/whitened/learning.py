@@ -112,8 +112,8 @@ class LearntFit:
     def doubt(self, ramp: float, calibration: float) -> float:
         """Root mean square (rad) of what a soft screw, a ramp of the gap and a sensor's lag can do to the gap.
 
-        All are free beside the factors within wide limits here (`ramp`: rad/s), and cost only where the window does not tell them from
-        the factors.
+        All are free beside the factors within wide limits here (`ramp`: rad/s), and cost only where the window does not
+        tell them from these. A screw that is soft for certain moves the gap whatever the factors have taken up of it.
         """
         reduction = self.problem.reduction
         growth = NuisancePrior(0.0, ramp * reduction.response.interval)
