@@ -182,7 +182,8 @@ class Wear(Struct, frozen=True):
         `stated`: what the nameplate states of the machine.
         """
         wear, rejection = self._update_trend(settings, boot, estimate, now)
-        wear = msgspec.structs.replace(wear, mismatches=self._mismatches(estimate))
+        if wear.mismatches != (mismatches := self._mismatches(estimate)):
+            wear = msgspec.structs.replace(wear, mismatches=mismatches)
         if not learning.learn:
             return wear, rejection
         machine = updated(self.machine, learning, estimate, counts=not rejection, now=now, stated=stated)

@@ -37,6 +37,7 @@ from servotwin.plant.signals import Array
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
 _WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: wider ones are searched before the noise is known
+_TOGETHER = 5.0  # spreads: as unlikely for four factors as LARGEST is for one
 _AT_END = 1e-3  # of the range of a factor
 _SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
 _MOST_KNOWN = 1e7  # of the softness: no number of windows tells it better than to 0.0003
@@ -94,7 +95,7 @@ class LearntFit:
 
     @property
     def beyond(self) -> str:
-        """Sentence on a factor that lies at the end of what is allowed; empty where none does."""
+        """Sentence on factors that lie at the end of what is allowed, or beyond it together; empty where none do."""
         low, high = self.problem.prior.limits()
         ends = _AT_END * (high - low)
         for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
@@ -103,7 +104,14 @@ class LearntFit:
                 return (
                     f"{name} would have to be {off:+.3g} % off the model, {LARGEST:g} spreads from what is known of it"
                 )
-        return ""
+        away = self.problem.prior.root @ (self.free.factors - self.problem.prior.mean)
+        if float(away @ away) <= _TOGETHER**2:
+            return ""
+        parts = (f"{name} {100.0 * math.expm1(x):+.3g} %" for name, x in zip(FACTORS, self.free.factors, strict=True))
+        return (
+            f"the machine would have to be {np.linalg.norm(away):.3g} spreads from what is known of it, and "
+            f"{_TOGETHER:g} are allowed: {', '.join(parts)} off the model"
+        )
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
